@@ -1,0 +1,36 @@
+"""The exceptions of `ambid`.
+
+Every error that input can cause is an :class:`AmbidError`; the command line prints it on one line and exits with code 2.
+Anything else that escapes is a defect of the program.
+"""
+
+
+class AmbidError(Exception):
+    """Input refused.
+
+    The message names what, where, the rule and the remedy, on one line:
+    ``column 'current' is in [V]; the rig wants a current unit. Fix the header, or give channels.current.gain``.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+class UnitError(AmbidError):
+    """A unit is unknown, missing, or of another kind than the quantity it stands with."""
+
+
+class RecordError(AmbidError):
+    """A record, its file or one of its channels breaks a rule of the record format."""
+
+
+class RigError(AmbidError):
+    """A rig file or one of its entries breaks a rule of the rig schema."""
+
+
+class ModelError(AmbidError):
+    """A model is unknown, or its parameters do not make a physical plant."""
+
+
+class EstimationError(AmbidError):
+    """The data cannot be turned into an estimate at all (as opposed to a poor one, which is given with its flags)."""
