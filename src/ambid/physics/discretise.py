@@ -1,0 +1,92 @@
+"""Exact discretisation under a zero-order hold, with exact derivatives.
+
+The input is held over a sample and may reach the plant a fraction of a sample late: over one period the plant sees first the
+previous value, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.physics.models import StateSpace
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DiscreteSpace:
+    """Matrices of x[k+1] = A x[k] + B u[k-d] + B_late u[k-d-1] + E d[k], y[k] = C x[k].
+
+    Attributes
+    ----------
+    A : ndarray, shape (n_states, n_states)
+    B, B_late : ndarray, shape (n_states, n_inputs)
+        `B_late` is zero where the delay is a whole number of samples.
+    E : ndarray, shape (n_states, n_disturbances)
+        Disturbances held over a sample.
+    C : ndarray, shape (n_outputs, n_states)
+    """
+
+    A: Array
+    B: Array
+    B_late: Array
+    E: Array
+    C: Array
+
+
+def discretise(
+    space: StateSpace, period_s: float, *, fraction: float = 0.0, derivatives: Sequence[StateSpace] = ()
+) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
+    """Discretise exactly, together with the derivatives along given directions.
+
+    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the upper right
+    block of exp([[M, dM], [0, M]] T) (Mathias 1996).
+
+    Parameters
+    ----------
+    space : StateSpace
+        Continuous-time matrices.
+    period_s : float
+        Sampling period in s.
+    fraction : float
+        Part of a sample by which the input comes late, 0 <= fraction < 1.
+    derivatives : Sequence of StateSpace
+        Directions (dA, dB, dE); dC is passed on.
+
+    Returns
+    -------
+    discrete : DiscreteSpace
+        The discrete matrices.
+    directional : tuple of DiscreteSpace
+        Their derivatives, one for each direction; where `fraction` > 0, one more: along the fraction itself.
+    """
+    from scipy.linalg import expm
+
+    n, nu = space.B.shape
+    size = n + nu + space.E.shape[1]
+    whole = np.zeros((size, size), dtype=np.result_type(space.A, space.B, space.E))
+    whole[:n] = np.hstack([space.A, space.B, space.E]) * period_s
+    stack = np.zeros((max(1, len(derivatives)), 2 * size, 2 * size), dtype=whole.dtype)
+    stack[:, :size, :size] = stack[:, size:, size:] = whole
+    for block, d in zip(stack, derivatives, strict=False):
+        block[:n, size:] = np.hstack([d.A, d.B, d.E]) * period_s
+    full = expm(stack)
+    late = expm(stack * (1.0 - fraction)) if fraction else full
+
+    def split(now: Array, partial: Array, c: Array) -> DiscreteSpace:
+        b = partial[:n, n : n + nu]
+        return DiscreteSpace(A=now[:n, :n], B=b, B_late=now[:n, n : n + nu] - b, E=now[:n, n + nu :], C=c)
+
+    discrete = split(full[0, :size, :size], late[0, :size, :size], space.C)
+    directional = [split(full[j, :size, size:], late[j, :size, size:], d.C) for j, d in enumerate(derivatives)]
+    if fraction:
+        slope = -period_s * late[0, :n, :n] @ space.B
+        zero = np.zeros_like
+        directional.append(
+            DiscreteSpace(A=zero(discrete.A), B=slope, B_late=-slope, E=zero(discrete.E), C=zero(space.C))
+        )
+    return discrete, tuple(directional)
