@@ -95,7 +95,9 @@ class Record:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise RecordError(f"the sampling rate is {self.rate_hz}; it must be a positive number of Hz. Give --rate HZ")
+            raise RecordError(
+                f"the sampling rate is {self.rate_hz}; it must be a positive number of Hz. Correct --rate"
+            )
         if not self.channels:
             raise RecordError("the record has no channels; it needs at least one. Check the file's columns")
         names = [c.name for c in self.channels]

@@ -1,0 +1,275 @@
+"""From time stamps and columns to uniform samples: the rate, and what is done about gaps.
+
+A time column is uniform if every interval is within 1 % of the sampling period, or lies between two stamps that are
+within 1 % of a period of a uniform grid (jitter of a stamp shows twice in the intervals beside it).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import RecordError
+from ambid.record.record import Array, Step
+
+GapPolicy = Literal["error", "interpolate", "cut"]
+GAP_POLICIES: tuple[GapPolicy, ...] = ("error", "interpolate", "cut")
+MIN_SAMPLES = 8
+JITTER = 0.01  # of a sampling period
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """Columns as read from a file, not yet known to be uniform.
+
+    Attributes
+    ----------
+    where : str
+        The file, for messages.
+    names : tuple of str
+        Column names.
+    values : ndarray, shape (n_rows, n_columns)
+        In file units; NaN where a value is missing.
+    first_row : int
+        Line of the file in which the first row stands, counted from 1.
+    time : int or None
+        Which column is time (in seconds); None if there is none.
+    """
+
+    where: str
+    names: tuple[str, ...]
+    values: Array
+    first_row: int
+    time: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sampled:
+    """A table on a uniform grid.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_samples, n_columns)
+        Finite throughout; the time column is still there.
+    rate_hz, start_s : float
+        Sampling rate in Hz and time of the first sample in s.
+    steps : tuple of Step
+        What was done about gaps.
+    """
+
+    values: Array
+    rate_hz: float
+    start_s: float
+    steps: tuple[Step, ...]
+
+
+def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sampled:
+    """Find the rate and treat the gaps.
+
+    Parameters
+    ----------
+    table : Table
+        Columns of a file; all values finite if `gaps` is ``"error"``.
+    rate_hz : float or None
+        Rate in Hz for a table without time; beside a time column it has to agree with it.
+    gaps : {"error", "interpolate", "cut"}
+        Refuse gaps; fill them by linear interpolation; or keep the longest stretch without any. A gap is a missing or
+        non-finite value, or a jump of the time column.
+
+    Returns
+    -------
+    Sampled
+        At least 8 samples.
+
+    Raises
+    ------
+    RecordError
+        If there are fewer than 8 rows, no rate, two rates that differ, time that stands still or runs backwards,
+        irregular sampling, or a gap that the policy cannot treat.
+    """
+    check_gap_policy(gaps)
+    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise RecordError(f"the sampling rate given is {rate_hz}; it must be a positive number of Hz. Correct --rate")
+    _enough(table.values.shape[0], table.where, "rows")
+    if table.time is None and rate_hz is None:
+        raise RecordError(
+            f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
+            " Add the column, or give --rate HZ"
+        )
+    steps: list[Step] = []
+    values = table.values
+    if gaps == "interpolate":
+        values = _interpolated(table, steps)
+    elif gaps == "cut":
+        values = _longest_stretch(table, steps)
+    if table.time is None:
+        assert rate_hz is not None
+        return Sampled(values=values, rate_hz=float(rate_hz), start_s=0.0, steps=tuple(steps))
+    time = values[:, table.time]
+    first_row = table.first_row if gaps == "error" else None
+    _check_uniform(time, table.where, table.names[table.time], first_row)
+    found = float(f"{(time.size - 1) / (time[-1] - time[0]):.10g}")  # stamps carry no more than 10 digits of a rate
+    if rate_hz is not None and abs(rate_hz / found - 1) > JITTER:
+        raise RecordError(
+            f"{table.where}: its time column says {found:g} Hz but --rate says {rate_hz:g} Hz; they must agree."
+            " Give one of them only"
+        )
+    return Sampled(values=values, rate_hz=found, start_s=float(time[0]), steps=tuple(steps))
+
+
+def check_gap_policy(gaps: str) -> None:
+    """Refuse a gap policy that does not exist.
+
+    Parameters
+    ----------
+    gaps : str
+        What was asked for.
+
+    Raises
+    ------
+    RecordError
+        If it is none of error, interpolate and cut.
+    """
+    if gaps not in GAP_POLICIES:
+        raise RecordError(f"gaps = {gaps!r} is not known; choose one of {', '.join(GAP_POLICIES)}")
+
+
+def _enough(n: int, where: str, what: str) -> None:
+    if n < MIN_SAMPLES:
+        raise RecordError(f"{where} has {n} {what} of data; a record needs at least {MIN_SAMPLES}. Record for longer")
+
+
+def _check_uniform(time: Array, where: str, name: str, first_row: int | None) -> None:
+    """Refuse time that does not advance by one period per sample, naming the first bad row."""
+    steps = np.diff(time)
+    period = float(np.median(steps))
+
+    def refuse(k: int, what: str, remedy: str) -> RecordError:
+        place = f"row {first_row + k}" if first_row is not None else f"sample {k} after treating gaps"
+        return RecordError(f"{where}, {place}: {name} {what} (from {time[k - 1]:.9g} s to {time[k]:.9g} s). {remedy}")
+
+    if not np.all(steps > 0):
+        k = int(np.argmax(steps <= 0)) + 1
+        what = "stands still" if steps[k - 1] == 0 else "runs backwards"
+        raise refuse(k, what, "Time must increase: remove the row, or print time with more digits")
+    bad = _irregular(time, period)
+    if bad.any():
+        k = int(np.argmax(bad)) + 1
+        raise refuse(
+            k,
+            f"advances by {steps[k - 1] / period:.4g} samples instead of 1 within 1 %",
+            "Uniform sampling is required: print time with more digits, resample before, treat drop-outs with"
+            " --gaps interpolate or --gaps cut, or remove the time column and give --rate HZ",
+        )
+
+
+def _irregular(time: Array, period: float) -> NDArray[np.bool_]:
+    """Tell for every interval whether it breaks the 1 % rule, shape (n_samples - 1,)."""
+    intervals_ok = np.abs(np.diff(time) / period - 1) <= JITTER
+    if intervals_ok.all():
+        return ~intervals_ok
+    k = np.arange(time.size) - (time.size - 1) / 2
+    slope = float(k @ (time - time.mean()) / (k @ k))
+    on_grid = np.abs(time - time.mean() - slope * k) <= JITTER * slope
+    return ~(intervals_ok | (on_grid[:-1] & on_grid[1:]))
+
+
+def _period_of(time: Array, where: str) -> float:
+    """Return the usual interval of a time column that has gaps (NaN)."""
+    known = time[np.isfinite(time)]
+    _enough(known.size, where, "usable rows")
+    period = float(np.median(np.diff(known)))
+    if not period > 0:
+        raise RecordError(f"{where}: time does not increase from row to row; sort the rows, or remove the time column")
+    return period
+
+
+def _interpolated(table: Table, steps: list[Step]) -> Array:
+    """Insert the rows that the time column skips, then fill every gap linearly."""
+    values = _with_skipped_rows(table, steps)
+    filled, samples, longest = values.copy(), 0, 0
+    for j, name in enumerate(table.names):
+        missing = ~np.isfinite(values[:, j])
+        if not missing.any():
+            continue
+        if missing[0] or missing[-1]:
+            end = "first" if missing[0] else "last"
+            raise RecordError(
+                f"{table.where}, column {name!r}: the {end} value is missing; interpolation needs one on both"
+                " sides. Remove the rows at that end, or use --gaps cut"
+            )
+        at = np.arange(values.shape[0])
+        filled[missing, j] = np.interp(at[missing], at[~missing], values[~missing, j])
+        samples += int(missing.sum())
+        longest = max(longest, *(stop - start for start, stop in _runs(missing)))
+    if samples:
+        steps.append(Step(name="gaps_interpolated", settings={"values": samples, "longest": longest}))
+    return filled
+
+
+def _with_skipped_rows(table: Table, steps: list[Step]) -> Array:
+    """Return the values with a row of NaN (and its time) for each sample that the time column jumps over."""
+    if table.time is None:
+        return table.values
+    time = table.values[:, table.time]
+    if not np.isfinite(time).all():
+        return table.values
+    period = _period_of(time, table.where)
+    advance = np.diff(time) / period
+    whole = np.rint(advance)
+    skips = whole > 1
+    if not skips.any():
+        return table.values
+    # A jump counts as skipped samples only if it is a whole number of periods: else the clock itself is at fault.
+    wrong = skips & (np.abs(advance - whole) > JITTER * whole)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise RecordError(
+            f"{table.where}, row {table.first_row + k + 1}: time jumps by {advance[k]:.4g} samples, not by a whole"
+            " number: samples cannot be inserted. Use --gaps cut, or resample before"
+        )
+    n_new = int(whole[skips].sum()) - int(skips.sum())
+    if n_new > time.size:
+        raise RecordError(
+            f"{table.where}: time skips {n_new} samples but only {time.size} were recorded; that is too much to"
+            " interpolate. Use --gaps cut"
+        )
+    at = np.concatenate([[0], np.cumsum(np.where(skips, whole, 1))]).astype(np.int64)
+    values = np.full((int(at[-1]) + 1, table.values.shape[1]), np.nan)
+    values[at] = table.values
+    steps.append(Step(name="gaps_inserted", settings={"rows": n_new, "places": int(skips.sum())}))
+    return values
+
+
+def _longest_stretch(table: Table, steps: list[Step]) -> Array:
+    """Keep the longest run of rows without a missing value or a jump in time."""
+    values = table.values
+    good = np.isfinite(values).all(axis=1)
+    broken = np.zeros(values.shape[0] - 1, dtype=bool)  # between row k and k + 1
+    if table.time is not None:
+        time = values[:, table.time]
+        period = _period_of(time, table.where)
+        with np.errstate(invalid="ignore"):
+            broken = ~(np.abs(np.diff(time) / period - 1) <= JITTER)
+        if good.all() and broken.any() and not _irregular(time, period).any():
+            broken[:] = False
+    starts = np.flatnonzero(good & np.concatenate([[True], ~good[:-1] | broken]))
+    stops = np.flatnonzero(good & np.concatenate([~good[1:] | broken, [True]])) + 1
+    if starts.size == 0:
+        raise RecordError(f"{table.where} has no row without a missing value. Check what was recorded")
+    best = int(np.argmax(stops - starts))
+    start, stop = int(starts[best]), int(stops[best])
+    _enough(stop - start, table.where, "rows in its longest stretch without a gap")
+    if stop - start < values.shape[0]:
+        settings = {"first": start, "kept": stop - start, "dropped": values.shape[0] - (stop - start)}
+        steps.append(Step(name="gaps_cut", settings=settings))
+    return values[start:stop]
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return (start, stop) of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
