@@ -37,7 +37,7 @@ def _similar(path: Path) -> str:
     except OSError:
         return f" (nor does its folder {path.parent})"
     near = difflib.get_close_matches(path.name, names, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
+    return f" ({near[0]} does)" if near else ""
 
 
 def sha256_of(data: bytes) -> str:

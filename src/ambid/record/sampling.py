@@ -168,13 +168,14 @@ def _check_uniform(time: Array, where: str, name: str, first_row: int | None) ->
 
 def _irregular(time: Array, period: float) -> NDArray[np.bool_]:
     """Tell for every interval whether it breaks the 1 % rule, shape (n_samples - 1,)."""
-    intervals_ok = np.abs(np.diff(time) / period - 1) <= JITTER
+    intervals_ok: NDArray[np.bool_] = np.abs(np.diff(time) / period - 1) <= JITTER
     if intervals_ok.all():
-        return ~intervals_ok
+        return np.zeros(intervals_ok.size, dtype=np.bool_)
     k = np.arange(time.size) - (time.size - 1) / 2
     slope = float(k @ (time - time.mean()) / (k @ k))
     on_grid = np.abs(time - time.mean() - slope * k) <= JITTER * slope
-    return ~(intervals_ok | (on_grid[:-1] & on_grid[1:]))
+    irregular: NDArray[np.bool_] = ~(intervals_ok | (on_grid[:-1] & on_grid[1:]))
+    return irregular
 
 
 def _period_of(time: Array, where: str) -> float:
@@ -247,7 +248,7 @@ def _with_skipped_rows(table: Table, steps: list[Step]) -> Array:
 def _longest_stretch(table: Table, steps: list[Step]) -> Array:
     """Keep the longest run of rows without a missing value or a jump in time."""
     values = table.values
-    good = np.isfinite(values).all(axis=1)
+    good: NDArray[np.bool_] = np.isfinite(values).all(axis=1)
     broken = np.zeros(values.shape[0] - 1, dtype=bool)  # between row k and k + 1
     if table.time is not None:
         time = values[:, table.time]

@@ -1,0 +1,149 @@
+"""Text of a CSV file: its header row and its numbers, with the first bad cell named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ambid.errors import RecordError
+from ambid.record.record import Array
+from ambid.record.sampling import GapPolicy
+
+_HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """The header row: its line number, the delimiter it shows, and the columns it names."""
+
+    row: int
+    delimiter: str
+    names: tuple[str, ...]
+    unit_texts: tuple[str | None, ...]
+    comments: tuple[str, ...]
+
+
+def find_header(lines: Sequence[str], path: Path) -> Header:
+    """Find the header row and take it apart."""
+    row = next((k for k, text in enumerate(lines, start=1) if text.strip() and not text.startswith("#")), None)
+    if row is None:
+        raise RecordError(f"{path} has no header row. Write one row of 'name [unit]', then the numbers")
+    line = lines[row - 1]
+    comments = [text.lstrip("#").strip() for text in lines[: row - 1] if text.startswith("#")]
+    delimiter = _delimiter(line, row, path)
+    cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
+    if all(np.isfinite(_number(cell)) for cell in cells):
+        raise RecordError(
+            f"{path}, row {row}: numbers stand where the header row is wanted. Write one row of 'name [unit]' before"
+            " them, without '#'"
+        )
+    names, units = [], []
+    for j, cell in enumerate(cells, start=1):
+        match = _HEADER_CELL.fullmatch(cell)
+        name = match["name"].strip() if match else cell
+        if not name:
+            raise RecordError(
+                f"{path}, row {row}: column {j} has no name. Write 'name [unit]', or remove the delimiter"
+            )
+        if name in names:
+            raise RecordError(f"{path}, row {row}: column {name!r} stands twice; names must differ. Rename one")
+        names.append(name)
+        units.append(match["unit"].strip() if match else None)
+    return Header(row=row, delimiter=delimiter, names=tuple(names), unit_texts=tuple(units), comments=tuple(comments))
+
+
+def _delimiter(line: str, row: int, path: Path) -> str:
+    """Tell what separates the columns, from the header row outside its units."""
+    outside = re.sub(r"\[[^\[\]]*\]", "[]", line)
+    found = [d for d in (",", ";", "\t") if d in outside]
+    if len(found) > 1:
+        raise RecordError(
+            f"{path}, row {row}: the header holds both {found[0]!r} and {found[1]!r}; one delimiter only. Use commas"
+        )
+    if not found and outside.count("[]") > 1:
+        raise RecordError(f"{path}, row {row}: the columns are not separated by commas. Write 'time [s],voltage [V],…'")
+    return found[0] if found else ","
+
+
+def data_rows(lines: list[str], header_row: int, path: Path, at_least: int) -> list[str]:
+    """Return the rows of numbers, without empty lines at the end."""
+    end = len(lines)
+    while end > header_row and not lines[end - 1].strip():
+        end -= 1
+    body = lines[header_row:end]
+    if not body:
+        raise RecordError(f"{path} has a header row and no data. Record at least {at_least} rows")
+    if len(body) < at_least:
+        rows = "row" if len(body) == 1 else "rows"
+        raise RecordError(f"{path} has {len(body)} {rows} of data; at least {at_least} are needed. Record for longer")
+    return body
+
+
+def read_values(body: list[str], header: Header, path: Path, gaps: GapPolicy) -> Array:
+    """Turn the rows into numbers: all at once if they are sound, else cell by cell."""
+    if "" not in body:  # np.loadtxt would skip an empty line without a word
+        try:
+            values = np.loadtxt(body, delimiter=header.delimiter, comments=None, ndmin=2)
+        except ValueError:
+            pass
+        else:
+            if values.shape[1] == len(header.names) and np.isfinite(values).all():
+                return values
+    return _cell_by_cell(body, header, path, gaps)
+
+
+def _cell_by_cell(body: list[str], header: Header, path: Path, gaps: GapPolicy) -> Array:
+    """Read row by row; name the first bad cell, or mark bad cells NaN where the policy treats gaps."""
+    n = len(header.names)
+    values = np.full((len(body), n), np.nan)
+    for k, line in enumerate(body):
+        cells = line.split(header.delimiter)
+        row = header.row + 1 + k
+        if len(cells) != n:
+            raise RecordError(f"{path}, row {row}: {_ragged(line, len(cells), n, header.delimiter)}")
+        for j, cell in enumerate(cells):
+            number = _number(cell)
+            if not np.isfinite(number):
+                text = cell.strip()
+                if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", text):
+                    raise RecordError(
+                        f"{path}, row {row}, column {header.names[j]!r}: {text!r} has a decimal comma;"
+                        " numbers need a decimal point. Export again with a point"
+                    )
+                if gaps == "error":
+                    what = f"{text!r} is not a finite number" if text else "the value is missing"
+                    raise RecordError(
+                        f"{path}, row {row}, column {header.names[j]!r}: {what}; every cell must be one."
+                        " Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
+                    )
+                number = np.nan
+            values[k, j] = number
+    return values
+
+
+def _ragged(line: str, got: int, wanted: int, delimiter: str) -> str:
+    """Say what is wrong with a row that has too many or too few cells."""
+    if not line.strip():
+        return "the line is empty; each line must be a row of data. Remove it"
+    if line.lstrip().startswith("#"):
+        return "a comment stands among the data; comments go before the header row. Move it"
+    other = [d for d in (",", ";", "\t") if d != delimiter and d in line]
+    if other and got == 1:
+        return f"the data are separated by {other[0]!r} but the header by {delimiter!r}. Use commas in both"
+    hint = "; if the numbers have decimal commas, export them with a point" if delimiter == "," and got > wanted else ""
+    cells = "cell" if got == 1 else "cells"
+    return (
+        f"{got} {cells} where the header names {wanted} columns{hint}. Correct the row, or remove it if it was cut off"
+    )
+
+
+def _number(cell: str) -> float:
+    """Return the number in a cell, NaN if it holds none."""
+    try:
+        return float("nan") if "_" in cell else float(cell)
+    except ValueError:
+        return float("nan")

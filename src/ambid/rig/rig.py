@@ -1,0 +1,204 @@
+"""The rig: what is known of a bench before its records are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+from ambid.errors import RigError
+from ambid.physics.models import nearest
+from ambid.physics.parameters import Parameter
+from ambid.record.calibration import Calibration
+from ambid.record.sampling import GapPolicy
+
+_EMPTY: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigChannel:
+    """Where a role of the model is found in a record.
+
+    Attributes
+    ----------
+    role : str
+        Input or output of the model (``voltage``, ``current``, ``position``), or ``reference``.
+    column : str
+        Column of the record.
+    unit : str or None
+        Unit of that column, where it overrides the header's.
+    calibration : Calibration or None
+        From the column's SI unit to the role's; None if the column is the role already.
+    delay : int or "auto"
+        Samples by which the input acts later than logged; ``"auto"``: the identification finds it. 0 for outputs.
+    variable : str or None
+        Variable of a ``.mat`` file that holds the column; None: it is called like the column.
+    """
+
+    role: str
+    column: str
+    unit: str | None = None
+    calibration: Calibration | None = None
+    delay: int | Literal["auto"] = 0
+    variable: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """The controller that closes the loop in simulation: V = -(kp e + ki ∫e dt + kd de/dt), e = position - reference.
+
+    Attributes
+    ----------
+    kind : {"pid"}
+        The only kind.
+    kp, ki, kd : float
+        Gains in V/m, V/(m s), V s/m.
+    delay : int
+        Samples between measuring and acting.
+    limits : Mapping[str, tuple[float, float]]
+        Lowest and highest value of a role, SI.
+    """
+
+    kind: Literal["pid"] = "pid"
+    kp: float = 0.0
+    ki: float = 0.0
+    kd: float = 0.0
+    delay: int = 0
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """Noise of the bench, for simulation.
+
+    Attributes
+    ----------
+    position, current : float
+        Sensor noise, m rms and A rms.
+    force, voltage : float
+        Process noise densities, N/√Hz and V/√Hz.
+    resolutions : Mapping[str, float]
+        Quantisation step of a role, SI; 0 or absent: none.
+    """
+
+    position: float = 0.0
+    current: float = 0.0
+    force: float = 0.0
+    voltage: float = 0.0
+    resolutions: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordSettings:
+    """How records of the bench are read.
+
+    Attributes
+    ----------
+    rate_hz : float or None
+        Sampling rate in Hz for records without time.
+    gaps : {"error", "interpolate", "cut"} or None
+        What to do about gaps; None: refuse them.
+    from_s, to_s : float or None
+        Which part of a record is used, s.
+    time : (variable, unit) or None
+        Time variable of a ``.mat`` file.
+    """
+
+    rate_hz: float | None = None
+    gaps: GapPolicy | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+    time: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rig:
+    """A bench: model, channels and their calibration, parameters, loop, noise. All numbers SI.
+
+    Attributes
+    ----------
+    name : str
+        A line for reports.
+    model : str
+        Name of the model, one of :func:`ambid.physics.models.model_names`.
+    channels : tuple of RigChannel
+        One per role: the model's inputs, then its outputs, then ``reference`` if it is given.
+    parameters : tuple of Parameter
+        One per parameter of the model, in its order. Those that the file does not name are free, or fixed at the
+        model's default where it has one.
+    operating_point : Mapping[str, float]
+        Declared values of roles, SI; a role that is absent takes the mean of the record.
+    loop : Loop or None
+        Controller, for simulation.
+    noise : Noise or None
+        Noise, for simulation.
+    record : RecordSettings
+        How records are read.
+    open_loop : bool
+        The user declares that records are taken without feedback.
+    source : Path or None
+        The file it came from.
+    """
+
+    name: str
+    model: str
+    channels: tuple[RigChannel, ...]
+    parameters: tuple[Parameter, ...]
+    operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
+    loop: Loop | None = None
+    noise: Noise | None = None
+    record: RecordSettings = field(default_factory=RecordSettings)
+    open_loop: bool = False
+    source: Path | None = None
+
+    def channel(self, role: str) -> RigChannel:
+        """Return the channel of a role.
+
+        Parameters
+        ----------
+        role : str
+            Such as ``"voltage"``.
+
+        Returns
+        -------
+        RigChannel
+            The channel.
+
+        Raises
+        ------
+        RigError
+            If the rig has no such role.
+        """
+        for c in self.channels:
+            if c.role == role:
+                return c
+        roles = [c.role for c in self.channels]
+        raise RigError(f"the rig has no channel {role!r}; it has {', '.join(roles)}.{nearest(role, roles)}")
+
+    def parameter(self, name: str) -> Parameter:
+        """Return the parameter called `name`.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``"k_i"``.
+
+        Returns
+        -------
+        Parameter
+            In SI units.
+
+        Raises
+        ------
+        RigError
+            If the model has none of that name.
+        """
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        names = [p.name for p in self.parameters]
+        raise RigError(
+            f"model {self.model!r} has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)}"
+        )

@@ -1,0 +1,246 @@
+"""What a rig file (TOML, schema ``ambid.rig/1``) may hold, and one line for everything that it may not.
+
+Only the shape is checked here: known keys, types, finite numbers. What the entries mean together is checked where the
+rig is built.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ambid.errors import RigError
+from ambid.physics.models import nearest
+from ambid.record._files import file_bytes, utf8_text
+
+SCHEMA = "ambid.rig/1"
+
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, strict=True, ge=0)]
+Samples = Annotated[int, Field(strict=True, ge=0)]
+Text = Annotated[str, Field(strict=True, min_length=1)]
+
+
+class _Entry(BaseModel):
+    """Unknown keys are refused everywhere."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class QuantityEntry(_Entry):
+    """``{ value = 10.0, unit = "mm" }``."""
+
+    value: Number
+    unit: Text
+
+
+class ChannelEntry(_Entry):
+    """``[channels.<role>]``: which column is this role, and how its values become the role's unit."""
+
+    column: Text | None = None
+    variable: Text | None = None
+    unit: Text | None = None
+    gain: Number | None = None
+    offset: Number | None = None
+    table: Text | None = None
+    extrapolate: Annotated[bool, Field(strict=True)] = False
+    delay: Literal["auto"] | Samples | None = None
+
+
+class ParameterEntry(_Entry):
+    """One line of ``[parameters]``."""
+
+    value: Number | None = None
+    unit: Text | None = None
+    role: Literal["free", "fixed", "prior"] = "free"
+    sd: Number | None = None
+
+
+class LoopEntry(_Entry):
+    """``[loop]``: the controller, for simulation. Gains in V/m, V/(m s), V s/m; limits in SI, ± or [low, high]."""
+
+    kind: Literal["pid"] = "pid"
+    kp: Number = 0.0
+    ki: Number = 0.0
+    kd: Number = 0.0
+    delay: Samples = 0
+    limits: dict[str, Number | tuple[Number, Number]] = Field(default_factory=dict)
+
+
+class NoiseEntry(_Entry):
+    """``[noise]``: for simulation. Sensor noise rms in SI, process noise as densities, resolutions in SI."""
+
+    position: NotNegative = 0.0
+    current: NotNegative = 0.0
+    force: NotNegative = 0.0
+    voltage: NotNegative = 0.0
+    resolutions: dict[str, NotNegative] = Field(default_factory=dict)
+
+
+class TimeEntry(_Entry):
+    """``record.time``: the time variable of a .mat file."""
+
+    variable: Text
+    unit: Text = "s"
+
+
+class RecordEntry(_Entry):
+    """``[record]``: how records of this bench are read."""
+
+    rate_hz: Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)] | None = None
+    gaps: Literal["error", "interpolate", "cut"] | None = None
+    from_: NotNegative | None = Field(default=None, alias="from")
+    to: Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)] | None = None
+    time: TimeEntry | None = None
+
+
+class RigFile(_Entry):
+    """The whole file."""
+
+    schema_: Literal["ambid.rig/1"] = Field(alias="schema")
+    name: Annotated[str, Field(strict=True)] = ""
+    model: Text
+    channels: dict[str, ChannelEntry] = Field(default_factory=dict)
+    parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
+    operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
+    loop: LoopEntry | None = None
+    noise: NoiseEntry | None = None
+    record: RecordEntry = Field(default_factory=RecordEntry)
+    open_loop: Annotated[bool, Field(strict=True)] = False
+
+
+_ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
+    (): RigFile,
+    ("channels", "*"): ChannelEntry,
+    ("parameters", "*"): ParameterEntry,
+    ("operating_point", "*"): QuantityEntry,
+    ("loop",): LoopEntry,
+    ("noise",): NoiseEntry,
+    ("record",): RecordEntry,
+    ("record", "time"): TimeEntry,
+}
+
+
+def read_rig_file(path: Path) -> RigFile:
+    """Read a rig file and check its shape.
+
+    Parameters
+    ----------
+    path : Path
+        TOML, UTF-8.
+
+    Returns
+    -------
+    RigFile
+        As written: units are not yet converted.
+
+    Raises
+    ------
+    RigError
+        If the file cannot be read, is no TOML, or has an unknown key, a wrong type or a number that is not finite.
+    """
+    text = utf8_text(file_bytes(path, RigError, "rig"), path, RigError, "rig")
+    if not text.strip():
+        raise RigError(
+            f"rig {path} is empty. Write at least schema and model, or make one with: ambid init RECORD -o RIG"
+        )
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as failure:
+        raise RigError(f"rig {path} is not valid TOML: {failure}. Correct that line") from None
+    return checked(content, str(path))
+
+
+def checked(content: dict[str, Any], where: str) -> RigFile:
+    """Check the shape of a rig given as nested tables.
+
+    Parameters
+    ----------
+    content : dict
+        What the TOML file holds.
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    RigFile
+        The same, typed.
+
+    Raises
+    ------
+    RigError
+        For the first entry that breaks a rule.
+    """
+    given = content.get("schema")
+    if given != SCHEMA:
+        got = "has no schema" if given is None else f"has schema {given!r}"
+        raise RigError(f'rig {where} {got}; this program reads {SCHEMA!r}. Write schema = "{SCHEMA}" on top')
+    try:
+        return RigFile.model_validate(content)
+    except ValidationError as failure:
+        # An unknown key is the likeliest slip, and explains what else is wrong beside it; of a choice such as
+        # "auto" or a number, the complaint about the number is the telling one.
+        rank = {"extra_forbidden": 0, "literal_error": 2}
+        errors = sorted(failure.errors(include_url=False), key=lambda e: rank.get(e["type"], 1))
+        raise RigError(f"rig {where}: {_in_words(errors[0], content)}") from None
+
+
+def _in_words(error: Any, content: dict[str, Any]) -> str:
+    """Turn one of pydantic's errors into place, rule, what stood there, and remedy."""
+    keys = _place(error["loc"], content)
+    place, kind, limits = ".".join(keys), error["type"], error.get("ctx", {})
+    if kind == "extra_forbidden":
+        return _unknown_key(keys)
+    if kind == "missing":
+        return f"{place} is missing. Add it"
+    got = error["input"]
+    shown = "a table" if isinstance(got, dict) else f"{got!r}"
+    if keys[:2] == ["loop", "limits"]:
+        rule = "it must be a number, or [low, high]"
+    elif kind == "finite_number":
+        rule = "it must be finite"
+    elif kind in ("literal_error", "enum"):
+        rule = f"it must be {limits['expected']}"
+        if isinstance(got, str):
+            words = [w.strip("' ") for w in limits["expected"].replace(" or ", ",").split(",")]
+            near = nearest(got, words)
+            rule += f".{near}" if near else ""
+    elif kind in ("greater_than_equal", "greater_than"):
+        rule = "it must not be negative" if kind == "greater_than_equal" else "it must be positive"
+    elif kind in ("model_type", "dict_type"):
+        example = '{ value = 1.0, unit = "…" }' if keys[0] in ("parameters", "operating_point") else "a [table]"
+        rule = f"it must be {example}"
+    elif kind in ("string_type", "string_too_short"):
+        rule = "it must be a text that is not empty"
+    elif kind == "bool_type":
+        rule = "it must be true or false"
+    elif kind.startswith("int"):
+        rule = "it must be a whole number of samples" + (', or "auto"' if keys[0] == "channels" else "")
+    else:
+        rule = "it must be a number, without quotes"
+    return f"{place} is {shown}; {rule}{'' if rule.endswith('?') else '.'} Correct it"
+
+
+def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
+    """Keep of pydantic's location what is written in the file (it adds the branch of a union)."""
+    keys: list[str] = []
+    for part in loc:
+        if isinstance(content, dict) and part in content:
+            keys.append(str(part))
+            content = content[part]
+        elif isinstance(content, dict) and part == loc[-1] and isinstance(part, str) and part.isidentifier():
+            keys.append(part)
+    return keys or ["the file"]
+
+
+def _unknown_key(keys: list[str]) -> str:
+    """Name an unknown key, the table it stands in, and the nearest known key."""
+    *table, key = keys
+    pattern = tuple("*" if i == 1 and t not in ("time",) else t for i, t in enumerate(table))
+    entry = _ENTRIES.get(pattern, RigFile)
+    known = [field.alias or name for name, field in entry.model_fields.items()]
+    inside = f"in [{'.'.join(table)}]" if table else "at the top"
+    return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"
