@@ -1,0 +1,150 @@
+"""The nonlinear one-axis plant: voltage-driven magnet, mass, gravity (thesis eq. 4.9 in physical form).
+
+m x'' = f(x, i) - c x' + m g,  V = R i + dlambda(x, i)/dt, with f and lambda from one co-energy (`physics.magnet`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ambid.errors import ModelError
+from ambid.physics.magnet import Magnet, Number
+
+
+class OperatingPoint(NamedTuple):
+    """Where a plant rests, and where a linear model holds.
+
+    Attributes
+    ----------
+    position, current, voltage : float
+        In m, A and V.
+    """
+
+    position: float = 0.0
+    current: float = 0.0
+    voltage: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NonlinearPlant:
+    """Magnet, coil and mass on one axis, driven by a voltage.
+
+    Attributes
+    ----------
+    magnet : Magnet
+        `SingleMagnet` or `DifferentialPair`.
+    m : float
+        Mass in kg.
+    R : float
+        Resistance of the axis in ohm (of both coils for a differential pair).
+    c : float
+        Mechanical damping in N s/m.
+    gravity : float
+        Gravity along +x in m/s^2; 0 for a horizontal axis.
+    """
+
+    magnet: Magnet
+    m: float
+    R: float
+    c: float = 0.0
+    gravity: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.m) and self.m > 0.0):
+            raise ModelError(f"m is {self.m} kg; a mass must be a positive number. Correct m")
+        for name, value, unit in (("R", self.R, "ohm"), ("c", self.c, "N s/m")):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ModelError(f"{name} is {value} {unit}; it must be zero or positive. Correct {name}")
+        if not math.isfinite(self.gravity):
+            raise ModelError(f"gravity is {self.gravity} m/s^2; it must be a finite number. Correct gravity")
+
+    def derivative(
+        self, state: tuple[Number, Number, Number], voltage: Number, force: float = 0.0
+    ) -> tuple[Number, Number, Number]:
+        """Return the right-hand side of the state equation.
+
+        Parameters
+        ----------
+        state : tuple
+            Position in m, velocity in m/s, current in A.
+        voltage : float
+            Axis voltage in V.
+        force : float
+            Disturbing force along +x in N.
+
+        Returns
+        -------
+        tuple
+            x' in m/s, x'' in m/s^2, i' in A/s.
+        """
+        x, v, i = state
+        w = self.magnet.coenergy
+        acceleration = (w.force(x, i) - self.c * v + force) / self.m + self.gravity
+        return v, acceleration, (voltage - self.R * i - w.force_per_current(x, i) * v) / w.inductance(x)
+
+    def equilibrium(self, position: float) -> OperatingPoint:
+        """Return the rest point at `position`.
+
+        Parameters
+        ----------
+        position : float
+            In m.
+
+        Returns
+        -------
+        OperatingPoint
+            Position in m, current in A and voltage in V.
+
+        Raises
+        ------
+        ModelError
+            If the position closes a gap or the magnet cannot hold the load there.
+        """
+        current = self.magnet.holding_current(position, self.m * self.gravity)
+        return OperatingPoint(position, current, self.R * current)
+
+    def linearise(self, position: float) -> dict[str, float]:
+        """Return the parameters of the linear model ``one-axis`` at the rest point (thesis eq. 4.8).
+
+        Parameters
+        ----------
+        position : float
+            In m.
+
+        Returns
+        -------
+        dict of str to float
+            m in kg, k_x in N/m, k_i in N/A, R in ohm, L in H, c in N s/m; f = k_i i - k_x x.
+        """
+        x, i, _ = self.equilibrium(position)
+        w = self.magnet.coenergy
+        return {
+            "m": self.m,
+            "k_x": w.displacement_coefficient(x, i),
+            "k_i": w.force_per_current(x, i),
+            "R": self.R,
+            "L": w.inductance(x),
+            "c": self.c,
+        }
+
+    def energy(self, state: tuple[float, float, float]) -> float:
+        """Return the energy that the axis voltage works against: lambda i - W' + m x'^2/2 - m g x.
+
+        Its rate is V i - R i^2 - c x'^2. For a pair it leaves out what the bias source gives or takes.
+
+        Parameters
+        ----------
+        state : tuple of float
+            Position in m, velocity in m/s, current in A.
+
+        Returns
+        -------
+        float
+            Energy in J, up to a constant.
+        """
+        x, v, i = state
+        w = self.magnet.coenergy
+        field = w.flux_linkage(x, i) * i - w.value(x, i)
+        return field + 0.5 * self.m * v**2 - self.m * self.gravity * x

@@ -1,0 +1,211 @@
+"""Named benches: plants of known truth with a loop that holds them, noise and limits.
+
+What a source prints is given with its source; everything else is chosen, and `Preset.sources` says so for every number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from ambid.errors import ModelError
+from ambid.physics.loop import Limits, Loop, Noise, placed_loop
+from ambid.physics.magnet import DifferentialPair, SingleMagnet
+from ambid.physics.models import nearest
+from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preset:
+    """A named bench.
+
+    Attributes
+    ----------
+    name, summary : str
+        Name for the command line, and one line that describes it.
+    parameters : Mapping[str, float]
+        Truth of the linear model `model` in SI units: m, k_x, k_i, R, L, c.
+    loop : Loop
+        Controller and delay; stable on the linear plant at `rate_hz`.
+    usually_closed : bool
+        Whether a record is taken in closed loop unless told otherwise.
+    noise : Noise
+        Sensor and process noise.
+    limits : Limits
+        Voltage, current and stops.
+    rate_hz : float
+        Sampling rate in Hz that the loop is designed for.
+    sources : Mapping[str, str]
+        Where each number comes from, or that it is chosen.
+    model : str
+        Name of the linear model.
+    plant : NonlinearPlant or None
+        The nonlinear plant whose linearisation `parameters` is, where there is one.
+    operating_point : OperatingPoint
+        Where the bench rests: m, A, V.
+    instruments : Mapping[str, (float, str)]
+        Gains of sensors and amplifiers with their units, where the source gives them.
+    """
+
+    name: str
+    summary: str
+    parameters: Mapping[str, float]
+    loop: Loop
+    usually_closed: bool
+    noise: Noise
+    limits: Limits
+    rate_hz: float
+    sources: Mapping[str, str]
+    model: str = "one-axis"
+    plant: NonlinearPlant | None = None
+    operating_point: OperatingPoint = field(default_factory=OperatingPoint)
+    instruments: Mapping[str, tuple[float, str]] = field(default_factory=lambda: MappingProxyType({}))
+
+
+def _thesis() -> Preset:
+    parameters = {"m": 0.1, "k_x": 587.22, "k_i": -310.08, "R": 1.25, "L": 59.6e-3, "c": 0.0}
+    table = "thesis table 4.1"
+    return Preset(
+        name="thesis",
+        summary="the thesis's simulation rig: stable, poles -0.0076 and -10.5 +- 4017j rad/s",
+        parameters=MappingProxyType(parameters),
+        loop=placed_loop(parameters, (-400 + 3990j, -400 - 3990j, -40, -10), derivative_cutoff_hz=3000.0, delay=0.0),
+        usually_closed=False,
+        noise=Noise(position=5e-7, current=1e-4),
+        limits=Limits(voltage=(-24.0, 24.0), current=(-2.0, 2.0), position=(-0.01, 0.01)),
+        rate_hz=10_000.0,
+        sources=MappingProxyType(
+            {
+                "m": table,
+                "k_x": table,
+                "k_i": table,
+                "L": f"{table}, printed 5.96e-2 mH; (4.10) needs 59.6 mH",
+                "R": f"{table}, printed 1.8 ohm; (4.10) needs 1.25 ohm",
+                "c": "thesis eq. 4.8: none",
+                "loop, noise, limits, rate_hz": "chosen; travel of 20 mm as in thesis ch. 5",
+            }
+        ),
+    )
+
+
+def _unstable_bearing() -> Preset:
+    magnet = DifferentialPair(turns=138, area=470.3e-6, bias=1.0, gap=0.432e-3, half_angle=0.392, leakage=2e-3)
+    plant = NonlinearPlant(magnet=magnet, m=4.0, R=1.6)
+    parameters = plant.linearise(0.0)
+    return Preset(
+        name="unstable-bearing",
+        summary="differential bearing: 138 turns, 470.3 mm2, bias 1 A, gap 0.432 mm; k_i 55.7 N/A, k_x -1.29e5 N/m",
+        parameters=MappingProxyType(parameters),
+        plant=plant,
+        loop=placed_loop(parameters, (-1500, -250 + 250j, -250 - 250j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=2e-7, current=2e-3, force=2.0, voltage=0.05),
+        limits=Limits(voltage=(-48.0, 48.0), current=(-1.0, 1.0), position=(-0.2e-3, 0.2e-3)),
+        rate_hz=20_000.0,
+        sources=MappingProxyType(
+            {
+                "turns, area, bias, gap, half_angle": "given for this bench; k_i and k_x follow (theory.md sec. 1)",
+                "L": "follows from the geometry (24.07 mH) and a chosen leakage of 2 mH, both coils",
+                "m": "chosen",
+                "R": "chosen, both coils",
+                "limits.current": "the bias: neither coil reverses",
+                "loop, noise, limits, rate_hz": "chosen",
+            }
+        ),
+    )
+
+
+def _rmit() -> Preset:
+    parameters = {"m": 2.0, "k_x": -150_000.0, "k_i": 61.0, "R": 2.0, "L": 30e-3, "c": 0.0}
+    source = "thesis sec. 1.4"
+    return Preset(
+        name="rmit",
+        summary="one axis of the RMIT bearing: 61 N/A, -150 000 N/m, air gap 0.35 mm",
+        parameters=MappingProxyType(parameters),
+        loop=placed_loop(parameters, (-1500, -350 + 350j, -350 - 350j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=5e-7, current=1e-3, force=1.0, voltage=0.05),
+        limits=Limits(voltage=(-60.0, 60.0), current=(-2.0, 2.0), position=(-350e-6, 350e-6)),
+        rate_hz=20_000.0,
+        sources=MappingProxyType(
+            {
+                "k_i": f"{source}, eq. 1.6",
+                "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
+                "limits.position": source,
+                "position_sensor": source,
+                "amplifier": source,
+                "m": "chosen",
+                "R": "chosen",
+                "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
+                "loop, noise, voltage and current limits, rate_hz": "chosen",
+            }
+        ),
+        instruments=MappingProxyType({"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")}),
+    )
+
+
+def _levitated_ball() -> Preset:
+    m, gravity, gap, current = 0.06, 9.81, 0.010, 0.95
+    k = 2.0 * m * gravity * (gap / current) ** 2
+    plant = NonlinearPlant(magnet=SingleMagnet(k=k, leakage=0.104), m=m, R=4.2, gravity=gravity)
+    parameters = plant.linearise(gap)
+    return Preset(
+        name="levitated-ball",
+        summary="a ball under one magnet: position is the gap, rest at 10 mm and 0.95 A",
+        parameters=MappingProxyType(parameters),
+        plant=plant,
+        operating_point=plant.equilibrium(gap),
+        loop=placed_loop(parameters, (-150, -40 + 30j, -40 - 30j, -2), derivative_cutoff_hz=400.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=2000.0, position=2e-6, current=1e-3, force=2e-3, voltage=0.02),
+        limits=Limits(voltage=(0.0, 12.0), current=(0.0, 2.5), position=(0.002, 0.020)),
+        rate_hz=2000.0,
+        sources=MappingProxyType(
+            {
+                "k_i, k_x": "gravity balance at the chosen rest point: k_i = -2 m g/i0, k_x = -2 m g/x0",
+                "m, R, leakage, rest point": "chosen",
+                "loop, noise, limits, rate_hz": "chosen",
+            }
+        ),
+    )
+
+
+_MAKERS = {"thesis": _thesis, "unstable-bearing": _unstable_bearing, "rmit": _rmit, "levitated-ball": _levitated_ball}
+
+
+def preset_names() -> tuple[str, ...]:
+    """Return the names of all presets.
+
+    Returns
+    -------
+    tuple of str
+        Names for the command line.
+    """
+    return tuple(_MAKERS)
+
+
+def preset(name: str) -> Preset:
+    """Return the bench called `name`.
+
+    Parameters
+    ----------
+    name : str
+        One of `preset_names`.
+
+    Returns
+    -------
+    Preset
+        The bench.
+
+    Raises
+    ------
+    ModelError
+        If there is none of that name; the message names the nearest.
+    """
+    if name not in _MAKERS:
+        known = list(_MAKERS)
+        raise ModelError(
+            f"there is no preset {name!r}; there are {', '.join(known)}.{nearest(name, known)} Give one of them"
+        )
+    return _MAKERS[name]()

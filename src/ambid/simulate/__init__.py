@@ -1,0 +1,17 @@
+"""Simulation: open and closed loop, linear and nonlinear, with noise, quantisation, delay and limits."""
+
+from ambid.simulate.bench import Simulation, simulate, simulate_preset
+from ambid.simulate.levels import largest_amplitude, noise_at_snr
+from ambid.simulate.plant import LinearPlant
+from ambid.simulate.poles import closed_loop_matrix, closed_loop_poles
+
+__all__ = [
+    "LinearPlant",
+    "Simulation",
+    "closed_loop_matrix",
+    "closed_loop_poles",
+    "largest_amplitude",
+    "noise_at_snr",
+    "simulate",
+    "simulate_preset",
+]

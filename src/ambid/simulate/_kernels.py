@@ -1,0 +1,195 @@
+"""The sequential loop of the simulator: controller, delay line, plant, stops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def rate_of_change(
+    x: float, v: float, i: float, voltage: float, force: float, magnet: Array, body: Array
+) -> tuple[float, float]:
+    """Return x'' and i' of the nonlinear plant (`ambid.physics.magnet.CoEnergy`)."""
+    gap_a, gap_b = 1.0 / (magnet[1] - x), 1.0 / (magnet[3] + x)
+    flux_a, flux_b = (magnet[4] + i) * gap_a, (magnet[4] - i) * gap_b
+    pull = 0.5 * (magnet[0] * flux_a * flux_a - magnet[2] * flux_b * flux_b)
+    motional = magnet[0] * flux_a * gap_a + magnet[2] * flux_b * gap_b
+    inductance = magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
+    acceleration = (pull - body[1] * v + force) / body[0] + body[3]
+    return acceleration, (voltage - body[2] * i - motional * v) / inductance
+
+
+@njit(cache=True, nogil=True)
+def runge_kutta(
+    x: float, v: float, i: float, voltage: float, force: float, h: float, magnet: Array, body: Array
+) -> tuple[float, float, float]:
+    """Return position, velocity and current one classical fourth-order step of `h` s later."""
+    v1 = v
+    a1, c1 = rate_of_change(x, v, i, voltage, force, magnet, body)
+    v2 = v + 0.5 * h * a1
+    a2, c2 = rate_of_change(x + 0.5 * h * v1, v2, i + 0.5 * h * c1, voltage, force, magnet, body)
+    v3 = v + 0.5 * h * a2
+    a3, c3 = rate_of_change(x + 0.5 * h * v2, v3, i + 0.5 * h * c2, voltage, force, magnet, body)
+    v4 = v + h * a3
+    a4, c4 = rate_of_change(x + h * v3, v4, i + h * c3, voltage, force, magnet, body)
+    sixth = h / 6.0
+    return (
+        x + sixth * (v1 + 2.0 * (v2 + v3) + v4),
+        v + sixth * (a1 + 2.0 * (a2 + a3) + a4),
+        i + sixth * (c1 + 2.0 * (c2 + c3) + c4),
+    )
+
+
+@njit(cache=True, nogil=True)
+def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, bool]:
+    """Stop the rotor at the ends of its range, without rebound; the flag says that it touched."""
+    if x >= high:
+        return high, min(v, 0.0), True
+    if x <= low:
+        return low, max(v, 0.0), True
+    return x, v, False
+
+
+@njit(cache=True, nogil=True)
+def quantise(value: float, step: float) -> float:
+    """Return `value` on the grid of `step`; a step of zero leaves it."""
+    return math.floor(value / step + 0.5) * step if step > 0.0 else value
+
+
+@njit(cache=True, nogil=True)
+def advance_nonlinear(
+    x: Array,
+    late: float,
+    now: float,
+    fraction: float,
+    disturbance: Array,
+    period: float,
+    substeps: int,
+    magnet: Array,
+    body: Array,
+    low: float,
+    high: float,
+) -> bool:
+    """Carry the state over one sample in place: first under the voltage `late`, then under `now`."""
+    touched = False
+    p, v, i = x[0], x[1], x[2]
+    for part in range(2):
+        length = period * (fraction if part == 0 else 1.0 - fraction)
+        if length == 0.0:
+            continue
+        voltage = (late if part == 0 else now) + disturbance[1]
+        h = length / substeps
+        for _ in range(substeps):
+            p, v, i = runge_kutta(p, v, i, voltage, disturbance[0], h, magnet, body)
+            p, v, hit = stop(p, v, low, high)
+            touched = touched or hit
+    x[0], x[1], x[2] = p, v, i
+    return touched
+
+
+@njit(cache=True, nogil=True)
+def advance_linear(
+    x: Array, centre: Array, late: float, now: float, disturbance: Array, a: Array, b: Array, b_late: Array, e: Array
+) -> None:
+    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations."""
+    n = x.size
+    deviation = x - centre
+    for row in range(n):
+        s = centre[row] + b[row] * now + b_late[row] * late
+        for column in range(n):
+            s += a[row, column] * deviation[column]
+        for column in range(e.shape[1]):
+            s += e[row, column] * disturbance[column]
+        x[row] = s
+
+
+@njit(cache=True, nogil=True)
+def run(
+    linear: bool,
+    excitation: Array,
+    setpoint: Array,
+    sensor_noise: Array,
+    disturbance: Array,
+    start: Array,
+    centre: Array,
+    centre_input: float,
+    outputs: Integers,
+    roles: tuple[int, int],
+    a: Array,
+    b: Array,
+    b_late: Array,
+    e: Array,
+    magnet: Array,
+    body: Array,
+    gains: Array,
+    delay: int,
+    fraction: float,
+    period: float,
+    substeps: int,
+    resolution: Array,
+    input_limits: tuple[float, float, float],
+    stops: tuple[float, float],
+) -> tuple[Array, Array, Array, int, int, int, int]:
+    """Run the loop over all samples.
+
+    `outputs` are the states that are measured, `roles` the columns among them of position and current (-1: none),
+    `gains` kp, ki T, kd, kc, tau, T, and `input_limits` low, high and resolution of the command.
+
+    Returns
+    -------
+    measured (n, n_outputs), command (n,), states (n, n_states), first contact (-1: none), first saturated command (-1:
+    none), number of saturated commands, first sample that is not finite (-1: none).
+    """
+    n, ny = sensor_noise.shape
+    measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))
+    contact, saturated, n_saturated = -1, -1, 0
+    x = start.copy()
+    at, current_at = roles
+    integral = derivative = last = 0.0
+    low, high, step = input_limits
+    for k in range(n):
+        for j in range(ny):
+            truth = x[outputs[j]]
+            if not math.isfinite(truth):
+                return measured, command, states, contact, saturated, n_saturated, k
+            measured[k, j] = quantise(truth + sensor_noise[k, j], resolution[j])
+        states[k] = x
+        wanted, error = centre_input + excitation[k], 0.0
+        if at >= 0:
+            y = measured[k, at]
+            error = setpoint[k] - y
+            derivative = (gains[4] * derivative - (gains[2] * (y - last) if k > 0 else 0.0)) / (gains[4] + gains[5])
+            last = y
+            wanted += gains[0] * error + integral + derivative
+        if current_at >= 0:
+            wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
+        beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
+        if beyond != 0.0:
+            n_saturated += 1
+            saturated = k if saturated < 0 else saturated
+        # Anti-windup: while the command is limited the integral may only move back.
+        growth = gains[1] * error
+        if beyond * growth <= 0.0:
+            integral += growth
+        command[k] = min(max(quantise(wanted, step), low), high)
+        now = command[k - delay] if k >= delay else centre_input
+        late = command[k - delay - 1] if k > delay else centre_input
+        if linear:
+            advance_linear(x, centre, late - centre_input, now - centre_input, disturbance[k], a, b, b_late, e)
+            touched = False
+            if at >= 0:
+                x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
+        else:
+            touched = advance_nonlinear(
+                x, late, now, fraction, disturbance[k], period, substeps, magnet, body, stops[0], stops[1]
+            )
+        if touched and contact < 0:
+            contact = k + 1
+    return measured, command, states, contact, saturated, n_saturated, -1

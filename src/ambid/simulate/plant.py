@@ -1,0 +1,99 @@
+"""Plants as the simulation loop takes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import ModelError
+from ambid.physics.discretise import discretise
+from ambid.physics.models import LinearModel, model
+from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinearPlant:
+    """A linear model with numbers.
+
+    Attributes
+    ----------
+    model : LinearModel
+        One of `ambid.physics.models.model`.
+    parameters : Mapping[str, float]
+        All of the model's parameters in SI units.
+    """
+
+    model: LinearModel
+    parameters: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        for spec in self.model.parameters:
+            value = self.parameters.get(spec.name, spec.default)
+            if value is None or not math.isfinite(value) or (spec.positive and value <= 0.0):
+                rule = "a positive number" if spec.positive else "a number"
+                raise ModelError(
+                    f"parameter {spec.name!r} of model {self.model.name!r} is {value}; a simulation wants {rule} in"
+                    f" {spec.unit}. Give {spec.name}"
+                )
+        full = {s.name: float(self.parameters.get(s.name, s.default or 0.0)) for s in self.model.parameters}
+        object.__setattr__(self, "parameters", MappingProxyType(full))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Standing:
+    """A plant at its operating point: what the simulation loop needs to know, linear or not."""
+
+    plant: LinearPlant | NonlinearPlant
+    model: LinearModel
+    point: OperatingPoint
+    centre: Array
+    centre_input: float
+
+    @classmethod
+    def of(cls, plant: LinearPlant | NonlinearPlant, point: OperatingPoint | None) -> Standing:
+        """Return the plant at `point`, by default at rest at zero."""
+        if isinstance(plant, LinearPlant):
+            of, point = plant.model, point or OperatingPoint()
+        else:
+            of, point = model("one-axis"), point or plant.equilibrium(0.0)
+        known = {"position": point.position, "velocity": 0.0, "current": point.current, "voltage": point.voltage}
+        return cls(
+            plant=plant,
+            model=of,
+            point=point,
+            centre=np.array([known[s] for s in of.states]),
+            centre_input=known[of.inputs[0]],
+        )
+
+    @property
+    def linear(self) -> bool:
+        """True for a linear plant."""
+        return isinstance(self.plant, LinearPlant)
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the linear model in SI units."""
+        if isinstance(self.plant, LinearPlant):
+            return self.plant.parameters
+        return self.plant.linearise(self.point.position)
+
+    def matrices(self, period: float, fraction: float) -> tuple[Array, Array, Array, Array]:
+        """Return A, B, B_late and E over a `period` in s; zeros for a nonlinear plant."""
+        if not isinstance(self.plant, LinearPlant):
+            return np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros((3, 2))
+        d, _ = discretise(self.model.matrices(self.plant.parameters), period, fraction=fraction)
+        full, now, late, noise = (np.ascontiguousarray(x) for x in (d.A, d.B[:, 0], d.B_late[:, 0], d.E))
+        return full, now, late, noise
+
+    def nonlinear(self) -> tuple[Array, Array]:
+        """Return the co-energy's numbers and m, c, R, gravity; zeros for a linear plant."""
+        if isinstance(self.plant, LinearPlant):
+            return np.zeros(6), np.zeros(4)
+        w, p = self.plant.magnet.coenergy, self.plant
+        return np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage]), np.array([p.m, p.c, p.R, p.gravity])
