@@ -45,15 +45,17 @@ def read_record(
     """
     path = Path(path)
     kind = _format_of(path)
+    if variables is not None and kind != "mat":
+        raise RecordError(f"{path}: a mapping of variables is for .mat files. Leave it out")
     if kind == "csv":
         return read_csv(path, rate_hz=rate_hz, gaps=gaps)
     if kind == "mat":
         from ambid.record.mat_format import read_mat
 
         return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps)
-    from ambid.record.hdf5_format import read_hdf5
+    from ambid.record.hdf5_format import read_hdf5_checked
 
-    return read_hdf5(path)
+    return read_hdf5_checked(path, rate_hz=rate_hz, gaps=gaps)
 
 
 def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:

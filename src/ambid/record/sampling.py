@@ -100,14 +100,14 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
             " Add the column, or give --rate HZ"
         )
     steps: list[Step] = []
-    values = table.values
+    values, first = table.values, 0
     if gaps == "interpolate":
         values = _interpolated(table, steps)
     elif gaps == "cut":
-        values = _longest_stretch(table, steps)
+        first, values = _longest_stretch(table, steps)
     if table.time is None:
         assert rate_hz is not None
-        return Sampled(values=values, rate_hz=float(rate_hz), start_s=0.0, steps=tuple(steps))
+        return Sampled(values=values, rate_hz=float(rate_hz), start_s=first / rate_hz, steps=tuple(steps))
     time = values[:, table.time]
     first_row = table.first_row if gaps == "error" else None
     _check_uniform(time, table.where, table.names[table.time], first_row)
@@ -245,10 +245,10 @@ def _with_skipped_rows(table: Table, steps: list[Step]) -> Array:
     return values
 
 
-def _longest_stretch(table: Table, steps: list[Step]) -> Array:
-    """Keep the longest run of rows without a missing value or a jump in time."""
+def _longest_stretch(table: Table, steps: list[Step]) -> tuple[int, Array]:
+    """Keep the longest run of rows without a missing value or a jump in time; return where it begins, and it."""
     values = table.values
-    good: NDArray[np.bool_] = np.isfinite(values).all(axis=1)
+    good: NDArray[np.bool_] = np.logical_and.reduce(np.isfinite(values), axis=1)
     broken = np.zeros(values.shape[0] - 1, dtype=bool)  # between row k and k + 1
     if table.time is not None:
         time = values[:, table.time]
@@ -267,7 +267,7 @@ def _longest_stretch(table: Table, steps: list[Step]) -> Array:
     if stop - start < values.shape[0]:
         settings = {"first": start, "kept": stop - start, "dropped": values.shape[0] - (stop - start)}
         steps.append(Step(name="gaps_cut", settings=settings))
-    return values[start:stop]
+    return start, values[start:stop]
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

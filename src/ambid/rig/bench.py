@@ -135,7 +135,7 @@ def _refuse_swapped(found: dict[str, Channel], wanted: dict[str, str], rig: Rig)
         for b in plain:
             if a != b and found[a].unit == wanted[b] and found[b].unit == wanted[a]:
                 raise UnitError(
-                    f"columns look swapped: channels.{a} is column {found[a].name!r} in [{found[a].unit}] and channels.{b}"
+                    f"swapped columns? channels.{a} is column {found[a].name!r} in [{found[a].unit}] and channels.{b}"
                     f" is column {found[b].name!r} in [{found[b].unit}]. Swap the two, or fix the header"
                 )
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ambid.errors import AmbidError, ModelError, RigError, UnitError
+from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import LinearModel, model, nearest
 from ambid.physics.parameters import Parameter, ParameterSpec
 from ambid.record.calibration import Calibration, read_calibration_table
-from ambid.rig.rig import Loop, Noise, RecordSettings, Rig, RigChannel
+from ambid.rig.rig import RecordSettings, Rig, RigChannel
 from ambid.units import Unit, parse_unit
 
 if TYPE_CHECKING:
-    from ambid.rig.schema import ChannelEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
+    from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
 
 REFERENCE = "reference"
 """A role that every model may have beside its own: the set point of the controller, in the unit of the position."""
@@ -103,8 +105,9 @@ def _build(file: RigFile, path: Path) -> Rig:
         channels=_channels(file.channels, plant, path) if file.channels else _default_channels(plant),
         parameters=_parameters(file.parameters, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
-        loop=_loop(file.loop, plant, where) if file.loop else None,
-        noise=_noise(file.noise, plant, where) if file.noise else None,
+        loop=_loop(file.loop) if file.loop else None,
+        limits=_limits(file.loop.limits, where) if file.loop and file.loop.limits else None,
+        noise=_noise(file.noise) if file.noise else None,
         record=RecordSettings(
             rate_hz=record.rate_hz,
             gaps=record.gaps,
@@ -246,9 +249,13 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
     if not isinstance(entry, Mapping):
         return MappingProxyType({})
     units = {role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}
-    _known_roles(entry, units, where, "operating_point")
     values: dict[str, float] = {}
     for role, quantity in entry.items():
+        if role not in units:
+            known = ", ".join(units)
+            raise RigError(
+                f"{where}: unknown key {role!r} in [operating_point]; known: {known}.{nearest(role, list(units))}"
+            )
         if quantity == "auto":
             continue
         place = f"{where}: operating_point.{role}"
@@ -259,36 +266,36 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
     return MappingProxyType(values)
 
 
-def _loop(entry: LoopEntry, plant: LinearModel, where: str) -> Loop:
-    _known_roles(entry.limits, plant.units, where, "loop.limits")
-    limits: dict[str, tuple[float, float]] = {}
-    for role, given in entry.limits.items():
+def _loop(entry: LoopEntry) -> Loop:
+    cutoff = math.inf if entry.derivative_cutoff_hz is None else entry.derivative_cutoff_hz
+    return Loop(kp=entry.kp, ki=entry.ki, kd=entry.kd, kc=entry.kc, derivative_cutoff_hz=cutoff, delay=entry.delay)
+
+
+def _limits(entry: LimitsEntry, where: str) -> Limits:
+    intervals: dict[str, tuple[float, float]] = {}
+    for role in ("voltage", "current", "position"):
+        given = getattr(entry, role)
+        if given is None:
+            continue
         low, high = given if isinstance(given, tuple) else (-given, given)
         if not low < high:
-            raise RigError(f"{where}: loop.limits.{role} is {given}; it must be positive, or [low, high]. Correct it")
-        limits[role] = (low, high)
-    return Loop(
-        kind=entry.kind, kp=entry.kp, ki=entry.ki, kd=entry.kd, delay=entry.delay, limits=MappingProxyType(limits)
-    )
+            raise RigError(
+                f"{where}: loop.limits.{role} is [{low}, {high}]; the lower comes first. Swap or correct them"
+            )
+        intervals[role] = (low, high)
+    return Limits(**intervals)
 
 
-def _noise(entry: NoiseEntry, plant: LinearModel, where: str) -> Noise:
-    _known_roles(entry.resolutions, plant.units, where, "noise.resolutions")
+def _noise(entry: NoiseEntry) -> Noise:
     return Noise(
         position=entry.position,
         current=entry.current,
         force=entry.force,
         voltage=entry.voltage,
-        resolutions=MappingProxyType(dict(entry.resolutions)),
+        position_resolution=entry.resolutions.position,
+        current_resolution=entry.resolutions.current,
+        voltage_resolution=entry.resolutions.voltage,
     )
-
-
-def _known_roles(entries: Mapping[str, object], roles: Mapping[str, str], where: str, table: str) -> None:
-    for role in entries:
-        if role not in roles:
-            raise RigError(
-                f"{where}: unknown key {role!r} in [{table}]; known: {', '.join(roles)}.{nearest(role, list(roles))}"
-            )
 
 
 def _unit(text: str, place: str) -> Unit:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from ambid.errors import RigError
+from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import nearest
 from ambid.physics.parameters import Parameter
 from ambid.record.calibration import Calibration
@@ -43,51 +44,6 @@ class RigChannel:
     calibration: Calibration | None = None
     delay: int | Literal["auto"] = 0
     variable: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Loop:
-    """The controller that closes the loop in simulation: V = -(kp e + ki ∫e dt + kd de/dt), e = position - reference.
-
-    Attributes
-    ----------
-    kind : {"pid"}
-        The only kind.
-    kp, ki, kd : float
-        Gains in V/m, V/(m s), V s/m.
-    delay : int
-        Samples between measuring and acting.
-    limits : Mapping[str, tuple[float, float]]
-        Lowest and highest value of a role, SI.
-    """
-
-    kind: Literal["pid"] = "pid"
-    kp: float = 0.0
-    ki: float = 0.0
-    kd: float = 0.0
-    delay: int = 0
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
-    """Noise of the bench, for simulation.
-
-    Attributes
-    ----------
-    position, current : float
-        Sensor noise, m rms and A rms.
-    force, voltage : float
-        Process noise densities, N/√Hz and V/√Hz.
-    resolutions : Mapping[str, float]
-        Quantisation step of a role, SI; 0 or absent: none.
-    """
-
-    position: float = 0.0
-    current: float = 0.0
-    force: float = 0.0
-    voltage: float = 0.0
-    resolutions: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,9 +87,11 @@ class Rig:
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
-        Controller, for simulation.
+        Controller and delay, for simulation.
+    limits : Limits or None
+        Intervals in which the bench works, for simulation.
     noise : Noise or None
-        Noise, for simulation.
+        Process and sensor noise, for simulation.
     record : RecordSettings
         How records are read.
     open_loop : bool
@@ -148,6 +106,7 @@ class Rig:
     parameters: tuple[Parameter, ...]
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
+    limits: Limits | None = None
     noise: Noise | None = None
     record: RecordSettings = field(default_factory=RecordSettings)
     open_loop: bool = False

@@ -19,6 +19,7 @@ from ambid.record._files import file_bytes, utf8_text
 SCHEMA = "ambid.rig/1"
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Positive = Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, strict=True, ge=0)]
 Samples = Annotated[int, Field(strict=True, ge=0)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
@@ -59,25 +60,46 @@ class ParameterEntry(_Entry):
     sd: Number | None = None
 
 
+Interval = Positive | tuple[Number, Number]
+
+
+class LimitsEntry(_Entry):
+    """``loop.limits``: SI, a positive number for ± that, or [low, high]."""
+
+    voltage: Interval | None = None
+    current: Interval | None = None
+    position: Interval | None = None
+
+
 class LoopEntry(_Entry):
-    """``[loop]``: the controller, for simulation. Gains in V/m, V/(m s), V s/m; limits in SI, ± or [low, high]."""
+    """``[loop]``: the controller, for simulation; see :class:`ambid.physics.loop.Loop` for its law and units."""
 
     kind: Literal["pid"] = "pid"
     kp: Number = 0.0
     ki: Number = 0.0
     kd: Number = 0.0
-    delay: Samples = 0
-    limits: dict[str, Number | tuple[Number, Number]] = Field(default_factory=dict)
+    kc: Number = 0.0
+    derivative_cutoff_hz: Positive | None = None
+    delay: NotNegative = 0.0
+    limits: LimitsEntry | None = None
+
+
+class ResolutionsEntry(_Entry):
+    """``noise.resolutions``: quantisation steps of the logged values in m, A, V; 0 for none."""
+
+    position: NotNegative = 0.0
+    current: NotNegative = 0.0
+    voltage: NotNegative = 0.0
 
 
 class NoiseEntry(_Entry):
-    """``[noise]``: for simulation. Sensor noise rms in SI, process noise as densities, resolutions in SI."""
+    """``[noise]``: for simulation; m rms, A rms, N/√Hz, V/√Hz."""
 
     position: NotNegative = 0.0
     current: NotNegative = 0.0
     force: NotNegative = 0.0
     voltage: NotNegative = 0.0
-    resolutions: dict[str, NotNegative] = Field(default_factory=dict)
+    resolutions: ResolutionsEntry = Field(default_factory=ResolutionsEntry)
 
 
 class TimeEntry(_Entry):
@@ -90,10 +112,10 @@ class TimeEntry(_Entry):
 class RecordEntry(_Entry):
     """``[record]``: how records of this bench are read."""
 
-    rate_hz: Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)] | None = None
+    rate_hz: Positive | None = None
     gaps: Literal["error", "interpolate", "cut"] | None = None
     from_: NotNegative | None = Field(default=None, alias="from")
-    to: Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)] | None = None
+    to: Positive | None = None
     time: TimeEntry | None = None
 
 
@@ -118,7 +140,9 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("parameters", "*"): ParameterEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,
+    ("loop", "limits"): LimitsEntry,
     ("noise",): NoiseEntry,
+    ("noise", "resolutions"): ResolutionsEntry,
     ("record",): RecordEntry,
     ("record", "time"): TimeEntry,
 }
@@ -199,7 +223,7 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     got = error["input"]
     shown = "a table" if isinstance(got, dict) else f"{got!r}"
     if keys[:2] == ["loop", "limits"]:
-        rule = "it must be a number, or [low, high]"
+        rule = "it must be a positive number, or [low, high]"
     elif kind == "finite_number":
         rule = "it must be finite"
     elif kind in ("literal_error", "enum"):
@@ -239,8 +263,8 @@ def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
 def _unknown_key(keys: list[str]) -> str:
     """Name an unknown key, the table it stands in, and the nearest known key."""
     *table, key = keys
-    pattern = tuple("*" if i == 1 and t not in ("time",) else t for i, t in enumerate(table))
-    entry = _ENTRIES.get(pattern, RigFile)
+    pattern = tuple(table)
+    entry = _ENTRIES.get(pattern) or _ENTRIES.get((*pattern[:1], "*"), RigFile)
     known = [field.alias or name for name, field in entry.model_fields.items()]
     inside = f"in [{'.'.join(table)}]" if table else "at the top"
     return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"

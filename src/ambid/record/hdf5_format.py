@@ -1,0 +1,190 @@
+"""Records as HDF5, layout ``ambid.record/1``: nothing of a record is lost.
+
+    /                 attributes: schema, rate_hz, start_s, history (JSON), provenance (JSON)
+    /channels/<k>     float64 dataset, k = 0, 1, …; attributes: name, unit, source_unit
+
+Calibrations are part of the history. The values are stored bit for bit, compressed without loss.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ambid.errors import RecordError
+from ambid.record._files import file_bytes, sha256_of
+from ambid.record.record import Channel, Record, Step
+from ambid.record.sampling import JITTER, GapPolicy, Table, check_gap_policy, sample_uniformly
+
+SCHEMA = "ambid.record/1"
+
+
+def write_hdf5(record: Record, path: str | Path) -> None:
+    """Write a record with its history, provenance and units.
+
+    Parameters
+    ----------
+    record : Record
+        What to write; its history's settings must be JSON-able, as `Step` says.
+    path : str or Path
+        Overwritten if it exists.
+
+    Raises
+    ------
+    RecordError
+        If the history cannot be written as JSON, or the file cannot be written.
+    """
+    import h5py
+
+    path = Path(path)
+    try:
+        history = json.dumps([{"name": s.name, "settings": s.settings} for s in record.history], default=_plain)
+    except TypeError as failure:
+        raise RecordError(
+            f"the record's history cannot be stored: {failure}. Keep JSON-able settings in each step"
+        ) from None
+    try:
+        with h5py.File(path, "w") as file:
+            file.attrs["schema"] = SCHEMA
+            file.attrs["rate_hz"] = record.rate_hz
+            file.attrs["start_s"] = record.start_s
+            # Text beyond 64 kB does not fit an attribute (a calibration table may be long): it is a dataset.
+            file["history"] = history
+            file["provenance"] = json.dumps(dict(record.provenance))
+            group = file.create_group("channels")
+            for k, c in enumerate(record.channels):
+                dataset = group.create_dataset(
+                    str(k), data=c.values, compression="gzip", compression_opts=1, shuffle=True
+                )
+                dataset.attrs["name"] = c.name
+                dataset.attrs["unit"] = c.unit
+                dataset.attrs["source_unit"] = c.source_unit
+    except OSError as failure:
+        raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
+
+
+def read_hdf5_checked(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:
+    """Read a record under the rules that hold for every format: one rate, and finite values unless gaps are treated.
+
+    Parameters
+    ----------
+    path : str or Path
+        HDF5 file of layout ``ambid.record/1``.
+    rate_hz : float, optional
+        Has to agree with the rate in the file, in Hz.
+    gaps : {"error", "interpolate", "cut"}
+        What to do about values that are not finite.
+
+    Returns
+    -------
+    Record
+        Finite throughout.
+
+    Raises
+    ------
+    RecordError
+        As :func:`read_hdf5`, and if a rule above is broken.
+    """
+    record = read_hdf5(path)
+    check_gap_policy(gaps)
+    if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
+        raise RecordError(
+            f"record {path} was sampled at {record.rate_hz:g} Hz but --rate says {rate_hz:g} Hz. Leave --rate out"
+        )
+    values = np.column_stack([c.values for c in record.channels])
+    bad = ~np.isfinite(values)
+    if gaps == "error" and bad.any():
+        k, j = np.argwhere(bad)[0]
+        raise RecordError(
+            f"record {path}, sample {k} of channel {record.names[j]!r}: {values[k, j]} is not a finite number."
+            " Say how to treat gaps: --gaps interpolate or --gaps cut"
+        )
+    table = Table(where=str(path), names=record.names, values=values, first_row=0, time=None)
+    sampled = sample_uniformly(table, record.rate_hz, gaps)
+    if not sampled.steps:
+        return record
+    channels = tuple(replace(c, values=sampled.values[:, j]) for j, c in enumerate(record.channels))
+    start_s = record.start_s + sampled.start_s
+    return replace(record, channels=channels, start_s=start_s, history=(*record.history, *sampled.steps))
+
+
+def read_hdf5(path: str | Path) -> Record:
+    """Read a record that :func:`write_hdf5` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        HDF5 file of layout ``ambid.record/1``.
+
+    Returns
+    -------
+    Record
+        Equal to the one written, bit for bit; ``file`` and ``sha256`` in the provenance are of this file where the
+        record had none.
+
+    Raises
+    ------
+    RecordError
+        If the file is no HDF5, is damaged, or has another layout.
+    """
+    import h5py
+
+    path = Path(path)
+    data = file_bytes(path)
+    if not h5py.is_hdf5(path):
+        raise RecordError(f"record {path} is not an HDF5 file, or is damaged. Copy it again, or name its real format")
+    try:
+        with h5py.File(path, "r") as file:
+            _check_schema(file, path)
+            channels = tuple(_channel(file["channels"][str(k)]) for k in range(len(file["channels"])))
+            history = tuple(
+                Step(name=s["name"], settings=MappingProxyType(s["settings"]))
+                for s in json.loads(file["history"].asstr()[()])
+            )
+            provenance = {str(k): str(v) for k, v in json.loads(file["provenance"].asstr()[()]).items()}
+            rate_hz, start_s = float(file.attrs["rate_hz"]), float(file.attrs["start_s"])
+    except RecordError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError) as failure:
+        raise RecordError(
+            f"record {path} says it is {SCHEMA} but cannot be read ({type(failure).__name__}: {failure})."
+            " It is damaged: write it again"
+        ) from None
+    if "sha256" not in provenance:
+        provenance |= {"file": path.name, "sha256": sha256_of(data)}
+    return Record(
+        rate_hz=rate_hz, start_s=start_s, channels=channels, history=history, provenance=MappingProxyType(provenance)
+    )
+
+
+def _check_schema(file: Any, path: Path) -> None:
+    """Refuse HDF5 files of other programs and versions."""
+    schema = file.attrs.get("schema")
+    if schema is None:
+        inside = ", ".join(sorted(file)[:5]) or "nothing"
+        raise RecordError(
+            f"record {path} is HDF5 but not of ambid (no schema attribute; it holds {inside})."
+            " Export it as CSV, or write it with ambid"
+        )
+    if schema != SCHEMA:
+        raise RecordError(f"record {path} has schema {schema!r}; this program reads {SCHEMA!r}. Write it again")
+
+
+def _channel(dataset: Any) -> Channel:
+    attributes = {key: str(dataset.attrs[key]) for key in ("name", "unit", "source_unit")}
+    return Channel(values=np.asarray(dataset[()], dtype=np.float64), **attributes)
+
+
+def _plain(value: object) -> object:
+    """Turn what JSON does not know into what it does: mappings, NumPy numbers and arrays."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not JSON-able")

@@ -1,0 +1,225 @@
+"""Records from MATLAB: ``.mat`` of version 5 (SciPy) and 7.3 (which is HDF5).
+
+A mapping says which variable is which channel, and in what unit: ``{"current": ("data.i", "mA")}``. A variable is named
+as in MATLAB: ``i``, ``data.i`` for a field of a struct, ``y(:,2)`` for a column of a matrix.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ambid.errors import RecordError, UnitError
+from ambid.record._files import file_bytes, sha256_of
+from ambid.record.csv_format import column_channel
+from ambid.record.record import Array, Record, Step
+from ambid.record.sampling import GapPolicy, Table, check_gap_policy, sample_uniformly
+from ambid.units import UNKNOWN, parse_unit
+
+_EXPRESSION = re.compile(r"(?P<path>[A-Za-z]\w*(?:\.[A-Za-z]\w*)*)\s*(?:\(\s*:\s*,\s*(?P<column>\d+)\s*\))?")
+_TIME_NAMES = ("time", "t")
+
+
+def read_mat(
+    path: str | Path,
+    *,
+    variables: Mapping[str, tuple[str, str]] | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy = "error",
+) -> Record:
+    """Read a record from a MATLAB file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.mat`` file of version 5 or 7.3.
+    variables : Mapping of channel name to (variable, unit), optional
+        ``time`` maps to the time variable. Without a mapping every numeric vector of the file becomes a channel of
+        unknown unit, and a vector called ``time`` or ``t`` is the time in s.
+    rate_hz : float, optional
+        Sampling rate in Hz, for a file without a time variable.
+    gaps : {"error", "interpolate", "cut"}
+        What to do about values that are not finite.
+
+    Returns
+    -------
+    Record
+        In SI units where the units are known.
+
+    Raises
+    ------
+    RecordError
+        If the file is damaged, a variable is missing or is not a vector, or the samples are not uniform.
+    """
+    path = Path(path)
+    check_gap_policy(gaps)
+    data = file_bytes(path)
+    content = _content(path, data)
+    mapping = dict(variables) if variables is not None else _every_vector(content, path)
+    if "time" not in mapping:
+        found = next((name for name in _TIME_NAMES if name in content), None)
+        mapping |= {"time": (found, "s")} if found and rate_hz is None else {}
+    columns = {name: _vector(content, expression, path) for name, (expression, _) in mapping.items()}
+    values = _side_by_side(columns, mapping, path)
+    names = tuple(columns)
+    time = names.index("time") if "time" in names else None
+    if time is not None:
+        values[:, time] = _seconds(values[:, time], mapping["time"], path)
+    if gaps == "error":
+        _refuse_gaps(values, names, mapping, path)
+    table = Table(where=str(path), names=names, values=values, first_row=1, time=time)
+    sampled = sample_uniformly(table, rate_hz, gaps)
+    channels = tuple(
+        column_channel(name, None if mapping[name][1] == UNKNOWN else mapping[name][1], sampled.values[:, j])
+        for j, name in enumerate(names)
+        if j != time
+    )
+    settings = {"format": "mat", "variables": {name: expression for name, (expression, _) in mapping.items()}}
+    return Record(
+        rate_hz=sampled.rate_hz,
+        start_s=sampled.start_s,
+        channels=channels,
+        history=(Step(name="read", settings=MappingProxyType(settings)), *sampled.steps),
+        provenance=MappingProxyType({"file": path.name, "sha256": sha256_of(data)}),
+    )
+
+
+def _content(path: Path, data: bytes) -> dict[str, Any]:
+    """Return the variables of the file, structs as nested dicts."""
+    if data[:10] == b"MATLAB 7.3" or data[:8] == b"\x89HDF\r\n\x1a\n":
+        return _content_v73(path)
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True)
+    except Exception as failure:  # loadmat raises whatever its parser meets in a damaged file
+        raise RecordError(
+            f"record {path} is not a sound MATLAB file ({type(failure).__name__}: {failure}). Save it again from MATLAB"
+        ) from None
+    return {name: _fields(value) for name, value in content.items() if not name.startswith("__")}
+
+
+def _fields(value: Any) -> Any:
+    """Turn a 1 x 1 MATLAB struct into a dict."""
+    if isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
+        value = value.item()
+    if hasattr(value, "_fieldnames"):
+        return {name: _fields(getattr(value, name)) for name in value._fieldnames}
+    return value
+
+
+def _content_v73(path: Path) -> dict[str, Any]:
+    import h5py
+
+    def taken(node: Any) -> Any:
+        if isinstance(node, h5py.Group):
+            return {name: taken(node[name]) for name in node if not name.startswith("#")}
+        values = np.asarray(node[()])
+        # MATLAB stores column-major: what HDF5 shows is the transpose of the variable.
+        return values.T if values.ndim == 2 else values
+
+    try:
+        with h5py.File(path, "r") as file:
+            content: dict[str, Any] = taken(file)
+            return content
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as failure:
+        raise RecordError(
+            f"record {path} is not a sound MATLAB 7.3 file ({failure}). Save it again from MATLAB"
+        ) from None
+
+
+def _every_vector(content: Mapping[str, Any], path: Path) -> dict[str, tuple[str, str]]:
+    """Map every numeric vector of the file, of unknown unit."""
+    found = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in _TIME_NAMES}
+    if not found:
+        held = ", ".join(f"{name} {_shape(value)}" for name, value in list(content.items())[:8]) or "nothing"
+        raise RecordError(
+            f"record {path} holds no numeric vector at its top ({held}). Say in the rig which one is which channel:"
+            ' channels.<role>.variable = "data.y" or "y(:,2)"'
+        )
+    return found
+
+
+def _is_vector(value: Any) -> bool:
+    numeric = isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
+    return bool(numeric and value.size > 1 and value.size == max(value.shape))
+
+
+def _vector(content: Mapping[str, Any], expression: str, path: Path) -> Array:
+    """Look a variable up and return it as a column, shape (n_samples,)."""
+    match = _EXPRESSION.fullmatch(expression.strip())
+    if match is None:
+        raise RecordError(f"{expression!r} is not a variable of {path}; write it as y, data.y or y(:,2)")
+    value: Any = content
+    for depth, name in enumerate(match["path"].split(".")):
+        if not isinstance(value, Mapping) or name not in value:
+            inside = ".".join(match["path"].split(".")[:depth]) or "the file"
+            known = ", ".join(list(value)[:12]) if isinstance(value, Mapping) else "no fields"
+            raise RecordError(
+                f"record {path}: {inside} has no {name!r}; it has {known or 'nothing'}. Correct the variable"
+            )
+        value = value[name]
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+        raise RecordError(
+            f"record {path}: variable {expression!r} is {_shape(value)}; real numbers are wanted. Correct it"
+        )
+    if match["column"] is not None:
+        k = int(match["column"])
+        if value.ndim != 2 or not 1 <= k <= value.shape[1]:
+            raise RecordError(
+                f"record {path}: {match['path']!r} is {_shape(value)}; it has no column {k}. Correct the number"
+            )
+        value = value[:, k - 1]
+    if value.size != max(value.shape, default=0):
+        raise RecordError(
+            f"record {path}: variable {expression!r} is {_shape(value)}; a channel is one column."
+            f" Write {expression.strip()}(:,1) for its first"
+        )
+    return np.asarray(value, dtype=np.float64).reshape(-1)
+
+
+def _shape(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "a struct"
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        return "a " + " x ".join(map(str, value.shape)) + " matrix"
+    if isinstance(value, np.ndarray) and value.dtype.kind == "c":
+        return "complex"
+    return "not numeric"
+
+
+def _side_by_side(columns: Mapping[str, Array], mapping: Mapping[str, tuple[str, str]], path: Path) -> Array:
+    lengths = {name: column.size for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        listing = ", ".join(f"{mapping[name][0]} {n}" for name, n in lengths.items())
+        raise RecordError(
+            f"record {path}: variables differ in length ({listing}); all must have the same. Choose others"
+        )
+    return np.column_stack(list(columns.values()))
+
+
+def _seconds(time: Array, variable: tuple[str, str], path: Path) -> Array:
+    try:
+        unit = parse_unit(variable[1])
+    except UnitError as error:
+        raise RecordError(f"record {path}: time variable {variable[0]!r}: {error}") from None
+    if unit.si != "s":
+        raise RecordError(
+            f"record {path}: time variable {variable[0]!r} is in [{variable[1]}]; it must be in s, ms or us"
+        )
+    return unit.to_si(time)
+
+
+def _refuse_gaps(values: Array, names: tuple[str, ...], mapping: Mapping[str, tuple[str, str]], path: Path) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        row, j = np.argwhere(bad)[0]
+        raise RecordError(
+            f"{path}, row {row + 1} of variable {mapping[names[j]][0]!r}: {values[row, j]} is not a finite number;"
+            " every value must be one. Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
+        )
