@@ -75,13 +75,13 @@ class CoEnergy:
 
     def force_per_current(self, x: Number, i: Number) -> Number:
         """Return k_i = df/di = dlambda/dx in N/A at `x` in m and `i` in A."""
-        return self.k_a * (self.i0 + i) / (self.s_a - x) ** 2 + self.k_b * (self.i0 - i) / (self.s_b + x) ** 2
+        a, b = 1.0 / (self.s_a - x), 1.0 / (self.s_b + x)
+        return self.k_a * (self.i0 + i) * a * a + self.k_b * (self.i0 - i) * b * b
 
     def displacement_coefficient(self, x: Number, i: Number) -> Number:
         """Return k_x = -df/dx in N/m (negative for any attracting magnet) at `x` in m and `i` in A."""
-        return -(
-            self.k_a * (self.i0 + i) ** 2 / (self.s_a - x) ** 3 + self.k_b * (self.i0 - i) ** 2 / (self.s_b + x) ** 3
-        )
+        a, b = 1.0 / (self.s_a - x), 1.0 / (self.s_b + x)
+        return -(self.k_a * (self.i0 + i) ** 2 * a * a * a + self.k_b * (self.i0 - i) ** 2 * b * b * b)
 
 
 class Magnet(Protocol):

@@ -129,7 +129,7 @@ class NonlinearPlant:
             "c": self.c,
         }
 
-    def energy(self, state: tuple[float, float, float]) -> float:
+    def energy(self, state: tuple[Number, Number, Number]) -> Number:
         """Return the energy that the axis voltage works against: lambda i - W' + m x'^2/2 - m g x.
 
         Its rate is V i - R i^2 - c x'^2. For a pair it leaves out what the bias source gives or takes.

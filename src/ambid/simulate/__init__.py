@@ -4,6 +4,7 @@ from ambid.simulate.bench import Simulation, simulate, simulate_preset
 from ambid.simulate.levels import largest_amplitude, noise_at_snr
 from ambid.simulate.plant import LinearPlant
 from ambid.simulate.poles import closed_loop_matrix, closed_loop_poles
+from ambid.simulate.rig_bench import simulate_rig
 
 __all__ = [
     "LinearPlant",
@@ -14,4 +15,5 @@ __all__ = [
     "noise_at_snr",
     "simulate",
     "simulate_preset",
+    "simulate_rig",
 ]

@@ -22,6 +22,7 @@ from ambid.physics.presets import Preset
 from ambid.record.record import Record
 from ambid.simulate._logging import drawn_noise, logged, written
 from ambid.simulate.plant import LinearPlant, Standing
+from ambid.simulate.poles import closed_loop_poles
 
 Array = NDArray[np.float64]
 
@@ -48,6 +49,8 @@ class Simulation:
         Number of limited commands.
     n_over_current : int
         Number of samples with the true current outside its limits.
+    largest_pole : float
+        Largest modulus of the sampled (linearised) loop's poles; the loop is unstable above 1.
     """
 
     record: Record
@@ -58,6 +61,7 @@ class Simulation:
     first_saturated: int | None
     n_saturated: int
     n_over_current: int
+    largest_pole: float
 
     @property
     def within_limits(self) -> bool:
@@ -66,8 +70,10 @@ class Simulation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One sentence for each limit that was met."""
+        """One sentence for each thing that a user should know: an unstable loop, each limit that was met."""
         rate, found = self.record.rate_hz, []
+        if self.largest_pole > 1.0 + 1e-9:
+            found.append(f"the loop is unstable: its largest pole has the modulus {self.largest_pole:.6g}")
         if self.first_contact is not None:
             found.append(f"the rotor touched a stop at sample {self.first_contact} ({self.first_contact / rate:.6g} s)")
         if self.first_saturated is not None:
@@ -183,6 +189,7 @@ def simulate(
         first_saturated=None if first < 0 else first,
         n_saturated=count,
         n_over_current=_beyond(of, states, limits),
+        largest_pole=float(np.abs(closed_loop_poles(truth, loop, rate_hz, of=of.name)[0])),
     )
 
 
