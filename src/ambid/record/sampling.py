@@ -145,7 +145,7 @@ def _enough(n: int, where: str, what: str) -> None:
 def _check_uniform(time: Array, where: str, name: str, first_row: int | None) -> None:
     """Refuse time that does not advance by one period per sample, naming the first bad row."""
     steps = np.diff(time)
-    period = float(np.median(steps))
+    period = _usual_interval(steps)
 
     def refuse(k: int, what: str, remedy: str) -> RecordError:
         place = f"row {first_row + k}" if first_row is not None else f"sample {k} after treating gaps"
@@ -166,6 +166,13 @@ def _check_uniform(time: Array, where: str, name: str, first_row: int | None) ->
         )
 
 
+def _usual_interval(intervals: Array) -> float:
+    """Return the mean of those intervals that are within 5 % of the median: neither jumps nor rounding move it."""
+    median = float(np.median(intervals))
+    usual = intervals[np.abs(intervals - median) <= 0.05 * abs(median)]
+    return float(usual.mean()) if usual.size else median
+
+
 def _irregular(time: Array, period: float) -> NDArray[np.bool_]:
     """Tell for every interval whether it breaks the 1 % rule, shape (n_samples - 1,)."""
     intervals_ok: NDArray[np.bool_] = np.abs(np.diff(time) / period - 1) <= JITTER
@@ -182,7 +189,7 @@ def _period_of(time: Array, where: str) -> float:
     """Return the usual interval of a time column that has gaps (NaN)."""
     known = time[np.isfinite(time)]
     _enough(known.size, where, "usable rows")
-    period = float(np.median(np.diff(known)))
+    period = _usual_interval(np.diff(known))
     if not period > 0:
         raise RecordError(f"{where}: time does not increase from row to row; sort the rows, or remove the time column")
     return period

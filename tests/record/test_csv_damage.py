@@ -1,0 +1,160 @@
+"""Damaged CSV records: each is refused in one line that says where and what to do."""
+
+import gzip
+import os
+
+import pytest
+
+from ambid.errors import RecordError
+from ambid.record import read_record
+
+HEADER = "time [s],voltage [V],position [mm]"
+
+
+def rows(n=20):
+    return [f"{k * 0.001:.6g},{0.1 * k:.6g},{k}" for k in range(n)]
+
+
+def changed(row, text):
+    """The rows with the one in file line `row` (the header is line 1) replaced."""
+    body = rows()
+    body[row - 2] = text
+    return body
+
+
+def text(body, header=HEADER):
+    return (header + "\n" + "\n".join(body) + "\n").encode()
+
+
+CASES = {
+    "empty file": (b"", ["0 bytes", "again"]),
+    "only blank lines": (b"\n\n\n", ["header"]),
+    "header only": (text([]), ["no data"]),
+    "comments only": (b"# a\n# b\n", ["header"]),
+    "one row": (text(rows(1)), ["1 row", "at least 8"]),
+    "two rows": (text(rows(2)), ["2 rows", "at least 8"]),
+    "seven rows": (text(rows(7)), ["7 rows", "at least 8"]),
+    "no header": ("\n".join(rows()).encode(), ["row 1", "name [unit]"]),
+    "commented header": (b"# " + text(rows()), ["row 2", "without '#'"]),
+    "text in numbers": (text(changed(9, "0.007,high,7")), ["row 9", "'voltage'", "'high'", "--gaps"]),
+    "missing cell": (text(changed(9, "0.007,,7")), ["row 9", "'voltage'", "missing", "--gaps"]),
+    "nan": (text(changed(9, "0.007,0.7,NaN")), ["row 9", "'position'", "'NaN'"]),
+    "infinite": (text(changed(9, "0.007,-inf,7")), ["row 9", "'voltage'", "'-inf'"]),
+    "overflow": (text(changed(9, "0.007,1e999,7")), ["row 9", "'voltage'", "'1e999'"]),
+    "underscored number": (text(changed(9, "0.007,1_0,7")), ["row 9", "'voltage'", "'1_0'"]),
+    "too few cells": (text(changed(9, "0.007,0.7")), ["row 9", "2 cells", "3 columns"]),
+    "too many cells": (text(changed(9, "0.007,0.7,7,8")), ["row 9", "4 cells", "3 columns"]),
+    "cut off in the last row": (text(changed(21, "0.019,1.")), ["row 21", "cut off"]),
+    "all rows too wide": (text([r + ",1" for r in rows()]), ["row 2", "4 cells"]),
+    "empty line inside": (text(changed(9, "")), ["row 9", "empty"]),
+    "comment among data": (text(changed(9, "# pause")), ["row 9", "comment"]),
+    "decimal commas, comma separated": (text([r.replace(".", ",") for r in rows()]), ["row 3", "decimal comma"]),
+    "decimal commas, semicolon separated": (
+        text([r.replace(",", ";").replace(".", ",") for r in rows()], HEADER.replace(",", ";")),
+        ["row 3", "'time'", "'0,001'", "decimal comma", "point"],
+    ),
+    "semicolons under a comma header": (text([r.replace(",", ";") for r in rows()]), ["row 2", "';'", "commas"]),
+    "two delimiters in the header": (text(rows(), "time [s],voltage [V];position [mm]"), ["row 1", "';'", "commas"]),
+    "header separated by blanks": (text(rows(), "time [s] voltage [V] position [mm]"), ["row 1", "commas"]),
+    "duplicate column": (text(rows(), "time [s],voltage [V],voltage [mm]"), ["row 1", "'voltage'", "twice"]),
+    "nameless column": (text(rows(), "time [s],voltage [V],[mm]"), ["row 1", "column 3", "no name"]),
+    "trailing comma in the header": (text(rows(), HEADER + ","), ["row 1", "column 4"]),
+    "time without a unit": (text(rows(), "time,voltage [V],position [mm]"), ["row 1", "'time'", "time [s]"]),
+    "time in metres": (text(rows(), "time [m],voltage [V],position [mm]"), ["'time'", "[m]", "[ms]"]),
+    "time in an unknown unit": (text(rows(), "time [sec],voltage [V],position [mm]"), ["'time'", "[sec]", "[ms]"]),
+    "time only": (text([r.split(",")[0] for r in rows()], "time [s]"), ["nothing else"]),
+    "time stands still": (text(changed(9, "0.006,0.7,7")), ["row 9", "stands still"]),
+    "time runs backwards": (text(changed(9, "0.0035,0.7,7")), ["row 9", "backwards"]),
+    "time all zero": (text(["0,1,2"] * 20), ["row 3", "stands still"]),
+    "jitter of 2 %": (text(changed(9, "0.00702,0.7,7")), ["row 9", "1.02 samples", "--rate", "resample"]),
+    "skipped sample": (text(rows()[:7] + rows()[8:]), ["row 9", "2 samples", "--gaps"]),
+    "skipped last sample": (text([*rows()[:19], "0.020,2,20"]), ["row 21", "2 samples"]),
+    "not UTF-8": (text(rows()).replace(b"[mm]", b"[\xb5m]"), ["row 1", "0xb5", "UTF-8"]),
+    "UTF-16": (text(rows()).decode().encode("utf-16"), ["UTF-16", "UTF-8"]),
+    "binary": (text(changed(9, "0.007,\0,7")), ["binary"]),
+    "gzip without saying so": (gzip.compress(text(rows())), ["gzipped", ".gz"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_damage_is_named_in_one_line(tmp_path, case):
+    data, said = CASES[case]
+    path = tmp_path / "damaged.csv"
+    path.write_bytes(data)
+    with pytest.raises(RecordError) as failure:
+        read_record(path)
+    message = str(failure.value)
+    assert "\n" not in message
+    assert "damaged.csv" in message
+    for words in said:
+        assert words in message
+
+
+def test_truncated_gzip(tmp_path):
+    path = tmp_path / "r.csv.gz"
+    path.write_bytes(gzip.compress(text(rows(500)))[:-200])
+    with pytest.raises(RecordError, match="truncated"):
+        read_record(path)
+
+
+def test_gzip_that_is_none_or_empty(tmp_path):
+    path = tmp_path / "r.csv.gz"
+    path.write_bytes(text(rows()))
+    with pytest.raises(RecordError, match="not a sound gzip"):
+        read_record(path)
+    path.write_bytes(gzip.compress(b""))
+    with pytest.raises(RecordError, match="empty inside"):
+        read_record(path)
+
+
+def test_missing_file_names_the_nearest(tmp_path):
+    (tmp_path / "record_7.csv").write_bytes(text(rows()))
+    with pytest.raises(RecordError, match=r"record7\.csv does not exist \(record_7\.csv does\)"):
+        read_record(tmp_path / "record7.csv")
+    with pytest.raises(RecordError, match="folder"):
+        read_record(tmp_path / "nowhere" / "record7.csv")
+
+
+def test_folder_instead_of_a_file(tmp_path):
+    (tmp_path / "r.csv").mkdir()
+    with pytest.raises(RecordError, match="is a folder"):
+        read_record(tmp_path / "r.csv")
+    with pytest.raises(RecordError, match="is a folder"):
+        read_record(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may read every file")
+def test_permission_denied(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_bytes(text(rows()))
+    path.chmod(0)
+    with pytest.raises(RecordError, match="permission denied"):
+        read_record(path)
+
+
+def test_unknown_format_lists_the_known(tmp_path):
+    with pytest.raises(RecordError, match=r"\.csv\.gz.*\.mat"):
+        read_record(tmp_path / "record.xlsx")
+
+
+@pytest.mark.parametrize("rate", [0.0, -5.0, float("nan"), float("inf")])
+def test_rate_must_be_positive(tmp_path, rate):
+    path = tmp_path / "r.csv"
+    path.write_bytes(text([r.partition(",")[2] for r in rows()], "voltage [V],position [mm]"))
+    with pytest.raises(RecordError, match="positive number of Hz"):
+        read_record(path, rate_hz=rate)
+
+
+def test_rate_that_contradicts_time(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_bytes(text(rows()))
+    assert read_record(path, rate_hz=1000.0).rate_hz == 1000.0
+    with pytest.raises(RecordError, match=r"1000 Hz.*2000 Hz"):
+        read_record(path, rate_hz=2000.0)
+
+
+def test_unknown_gap_policy(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_bytes(text(rows()))
+    with pytest.raises(RecordError, match="interpolate"):
+        read_record(path, gaps="fill")
