@@ -1,0 +1,76 @@
+# Everything a person or the CI does with this repository. `make` alone lists the targets.
+
+PYTHON ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
+PYTEST_ARGS ?=
+
+# Without byte code every start of the command compiles its imports again: 3 to 6 times slower.
+unexport PYTHONDONTWRITEBYTECODE
+# Neither may decide what a fresh environment imports or where it is installed.
+unexport PYTHONPATH
+unexport PYTHONHOME
+unexport PIP_TARGET
+unexport PIP_USER
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint types pytest bench docs format changelog lock clean distclean
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
+
+setup: $(VENV)/.setup  ## make .venv with ambid and its tools, from hash-pinned versions (PYTHON=... chooses the Python)
+
+$(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools/venv.sh
+	@sh tools/venv.sh $(VENV) "$(PYTHON)"
+	@echo "Installing the pinned packages into $(VENV) (a minute or two, once) ..." >&2
+	@$(PIP) install --quiet --require-hashes -r requirements/build.txt
+	@$(PIP) install --quiet --require-hashes -r requirements/dev.txt
+	@$(PIP) install --quiet --no-build-isolation --no-deps --no-index --editable .
+	@$(BIN)/python -m compileall -q src
+	@touch $@
+
+demo: setup  ## identify the embedded record and print the estimate beside the truth
+	@$(BIN)/ambid demo
+
+test: lint types pytest  ## everything that must hold: lint, types, all tests
+
+lint: setup  ## formatting and lint
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: setup  ## strict type check
+	$(BIN)/mypy
+
+# After lint and types also under `make -j`: the last line of `make test` is pytest's own verdict.
+pytest: setup | lint types  ## all tests, after lint and types (PYTEST_ARGS="-k words" chooses)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+bench: setup  ## measure speed and accuracy beside plain SciPy; writes bench/results and docs/benchmarks.md
+	@$(BIN)/python bench/run.py
+
+docs: $(VENV)/.docs  ## build the documentation into docs/_site
+	@$(BIN)/python -m sphinx --jobs auto --keep-going -b html docs docs/_site
+	@echo "docs/_site/index.html"
+
+$(VENV)/.docs: $(VENV)/.setup requirements/docs.txt
+	@$(PIP) install --quiet --require-hashes -r requirements/docs.txt
+	@touch $@
+
+format: setup  ## rewrite the files in the project's format
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+changelog: setup  ## make CHANGELOG.md from changes/
+	@$(BIN)/python tools/changelog.py
+
+lock: setup  ## pin the newest allowed versions again (needs the package index)
+	@sh tools/lock.sh $(BIN)/python
+
+clean:  ## remove caches and builds
+	@rm -rf build dist docs/_site docs/api .pytest_cache .mypy_cache .ruff_cache
+	@find src tests bench tools docs -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+
+distclean: clean  ## clean, and remove .venv
+	@rm -rf $(VENV) src/*.egg-info
