@@ -1,0 +1,78 @@
+"""Imports point downward only (ARCHITECTURE.md); the rule itself is tested on fabricated sources."""
+
+import pytest
+
+from tests.conventions.import_rules import RANK, violations
+from tests.conventions.sources import ROOT, module_name, package_files, parsed, rooms, shown
+
+
+def test_every_import_points_downward():
+    found = [
+        f"{shown(path)}: {violation}"
+        for path in package_files()
+        for violation in violations(parsed(path), module_name(path), is_package=path.name == "__init__.py")
+    ]
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_every_room_stands_in_a_tier_and_on_the_map():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    assert not [room for room in rooms() if room not in RANK], "rooms without a tier in import_rules.py"
+    assert not [r for r in rooms() if f"`{r}/`" not in text and f"`{r}.py`" not in text], "rooms not in ARCHITECTURE.md"
+
+
+FABRICATED = {
+    "upward": ("ambid.physics.models", "from ambid.simulate.bench import simulate", "upward"),
+    "upward, the room itself": ("ambid.record.record", "from ambid import rig", "upward"),
+    "upward by two dots": ("ambid.record.csv_format", "from ..physics import models", "upward"),
+    "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
+    "sideways": ("ambid.signals.filters", "from ambid.physics import models", "sideways"),
+    "sideways, top": ("ambid.fleet.many", "import ambid.cli", "sideways"),
+    "inside a function": ("ambid.rig.load", "def f():\n    from ambid.identify import greybox\n", "line 2: rig"),
+    "for typing only": (
+        "ambid.errors",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ambid.record import Record\n",
+        "line 3: errors",
+    ),
+    "by name": ("ambid.identify", "import importlib\nm = importlib.import_module('ambid.validate')", "upward"),
+    "private module": ("ambid.rig.schema", "from ambid.record._files import file_bytes", "_files is private to record"),
+    "private module as a name": ("ambid.rig.schema", "from ambid.record import _files", "_files is private to record"),
+    "private name": (
+        "ambid.simulate.bench",
+        "from ambid.physics.models import _blocks",
+        "_blocks is private to physics",
+    ),
+    "the package itself": ("ambid.job", "import ambid", "stands above it"),
+    "everything": ("ambid.job", "from ambid import *", "stands above it"),
+    "an unknown room": ("ambid.toolbox.things", "import numpy", "in no tier"),
+    "from an unknown room": ("ambid.job", "from ambid.toolbox import things", "in no tier"),
+}
+
+
+@pytest.mark.parametrize(("module", "source", "complaint"), FABRICATED.values(), ids=FABRICATED.keys())
+def test_a_forbidden_import_is_found(module, source, complaint):
+    found = violations(source, module)
+    assert len(found) == 1
+    assert complaint in found[0]
+
+
+ALLOWED = {
+    "downward": (
+        "ambid.identify.greybox",
+        "from ambid.physics.models import model\nfrom ambid.errors import ModelError",
+    ),
+    "own private module": ("ambid.record.csv_format", "from ambid.record._files import file_bytes"),
+    "own private module, relative": ("ambid.record.csv_format", "from ._files import file_bytes"),
+    "others' libraries": ("ambid.errors", "import numpy.linalg\nfrom ambidextrous import cli"),
+    "the version": ("ambid.report.html", "from ambid import __version__"),
+}
+
+
+@pytest.mark.parametrize(("module", "source"), ALLOWED.values(), ids=ALLOWED.keys())
+def test_an_allowed_import_passes(module, source):
+    assert violations(source, module) == []
+
+
+def test_relative_imports_of_a_room_resolve_from_the_room():
+    assert violations("from .csv_format import read_csv", "ambid.record", is_package=True) == []
+    assert "upward" in violations("from ..rig import load", "ambid.record", is_package=True)[0]
