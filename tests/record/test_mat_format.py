@@ -1,0 +1,126 @@
+"""MATLAB files of both kinds: the same variables give the same record; what is no channel is refused."""
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from ambid.errors import RecordError
+from ambid.record import read_record
+
+N = 40
+TIME = np.arange(N) * 1e-3
+VOLTAGE = np.sin(TIME * 300)
+BOTH = np.column_stack([np.cos(TIME), np.arange(N)])
+
+
+def v5(path):
+    data = {"t": TIME, "y": BOTH, "n": np.arange(N, dtype=np.int16)}
+    savemat(path, {"u": VOLTAGE[:, None], "row": VOLTAGE[None, :], "data": data, "tv": TIME, "title": "bench 1"})
+
+
+def v73(path):
+    """As MATLAB writes it: HDF5 after a 512-byte header, matrices transposed, structs as groups."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["u"], file["row"], file["tv"] = VOLTAGE[None, :], VOLTAGE[:, None], TIME[None, :]
+        file["title"] = np.frombuffer("bench 1".encode("utf-16-le"), np.uint16)[:, None]
+        group = file.create_group("data")
+        group["t"], group["y"], group["n"] = TIME[None, :], BOTH.T, np.arange(N, dtype=np.int16)[None, :]
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, made by a test".ljust(116))
+
+
+@pytest.fixture(params=[v5, v73])
+def path(request, tmp_path):
+    request.param(tmp_path / "r.mat")
+    return tmp_path / "r.mat"
+
+
+MAPPING = {
+    "time": ("data.t", "s"),
+    "voltage": ("u", "mV"),
+    "again": ("row", "V"),
+    "position": ("data.y(:,2)", "um"),
+    "count": ("data.n", "1"),
+}
+
+
+def test_named_variables_become_channels(path):
+    r = read_record(path, variables=MAPPING)
+    assert r.rate_hz == 1000.0
+    assert r.names == ("voltage", "again", "position", "count")
+    assert [c.unit for c in r.channels] == ["V", "V", "m", "1"]
+    np.testing.assert_allclose(r["voltage"], VOLTAGE * 1e-3, rtol=1e-15)
+    np.testing.assert_array_equal(r["again"], VOLTAGE)
+    np.testing.assert_allclose(r["position"], np.arange(N) * 1e-6, rtol=1e-15)
+    np.testing.assert_array_equal(r["count"], np.arange(N))
+    assert r.history[0].settings["variables"]["position"] == "data.y(:,2)"
+    assert len(r.provenance["sha256"]) == 64
+
+
+def test_rate_given_instead_of_time(path):
+    assert read_record(path, variables={"voltage": ("u", "V")}, rate_hz=250.0).rate_hz == 250.0
+    with pytest.raises(RecordError, match="--rate"):
+        read_record(path, variables={"voltage": ("u", "V")})
+
+
+@pytest.mark.parametrize(
+    ("variable", "said"),
+    [
+        ("uu", "no 'uu'; it has"),
+        ("data.q", "data has no 'q'; it has"),
+        ("u.x", "u has no 'x'"),
+        ("data", "a struct"),
+        ("data.y", r"40 x 2 matrix; a channel is one column. Write data.y\(:,1\)"),
+        ("data.y(:,3)", "no column 3"),
+        ("data.y(:,0)", "no column 0"),
+        ("data.y(2,:)", "write it as"),
+        ("3y", "write it as"),
+    ],
+)
+def test_what_is_no_channel_is_refused(path, variable, said):
+    with pytest.raises(RecordError, match=said):
+        read_record(path, variables={"voltage": (variable, "V")}, rate_hz=1.0)
+
+
+def test_differing_lengths_and_wrong_time_units_are_refused(path):
+    with pytest.raises(RecordError, match="in s, ms or us"):
+        read_record(path, variables=MAPPING | {"time": ("tv", "m")})
+    with pytest.raises(RecordError, match="nearest known"):
+        read_record(path, variables=MAPPING | {"time": ("tv", "sec")})
+
+
+def test_gaps_and_irregular_time(tmp_path):
+    bad = VOLTAGE.copy()
+    bad[7] = np.nan
+    savemat(tmp_path / "r.mat", {"u": bad, "t": TIME, "late": TIME + (TIME > 0.02) * 1e-3, "short": TIME[:30]})
+    with pytest.raises(RecordError, match="row 8 of variable 'u'"):
+        read_record(tmp_path / "r.mat", variables={"voltage": ("u", "V")})
+    assert read_record(tmp_path / "r.mat", variables={"voltage": ("u", "V")}, gaps="interpolate").n_samples == N
+    with pytest.raises(RecordError, match="advances by 2 samples"):
+        read_record(tmp_path / "r.mat", variables={"x": ("t", "V"), "time": ("late", "s")})
+    with pytest.raises(RecordError, match="u 40, short 30"):
+        read_record(tmp_path / "r.mat", variables={"a": ("u", "V"), "b": ("short", "V")}, rate_hz=1.0)
+
+
+def test_without_a_mapping_every_vector_is_a_channel_of_unknown_unit(tmp_path):
+    savemat(tmp_path / "r.mat", {"u": VOLTAGE, "i": VOLTAGE, "time": TIME, "m": BOTH, "s": 1.0, "name": "x"})
+    r = read_record(tmp_path / "r.mat")
+    assert r.rate_hz == 1000.0
+    assert [(c.name, c.unit) for c in r.channels] == [("u", "?"), ("i", "?")]
+    savemat(tmp_path / "none.mat", {"m": BOTH})
+    with pytest.raises(RecordError, match=r"no numeric vector.*40 x 2 matrix"):
+        read_record(tmp_path / "none.mat", rate_hz=1.0)
+
+
+def test_damaged_files(tmp_path, path):
+    whole = path.read_bytes()
+    for name, data in (("zero.mat", b""), ("half.mat", whole[: len(whole) // 2]), ("text.mat", b"time,voltage\n" * 50)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(RecordError, match=name):
+            read_record(tmp_path / name, variables={"voltage": ("u", "V")}, rate_hz=1.0)
+
+
+def test_a_mapping_is_for_mat_files_only(tmp_path):
+    with pytest.raises(RecordError, match=r"for \.mat files"):
+        read_record(tmp_path / "r.csv", variables={"voltage": ("u", "V")})
