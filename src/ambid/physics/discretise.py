@@ -1,7 +1,7 @@
 """Exact discretisation under a zero-order hold, with exact derivatives.
 
-The input is held over a sample and may reach the plant a fraction of a sample late: over one period the plant sees first the
-previous value, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
+The input is held over a sample and may reach the plant a fraction of a sample late: over one period the plant
+sees first the previous value, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class DiscreteSpace:
 
 
 def discretise(
-    space: StateSpace, period_s: float, *, fraction: float = 0.0, derivatives: Sequence[StateSpace] = ()
+    space: StateSpace, period_s: float, *, fraction: float | None = None, derivatives: Sequence[StateSpace] = ()
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
     """Discretise exactly, together with the derivatives along given directions.
 
-    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the upper right
-    block of exp([[M, dM], [0, M]] T) (Mathias 1996).
+    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the
+    upper right block of exp([[M, dM], [0, M]] T) (Mathias 1996).
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def discretise(
         Continuous-time matrices.
     period_s : float
         Sampling period in s.
-    fraction : float
-        Part of a sample by which the input comes late, 0 <= fraction < 1.
+    fraction : float, optional
+        Part of a sample by which the input comes late, 0 <= fraction < 1; None: none, and no derivative along it.
     derivatives : Sequence of StateSpace
         Directions (dA, dB, dE); dC is passed on.
 
@@ -62,7 +62,7 @@ def discretise(
     discrete : DiscreteSpace
         The discrete matrices.
     directional : tuple of DiscreteSpace
-        Their derivatives, one for each direction; where `fraction` > 0, one more: along the fraction itself.
+        Their derivatives, one for each direction; where `fraction` is given, one more: along the fraction itself.
     """
     from scipy.linalg import expm
 
@@ -75,7 +75,7 @@ def discretise(
     for block, d in zip(stack, derivatives, strict=False):
         block[:n, size:] = np.hstack([d.A, d.B, d.E]) * period_s
     full = expm(stack)
-    late = expm(stack * (1.0 - fraction)) if fraction else full
+    late = full if fraction is None else expm(stack * (1.0 - fraction))
 
     def split(now: Array, partial: Array, c: Array) -> DiscreteSpace:
         b = partial[:n, n : n + nu]
@@ -83,7 +83,7 @@ def discretise(
 
     discrete = split(full[0, :size, :size], late[0, :size, :size], space.C)
     directional = [split(full[j, :size, size:], late[j, :size, size:], d.C) for j, d in enumerate(derivatives)]
-    if fraction:
+    if fraction is not None:
         slope = -period_s * late[0, :n, :n] @ space.B
         zero = np.zeros_like
         directional.append(

@@ -79,6 +79,10 @@ class LinearModel(Protocol):
         """Return the exact derivative of the matrices with respect to one parameter."""
         ...
 
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return natural scales of the parameters that may rightly be zero, SI; a value is judged against them."""
+        ...
+
 
 _UNITS = {
     "voltage": "V",
@@ -174,6 +178,21 @@ class OneAxis:
                 raise _unknown_parameter(self, parameter)
         return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((2, 3)))
 
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the scale against which a damping near zero is judged: that of critical damping.
+
+        Parameters
+        ----------
+        theta : Mapping[str, float]
+            Parameters in SI units.
+
+        Returns
+        -------
+        Mapping[str, float]
+            ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's frequency.
+        """
+        return {"c": float(np.sqrt(abs(theta["m"] * max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]))))}
+
 
 @dataclass(frozen=True, slots=True)
 class Coil:
@@ -235,6 +254,22 @@ class Coil:
                 return StateSpace(A=np.array([[r / ell**2]]), B=d_b, E=d_b, C=zero)
             case _:
                 raise _unknown_parameter(self, parameter)
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return no scales: neither R nor L may be zero.
+
+        Parameters
+        ----------
+        theta : Mapping[str, float]
+            R and L in SI units.
+
+        Returns
+        -------
+        Mapping[str, float]
+            Empty.
+        """
+        del theta
+        return {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +344,21 @@ class Rotor:
             case _:
                 raise _unknown_parameter(self, parameter)
         return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((1, 2)))
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the scale against which a damping near zero is judged: that of critical damping.
+
+        Parameters
+        ----------
+        theta : Mapping[str, float]
+            Parameters in SI units.
+
+        Returns
+        -------
+        Mapping[str, float]
+            ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's frequency.
+        """
+        return {"c": float(np.sqrt(abs(theta["m"] * theta["k_x"])))}
 
 
 _MODELS: dict[str, LinearModel] = {m.name: m for m in (OneAxis(), Coil(), Rotor())}

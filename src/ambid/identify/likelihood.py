@@ -1,0 +1,272 @@
+"""Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2).
+
+The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given to SciPy's
+trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.predictor import PredictorProblem, Workspace, innovations, linearise
+
+Array = NDArray[np.float64]
+Status = Literal["converged", "stalled", "failed"]
+
+NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
+_ROUNDS = 10  # of reweighting by the innovation covariance
+_EVALUATIONS = 30  # of the residual in one round
+_DECREMENT = 1e-3  # squared Newton step, in standard deviations, below which a search has converged
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit:
+    """Outcome of one likelihood search.
+
+    Attributes
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    covariance : ndarray, shape (n_outputs, n_outputs)
+        Innovation covariance, scaled output units.
+    J : ndarray, shape (size + 1, size)
+        Compressed Jacobian of the weighted innovations: J^T J is the information matrix of the data.
+    J_prior : ndarray, shape (n_priors, size)
+        Rows of the priors.
+    criterion : float
+        Twice the negative log-likelihood but for constants: n log det(covariance) plus squared prior residuals.
+    status : {"converged", "stalled", "failed"}
+    evaluations : int
+    """
+
+    problem: PredictorProblem
+    vector: Array
+    covariance: Array
+    J: Array
+    J_prior: Array
+    criterion: float
+    status: Status
+    evaluations: int
+
+
+def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
+    """Return residual and Jacobian rows of the priors: those of the rig, and a weak one on log noise levels.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+
+    Returns
+    -------
+    r : ndarray, shape (n_priors,)
+    J : ndarray, shape (n_priors, size)
+    """
+    n = problem.n_physical
+    mean, inverse_sd = np.zeros(problem.size), np.zeros(problem.size)
+    mean[:n] = problem.prior_mean / problem.magnitude
+    inverse_sd[:n] = problem.magnitude / problem.prior_sd
+    if problem.noise == "levels":
+        mean[problem.slices["noise"]] = problem.noise_center
+        inverse_sd[problem.slices["noise"]] = 1 / NOISE_PRIOR_SD
+    active = inverse_sd > 0
+    return ((vector - mean) * inverse_sd)[active], np.diag(inverse_sd)[active]
+
+
+def criterion(problem: PredictorProblem, vector: Array, covariance: Array) -> float:
+    """Return n log det(covariance) plus the squared prior residuals.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    covariance : ndarray, shape (n_outputs, n_outputs), scaled output units
+
+    Returns
+    -------
+    float
+    """
+    r, _ = prior_rows(problem, vector)
+    return float(problem.n_used * np.linalg.slogdet(covariance)[1] + r @ r)
+
+
+def evaluate(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> tuple[float, Array | None]:
+    """Return the criterion and the innovation covariance at a vector, without a Jacobian.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    work : Workspace, optional
+
+    Returns
+    -------
+    criterion : float
+        Infinite where there is no predictor.
+    covariance : ndarray, shape (n_outputs, n_outputs), or None
+    """
+    e = innovations(problem, vector, work)
+    if e is None:
+        return np.inf, None
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = e.T @ e / e.shape[0]
+    if not np.all(np.isfinite(covariance)) or np.linalg.slogdet(covariance)[0] <= 0:
+        return np.inf, None
+    return criterion(problem, vector, covariance), covariance
+
+
+def weight_of(covariance: Array) -> Array:
+    """Return lower triangular W with W^T W = covariance^-1.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n), positive definite
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+    """
+    return np.linalg.solve(np.linalg.cholesky(covariance), np.eye(covariance.shape[0]))
+
+
+def score_statistic(problem: PredictorProblem, vector: Array, covariance: Array) -> float:
+    """Return the fall of the criterion that freeing all numbers of `problem` promises to second order.
+
+    The score (Lagrange multiplier) test: one evaluation decides whether an extension is worth a search.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+        The extended problem.
+    vector : ndarray, shape (size,)
+        The optimum of the smaller problem, written in the extended one.
+    covariance : ndarray, shape (n_outputs, n_outputs)
+        Innovation covariance there.
+
+    Returns
+    -------
+    float
+        Chi-squared with as many degrees of freedom as numbers were added, if they are not needed; 0 where undefined.
+    """
+    at = linearise(problem, vector, weight_of(covariance))
+    if at is None:
+        return 0.0
+    r, J = prior_rows(problem, vector)
+    return _decrement(np.vstack([at.J, J]), np.concatenate([at.r, r]))
+
+
+def _decrement(J: Array, r: Array) -> float:
+    """Squared length of the residual inside the Jacobian's column space: the Newton step in standard deviations, squared."""
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, _ = np.linalg.svd(J / norm, full_matrices=False)
+    inside = u[:, s > 1e-10 * s[0]].T @ r
+    return float(inside @ inside)
+
+
+def search(
+    problem: PredictorProblem,
+    start: Array,
+    *,
+    rounds: int = _ROUNDS,
+    evaluations: int = _EVALUATIONS,
+    tick: Callable[[], None] | None = None,
+) -> Fit:
+    """Minimise the likelihood criterion from `start`.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    start : ndarray, shape (size,)
+    rounds, evaluations : int
+        Bounds on reweightings, and on residual evaluations in each.
+    tick : callable, optional
+        Called after each evaluation (progress, interruption).
+
+    Returns
+    -------
+    Fit
+        With status ``"failed"`` where there is no predictor at `start`.
+    """
+    from scipy.optimize import least_squares
+
+    work, vector = Workspace(problem), start.copy()
+    value, covariance = evaluate(problem, vector, work)
+    if covariance is None:
+        return _failed(problem, start)
+    target = _Weighted(problem, work, tick)
+    status: Status = "stalled"
+    count = 1
+    for _ in range(rounds):
+        target.weight = weight_of(covariance)
+        # cost is about n_used * n_outputs / 2; a fall of 1e-3 is 3 % of a standard deviation
+        small = 1e-3 / (problem.n_used * problem.y.shape[1])
+        found = least_squares(
+            target.residual, vector, jac=target.jacobian, method="trf", x_scale="jac",
+            ftol=small, xtol=1e-12, gtol=1e-14, max_nfev=evaluations,
+        )  # fmt: skip
+        count += found.nfev
+        before, vector = value, found.x
+        J = target.jacobian(vector)
+        r, covariance = target.r, target.covariance
+        value = criterion(problem, vector, covariance)
+        # the covariance moved since r was weighted: that changes the decrement only to second order
+        if before - value < 0.01 and _decrement(J, r) < _DECREMENT:
+            status = "converged"
+            break
+    at = linearise(problem, vector, weight_of(covariance), work)
+    if at is None:
+        return _failed(problem, start)
+    return Fit(
+        problem=problem,
+        vector=vector,
+        covariance=covariance,
+        J=at.J,
+        J_prior=prior_rows(problem, vector)[1],
+        criterion=value,
+        status=status,
+        evaluations=count,
+    )
+
+
+def _failed(problem: PredictorProblem, start: Array) -> Fit:
+    n_y = problem.y.shape[1]
+    return Fit(
+        problem=problem, vector=start, covariance=np.eye(n_y), J=np.zeros((problem.size + 1, problem.size)),
+        J_prior=np.zeros((0, problem.size)), criterion=np.inf, status="failed", evaluations=1,
+    )  # fmt: skip
+
+
+class _Weighted:
+    """Residual and Jacobian as SciPy's optimiser asks for them: one evaluation serves both."""
+
+    def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
+        self.problem, self.work, self.tick = problem, work, tick
+        self.weight = np.eye(problem.y.shape[1])
+        self._forget()
+
+    def _forget(self) -> None:
+        self.at = np.full(self.problem.size, np.nan)
+        self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
+
+    def residual(self, vector: Array) -> Array:
+        prior, J_prior = prior_rows(self.problem, vector)
+        result = linearise(self.problem, vector, self.weight, self.work)
+        if self.tick is not None:
+            self.tick()
+        if result is None:  # infinite: the trust region shrinks
+            return np.full(self.problem.size + 1 + prior.size, np.inf)
+        self.at = vector.copy()
+        self.r, self.J = np.concatenate([result.r, prior]), np.vstack([result.J, J_prior])
+        self.covariance = result.covariance
+        return self.r
+
+    def jacobian(self, vector: Array) -> Array:
+        if not np.array_equal(self.at, vector):
+            self.residual(vector)
+        return self.J
