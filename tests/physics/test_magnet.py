@@ -86,5 +86,5 @@ def test_what_no_magnet_can_do_is_refused() -> None:
         PAIR.holding_current(0.0, 500.0)
     with pytest.raises(ModelError, match="air gap"):
         PAIR.holding_current(0.5e-3, 0.0)
-    with pytest.raises(ModelError, match="gap is -0.1"):
+    with pytest.raises(ModelError, match=r"gap is -0\.1"):
         DifferentialPair(turns=10, area=1e-4, bias=1.0, gap=-0.1)

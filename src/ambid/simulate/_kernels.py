@@ -136,6 +136,7 @@ def run(
     resolution: Array,
     input_limits: tuple[float, float, float],
     stops: tuple[float, float],
+    gap: tuple[float, float],
 ) -> tuple[Array, Array, Array, int, int, int, int]:
     """Run the loop over all samples.
 
@@ -145,7 +146,7 @@ def run(
     Returns
     -------
     measured (n, n_outputs), command (n,), states (n, n_states), first contact (-1: none), first saturated command (-1:
-    none), number of saturated commands, first sample that is not finite (-1: none).
+    none), number of saturated commands, first sample that is not finite or not in `gap` (-1: none).
     """
     n, ny = sensor_noise.shape
     measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))
@@ -190,6 +191,9 @@ def run(
             touched = advance_nonlinear(
                 x, late, now, fraction, disturbance[k], period, substeps, magnet, body, stops[0], stops[1]
             )
+            # Beyond a pole face the equations hold no more, though they give finite numbers again.
+            if not gap[0] < x[0] < gap[1] and k + 1 < n:
+                return measured, command, states, contact, saturated, n_saturated, k + 1
         if touched and contact < 0:
             contact = k + 1
     return measured, command, states, contact, saturated, n_saturated, -1

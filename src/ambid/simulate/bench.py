@@ -138,7 +138,7 @@ def simulate(
     Raises
     ------
     ModelError
-        If an argument has a wrong shape or value, or the simulation leaves the finite numbers.
+        If an argument has a wrong shape or value, or the simulation leaves the air gap or the finite numbers.
     """
     from ambid.simulate._kernels import run
 
@@ -172,11 +172,12 @@ def simulate(
         np.array([getattr(noise, f"{o}_resolution") for o in of.outputs]),
         (*getattr(limits, of.inputs[0]), getattr(noise, f"{of.inputs[0]}_resolution")),
         limits.position,
+        standing.gap,
     )
     if lost >= 0:
         raise ModelError(
-            f"the simulation leaves the finite numbers at sample {lost} ({lost / rate_hz:.6g} s); an unstable plant"
-            " needs a loop, and stops inside the air gap. Give limits.position, another loop, or more substeps"
+            f"the simulation leaves the air gap or the finite numbers at sample {lost} ({lost / rate_hz:.6g} s); an"
+            " unstable plant needs a loop, and stops in the gap. Give limits.position, another loop, or more substeps"
         )
     truth = {**standing.parameters(), "delay": loop.delay}
     settings = {"rate_hz": rate_hz, "loop": written(loop), "noise": written(noise), "limits": written(limits)}

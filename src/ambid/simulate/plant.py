@@ -83,6 +83,11 @@ class Standing:
             return self.plant.parameters
         return self.plant.linearise(self.point.position)
 
+    @property
+    def gap(self) -> tuple[float, float]:
+        """Positions in m between which the equations hold."""
+        return (-math.inf, math.inf) if isinstance(self.plant, LinearPlant) else self.plant.magnet.range
+
     def matrices(self, period: float, fraction: float) -> tuple[Array, Array, Array, Array]:
         """Return A, B, B_late and E over a `period` in s; zeros for a nonlinear plant."""
         if not isinstance(self.plant, LinearPlant):

@@ -121,14 +121,14 @@ def _raw(channel: Channel, c: RigChannel) -> Channel:
         unit = calibration.unit_in or (written.si if written else "1")
     else:
         unit = calibration.unit_in
-        out, first = np.unique(calibration.out, return_index=True)
-        raw = calibration.raw[first]
         slopes = np.diff(calibration.out)
         if not (np.all(slopes >= 0.0) or np.all(slopes <= 0.0)):
             raise RigError(
                 f"channels.{c.role}.table rises and falls; a simulated {c.role} cannot be put back through it."
                 " Simulate with a rig without that table"
             )
+        rising = slice(None) if slopes.sum() > 0.0 else slice(None, None, -1)
+        out, raw = calibration.out[rising], calibration.raw[rising]
         if values.min() < out[0] or values.max() > out[-1]:
             raise RigError(
                 f"the simulated {c.role} runs from {values.min():.4g} to {values.max():.4g} {channel.unit}; the table"
