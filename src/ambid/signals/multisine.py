@@ -29,8 +29,9 @@ def multisine(
 
     It has a line at each multiple of rate/(n_samples/periods) in the band (0 and half the rate left out). Schroeder
     phases φ_k = -2π Σ_{j<k} (k - j) p_j, with p_j the share of line j in the power, give a crest factor of about 1.7
-    for a flat spectrum (Schroeder 1970). `crest_iterations` lowers it by clipping the peaks and putting the amplitudes
-    back, from the given phases (van der Ouderaa, Schoukens and Renneboog 1988); the best iteration is kept.
+    for a flat spectrum of many lines (Schroeder 1970). `crest_iterations` lowers it by clipping the peaks and putting
+    the amplitudes back, from the given phases (van der Ouderaa, Schoukens and Renneboog 1988); the best iteration is
+    kept.
 
     Parameters
     ----------

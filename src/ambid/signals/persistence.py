@@ -84,6 +84,8 @@ def persistent_excitation(u: Array, order: int, *, tolerance: float = 1e-9) -> P
         return PersistentExcitation(order=0, asked=order, smallest=0.0, largest=0.0)
     rows = u.size - order + 1
     matrix = hankel(centred[:rows], centred[rows - 1 :]) / (rms * np.sqrt(rows))
+    # Each column has its own mean over its own samples: only their removal takes the constant out exactly.
+    matrix -= matrix.mean(axis=0)
     # The leading n columns of the triangle are those of the Hankel matrix of order n: one QR serves all orders.
     triangle: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
     values = np.linalg.svd(triangle, compute_uv=False)
