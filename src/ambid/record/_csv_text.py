@@ -14,6 +14,7 @@ from ambid.record.record import Array
 from ambid.record.sampling import GapPolicy
 
 _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
+_BLOCK = 20_000  # rows that are read at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,45 +85,55 @@ def data_rows(lines: list[str], header_row: int, path: Path, at_least: int) -> l
 
 
 def read_values(body: list[str], header: Header, path: Path, gaps: GapPolicy) -> Array:
-    """Turn the rows into numbers: all at once if they are sound, else cell by cell."""
-    if "" not in body:  # np.loadtxt would skip an empty line without a word
-        try:
-            values = np.loadtxt(body, delimiter=header.delimiter, comments=None, ndmin=2)
-        except ValueError:
-            pass
-        else:
-            if values.shape[1] == len(header.names) and np.isfinite(values).all():
-                return values
-    return _cell_by_cell(body, header, path, gaps)
+    """Turn the rows into numbers, shape (n_rows, n_columns): by blocks, and cell by cell where a block is not sound."""
+    values = np.empty((len(body), len(header.names)))
+    for start in range(0, len(body), _BLOCK):
+        block = body[start : start + _BLOCK]
+        numbers = _sound_block(block, header)
+        if numbers is None:
+            numbers = _cell_by_cell(block, header, header.row + 1 + start, path, gaps)
+        values[start : start + len(block)] = numbers
+    return values
 
 
-def _cell_by_cell(body: list[str], header: Header, path: Path, gaps: GapPolicy) -> Array:
+def _sound_block(block: list[str], header: Header) -> Array | None:
+    """Return the numbers of rows without any fault; None if there is one."""
+    if "" in block:  # np.loadtxt would skip an empty line without a word
+        return None
+    try:
+        numbers = np.loadtxt(block, delimiter=header.delimiter, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return numbers if numbers.shape[1] == len(header.names) and np.isfinite(numbers).all() else None
+
+
+def _cell_by_cell(block: list[str], header: Header, first_row: int, path: Path, gaps: GapPolicy) -> Array:
     """Read row by row; name the first bad cell, or mark bad cells NaN where the policy treats gaps."""
-    n = len(header.names)
-    values = np.full((len(body), n), np.nan)
-    for k, line in enumerate(body):
+    values = np.empty((len(block), len(header.names)))
+    for k, line in enumerate(block):
         cells = line.split(header.delimiter)
-        row = header.row + 1 + k
-        if len(cells) != n:
-            raise RecordError(f"{path}, row {row}: {_ragged(line, len(cells), n, header.delimiter)}")
+        if len(cells) != len(header.names):
+            fault = _ragged(line, len(cells), len(header.names), header.delimiter)
+            raise RecordError(f"{path}, row {first_row + k}: {fault}")
         for j, cell in enumerate(cells):
             number = _number(cell)
             if not np.isfinite(number):
-                text = cell.strip()
-                if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", text):
-                    raise RecordError(
-                        f"{path}, row {row}, column {header.names[j]!r}: {text!r} has a decimal comma;"
-                        " numbers need a decimal point. Export again with a point"
-                    )
-                if gaps == "error":
-                    what = f"{text!r} is not a finite number" if text else "the value is missing"
-                    raise RecordError(
-                        f"{path}, row {row}, column {header.names[j]!r}: {what}; every cell must be one."
-                        " Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
-                    )
+                fault = _faulty_cell(cell.strip(), gaps)
+                if fault:
+                    raise RecordError(f"{path}, row {first_row + k}, column {header.names[j]!r}: {fault}")
                 number = np.nan
             values[k, j] = number
     return values
+
+
+def _faulty_cell(text: str, gaps: GapPolicy) -> str:
+    """Say what is wrong with a cell that holds no finite number; nothing if it is a gap that the policy treats."""
+    if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", text):
+        return f"{text!r} has a decimal comma; numbers need a decimal point. Export again with a point"
+    if gaps != "error":
+        return ""
+    what = f"{text!r} is not a finite number" if text else "the value is missing"
+    return f"{what}; every cell must be one. Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
 
 
 def _ragged(line: str, got: int, wanted: int, delimiter: str) -> str:

@@ -165,7 +165,7 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
     lines.extend(",".join(map(repr, row)) for row in zip(*columns, strict=True))
     data = ("\n".join(lines) + "\n").encode()
     if path.suffix.lower() == ".gz":
-        data = gzip.compress(data, mtime=0)  # no date inside: equal records give equal files
+        data = gzip.compress(data, compresslevel=6, mtime=0)  # no date inside: equal records give equal files
     try:
         path.write_bytes(data)
     except OSError as failure:
