@@ -112,7 +112,18 @@ class Unit:
     scale: float
 
     def same_kind(self, other: Unit) -> bool:
-        """Tell whether a value in `other` can be expressed in this unit."""
+        """Tell whether a value in another unit can be expressed in this one.
+
+        Parameters
+        ----------
+        other : Unit
+            The other unit.
+
+        Returns
+        -------
+        bool
+            True if both have the same SI unit.
+        """
         return self.si == other.si
 
     @overload
@@ -129,7 +140,7 @@ class Unit:
 
         Returns
         -------
-        float or ndarray
+        float or ndarray, of the shape of `x`
             In `si`; `x` itself where the scale is 1, so that SI data pass bit for bit.
         """
         if self.scale == 1.0:

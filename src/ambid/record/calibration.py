@@ -13,7 +13,7 @@ import numpy as np
 
 from ambid.errors import AmbidError, RecordError, UnitError
 from ambid.record._csv_text import data_rows, find_header, read_values
-from ambid.record._files import file_bytes, sha256_of, utf8_text
+from ambid.record.files import file_bytes, sha256_of, utf8_text
 from ambid.record.record import Array, Channel, Step
 from ambid.units import Unit, parse_unit
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.errors import RecordError, UnitError
 from ambid.record._csv_text import Header, data_rows, find_header, read_values
-from ambid.record._files import file_bytes, gunzipped, sha256_of, utf8_text
+from ambid.record.files import file_bytes, gunzipped, sha256_of, utf8_text
 from ambid.record.record import Array, Channel, Record, Step
 from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly
 from ambid.units import UNKNOWN, Unit, nearest_unit, parse_unit

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import RecordError
-from ambid.record._files import file_bytes, sha256_of
+from ambid.record.files import file_bytes, sha256_of
 from ambid.record.record import Channel, Record, Step
 from ambid.record.sampling import JITTER, GapPolicy, Table, check_gap_policy, sample_uniformly
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import RecordError, UnitError
-from ambid.record._files import file_bytes, sha256_of
 from ambid.record.csv_format import column_channel
+from ambid.record.files import file_bytes, sha256_of
 from ambid.record.record import Array, Record, Step
 from ambid.record.sampling import GapPolicy, Table, check_gap_policy, sample_uniformly
 from ambid.units import UNKNOWN, parse_unit

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ambid.errors import RigError
 from ambid.physics.models import nearest
-from ambid.record._files import file_bytes, utf8_text
+from ambid.record.files import file_bytes, utf8_text
 
 SCHEMA = "ambid.rig/1"
 
