@@ -25,9 +25,9 @@ setup: $(VENV)/.setup  ## make .venv with ambid and its tools, from hash-pinned 
 $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools/venv.sh
 	@sh tools/venv.sh $(VENV) "$(PYTHON)"
 	@echo "Installing the pinned packages into $(VENV) (a minute or two, once) ..." >&2
-	@$(PIP) install --quiet --require-hashes -r requirements/build.txt
-	@$(PIP) install --quiet --require-hashes -r requirements/dev.txt
-	@$(PIP) install --quiet --no-build-isolation --no-deps --no-index --editable .
+	@$(PIP) install -qq --require-hashes -r requirements/build.txt
+	@$(PIP) install -qq --require-hashes -r requirements/dev.txt
+	@$(PIP) install -qq --no-build-isolation --no-deps --no-index --editable .
 	@$(BIN)/python -m compileall -q src
 	@touch $@
 
@@ -55,7 +55,7 @@ docs: $(VENV)/.docs  ## build the documentation into docs/_site
 	@echo "docs/_site/index.html"
 
 $(VENV)/.docs: $(VENV)/.setup requirements/docs.txt
-	@$(PIP) install --quiet --require-hashes -r requirements/docs.txt
+	@$(PIP) install -qq --require-hashes -r requirements/docs.txt
 	@touch $@
 
 format: setup  ## rewrite the files in the project's format

@@ -84,7 +84,7 @@ def _dunder(name: str) -> bool:
 
 
 def _call_name(node: ast.Call) -> str:
-    return getattr(node.func, "attr", None) or getattr(node.func, "id", "")
+    return ast.unparse(node.func).split(".")[-1]
 
 
 def _absolute(name: str, level: int, module: str, *, is_package: bool) -> str:

@@ -1,0 +1,148 @@
+"""Everything public has a numpydoc docstring that agrees with its signature; the rule itself is tested too."""
+
+import ast
+import importlib
+import inspect
+from pathlib import Path
+
+import pytest
+
+from tests.conventions.docstring_rules import module_complaints
+from tests.conventions.sources import PACKAGE, ROOT, module_name, package_files, parsed, rooms, shown
+
+PUBLIC_FILES = [
+    path for path in package_files() if not any(p.startswith("_") and p != "__init__.py" for p in path.parts)
+]
+
+
+@pytest.mark.parametrize("path", PUBLIC_FILES, ids=shown)
+def test_public_modules_are_documented(path):
+    found = [f"{shown(path)}: {complaint}" for complaint in module_complaints(parsed(path)) if _has_code(path)]
+    assert not found, "\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize("room", rooms())
+def test_every_name_a_room_exports_exists_and_is_documented(room):
+    module = importlib.import_module(f"ambid.{room}")
+    missing = [name for name in getattr(module, "__all__", []) if not hasattr(module, name)]
+    assert not missing, f"ambid.{room}.__all__ names what is not there"
+    found = []
+    for path, names in _exported_from_private_modules(module).items():
+        found += [f"{shown(path)}: {complaint}" for complaint in module_complaints(parsed(path), only=names)]
+    assert not found, "\n" + "\n".join(found)
+
+
+def _exported_from_private_modules(module):
+    exported: dict[Path, set[str]] = {}
+    for name in getattr(module, "__all__", []):
+        value = getattr(module, name)
+        value = getattr(value, "py_func", value)  # a compiled function carries its source there
+        home = getattr(value, "__module__", "")
+        if (inspect.isclass(value) or inspect.isfunction(value)) and "._" in home:
+            path = Path(inspect.getsourcefile(value))
+            exported.setdefault(path, set()).add(value.__name__)
+    return exported
+
+
+def _has_code(path):
+    return bool(parsed(path).body)
+
+
+def test_the_walk_meets_the_package():
+    assert PACKAGE / "errors.py" in PUBLIC_FILES
+    assert module_name(PACKAGE / "record" / "record.py") == "ambid.record.record"
+    assert PACKAGE.is_relative_to(ROOT)
+
+
+GOOD = '''
+"""A module."""
+
+@dataclass(frozen=True)
+class Gain:
+    """A gain.
+
+    Attributes
+    ----------
+    values : Array, shape (n_outputs,), in V/A
+    name : str
+        Any.
+    """
+
+    values: Array
+    name: str
+
+    @property
+    def first(self) -> float:
+        """The first, in V/A."""
+
+    def at(self, index: int) -> float:
+        """Return the gain at `index` in V/A."""
+
+
+def scale(x: Array, *names: str, gain: float = 1.0) -> Array:
+    """Scale.
+
+    Parameters
+    ----------
+    x : Array, shape (n_samples,), in A
+    *names : str
+        Channels.
+    gain : float
+        In V/A.
+
+    Returns
+    -------
+    Array, shape (n_samples,), in V
+
+    Raises
+    ------
+    ValueError
+        If the gain is 0.
+    """
+    def inner():
+        raise KeyError("not its own")
+    if gain == 0:
+        raise ValueError("gain")
+    return x
+'''
+
+BROKEN = {
+    "module": ('"""A module."""', "", "module has no docstring"),
+    "class": ('    """A gain.\n', '    f"""A gain.\n', "class Gain has no docstring"),
+    "attribute": ("    name : str\n        Any.\n", "", "'name' is not documented under Attributes"),
+    "attribute shape": (", shape (n_outputs,), in V/A\n    name", "\n    name", "Attributes names no shape"),
+    "parameter": ("    gain : float\n        In V/A.\n", "", "'gain' is not documented under Parameters"),
+    "starred": ("    *names : str\n        Channels.\n", "", "'names' is not documented"),
+    "parameter shape": ("x : Array, shape (n_samples,), in A", "x : Array", "'x' is an array"),
+    "stale parameter": (
+        "    gain : float\n",
+        "    gain : float\n    offset : float\n",
+        "'offset' that it does not have",
+    ),
+    "returns": ("    Returns\n    -------\n    Array, shape (n_samples,), in V\n", "", "no section Returns"),
+    "returned shape": ("    Array, shape (n_samples,), in V\n", "    Array\n", "Returns names no shape"),
+    "raises": ("    Raises\n    ------\n    ValueError\n        If the gain is 0.\n", "", "no section Raises"),
+    "raises another": ("    ValueError\n        If", "    TypeError\n        If", "raises ValueError, which Raises"),
+    "property": ('        """The first, in V/A."""\n', "        return 1.0\n", "Gain.first has no docstring"),
+    "property shape": ("def first(self) -> float", "def first(self) -> Array", "names no shape"),
+    "one sentence": ("gain at `index` in", "gain in", "'index' is not documented"),
+    "one sentence, array": ("def at(self, index: int) -> float", "def at(self, index: int) -> Array", "names no shape"),
+    "function": ('    """Scale.\n', '    f"""Scale.\n', "scale has no docstring"),
+}
+
+
+def test_a_good_module_passes():
+    assert list(module_complaints(ast.parse(GOOD))) == []
+
+
+@pytest.mark.parametrize(("old", "new", "complaint"), BROKEN.values(), ids=BROKEN.keys())
+def test_a_missing_part_is_found(old, new, complaint):
+    assert old in GOOD
+    found = list(module_complaints(ast.parse(GOOD.replace(old, new, 1))))
+    assert any(complaint in line for line in found), found
+
+
+def test_only_the_named_are_looked_at():
+    bare = '"""M."""\ndef a():\n    pass\ndef b():\n    pass\ndef _c():\n    pass\n'
+    assert len(list(module_complaints(ast.parse(bare)))) == 2
+    assert len(list(module_complaints(ast.parse(bare), only={"a"}))) == 1

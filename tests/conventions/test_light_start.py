@@ -1,0 +1,45 @@
+"""Starting the command costs no heavy import: judged by what is loaded, not by the clock."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from tests.conventions.sources import PACKAGE, ROOT, rooms
+
+# What a room may load when it is imported, and what the command may load before it does anything.
+HEAVY_FOR_ROOMS = ("numba", "llvmlite", "matplotlib", "h5py", "scipy.signal", "scipy.stats", "scipy.io")
+HEAVY_FOR_THE_COMMAND = ("numba", "llvmlite", "matplotlib", "h5py", "scipy", "jinja2")
+
+HELP = """
+import sys
+sys.argv = ["ambid", "--help"]
+from ambid.cli import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code, end.code
+"""
+
+
+def loaded_after(code, heavy):
+    report = f"import json, sys\nprint('\\n' + json.dumps([m for m in {heavy!r} if m in sys.modules]))"
+    done = subprocess.run([sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("room", [r for r in rooms() if r != "cli"])
+def test_importing_a_room_loads_nothing_heavy(room):
+    assert loaded_after(f"import ambid.{room}", HEAVY_FOR_ROOMS) == []
+
+
+@pytest.mark.parametrize("code", ["import ambid", HELP] if "cli" in rooms() else ["import ambid"])
+def test_the_package_and_the_help_load_nothing_heavy(code):
+    assert loaded_after(code, HEAVY_FOR_THE_COMMAND) == []
+
+
+def test_what_is_loaded_is_seen():
+    assert loaded_after("import h5py", HEAVY_FOR_ROOMS) == ["h5py"]
+    assert PACKAGE.is_dir()
