@@ -98,9 +98,9 @@ def _unstable_bearing() -> Preset:
         summary="differential bearing: 138 turns, 470.3 mm2, bias 1 A, gap 0.432 mm; k_i 55.7 N/A, k_x -1.29e5 N/m",
         parameters=MappingProxyType(parameters),
         plant=plant,
-        loop=placed_loop(parameters, (-1500, -250 + 250j, -250 - 250j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
+        loop=placed_loop(parameters, (-600, -120 + 120j, -120 - 120j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
         usually_closed=True,
-        noise=Noise.held(rate_hz=20_000.0, position=2e-7, current=2e-3, force=2.0, voltage=0.05),
+        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=2e-3, force=1.0, voltage=0.05),
         limits=Limits(voltage=(-48.0, 48.0), current=(-1.0, 1.0), position=(-0.2e-3, 0.2e-3)),
         rate_hz=20_000.0,
         sources=MappingProxyType(
@@ -123,9 +123,9 @@ def _rmit() -> Preset:
         name="rmit",
         summary="one axis of the RMIT bearing: 61 N/A, -150 000 N/m, air gap 0.35 mm",
         parameters=MappingProxyType(parameters),
-        loop=placed_loop(parameters, (-1500, -350 + 350j, -350 - 350j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
+        loop=placed_loop(parameters, (-800, -180 + 180j, -180 - 180j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
         usually_closed=True,
-        noise=Noise.held(rate_hz=20_000.0, position=5e-7, current=1e-3, force=1.0, voltage=0.05),
+        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.5, voltage=0.05),
         limits=Limits(voltage=(-60.0, 60.0), current=(-2.0, 2.0), position=(-350e-6, 350e-6)),
         rate_hz=20_000.0,
         sources=MappingProxyType(
