@@ -1,6 +1,6 @@
 # Everything a person or the CI does with this repository. `make` alone lists the targets.
 
-PYTHON ?=
+PYTHON :=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
@@ -15,13 +15,17 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types pytest bench docs format changelog lock clean distclean
+.PHONY: help setup demo test lint types bench docs format changelog lock clean distclean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
 
 setup: $(VENV)/.setup  ## make .venv with ambid and its tools, from hash-pinned versions (PYTHON=... chooses the Python)
 
+# A Python named on the command line counts also where the environment is already there.
+ifneq ($(strip $(PYTHON)),)
+.PHONY: $(VENV)/.setup
+endif
 $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools/venv.sh
 	@sh tools/venv.sh $(VENV) "$(PYTHON)"
 	@echo "Installing the pinned packages into $(VENV) (a minute or two, once) ..." >&2
@@ -34,7 +38,9 @@ $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools
 demo: setup  ## identify the embedded record and print the estimate beside the truth
 	@$(BIN)/ambid demo
 
-test: lint types pytest  ## everything that must hold: lint, types, all tests
+test: setup  ## everything that must hold: lint, types, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
+	@$(MAKE) --no-print-directory -j1 lint types
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: setup  ## formatting and lint
 	$(BIN)/ruff format --check .
@@ -43,15 +49,11 @@ lint: setup  ## formatting and lint
 types: setup  ## strict type check
 	$(BIN)/mypy
 
-# After lint and types also under `make -j`: the last line of `make test` is pytest's own verdict.
-pytest: setup | lint types  ## all tests, after lint and types (PYTEST_ARGS="-k words" chooses)
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
-
 bench: setup  ## measure speed and accuracy beside plain SciPy; writes bench/results and docs/benchmarks.md
 	@$(BIN)/python bench/run.py
 
 docs: $(VENV)/.docs  ## build the documentation into docs/_site
-	@$(BIN)/python -m sphinx --jobs auto --keep-going -b html docs docs/_site
+	@$(BIN)/python -m sphinx --quiet -b html docs docs/_site
 	@echo "docs/_site/index.html"
 
 $(VENV)/.docs: $(VENV)/.setup requirements/docs.txt

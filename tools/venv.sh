@@ -1,14 +1,19 @@
 #!/bin/sh
 # Make the virtual environment: sh tools/venv.sh FOLDER [PYTHON]
-# Takes PYTHON where given, else the first python3 that is 3.11 or newer. An environment that already works is kept.
+# Takes PYTHON where given, else the first python3 that is 3.11 or newer. An environment that already works is kept,
+# unless it is of another version than the PYTHON asked for.
 set -eu
 folder=$1
 wanted=${2:-}
 
 new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
 
+version() { "$1" -c 'import sys; print(sys.version_info[:2])' 2>/dev/null; }
+
 if new_enough "$folder/bin/python" && "$folder/bin/python" -m pip --version >/dev/null 2>&1; then
-    exit 0
+    if [ -z "$wanted" ] || [ "$(version "$wanted")" = "$(version "$folder/bin/python")" ]; then
+        exit 0
+    fi
 fi
 
 python=
