@@ -1,0 +1,1 @@
+"""Parameters, magnets, plant models and their discretisation, control loop and presets: no data in this room."""

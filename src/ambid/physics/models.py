@@ -76,11 +76,11 @@ class LinearModel(Protocol):
         ...
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
-        """Return the exact derivative of the matrices with respect to one parameter."""
+        """Return the exact derivative of the matrices at `theta` (SI) with respect to `parameter`."""
         ...
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return natural scales of the parameters that may rightly be zero, SI; a value is judged against them."""
+        """Return natural scales at `theta` (SI) for the parameters that may rightly be zero; values are judged by them."""
         ...
 
 
@@ -106,6 +106,11 @@ class OneAxis:
 
     m x'' = k_i i - k_x x - c x' + f,  V = R i + L i' + k_i x'; both position and current are measured
     (the printed C = [1 0 1]^T has to be two rows, theory.md sec. 1).
+
+    Attributes
+    ----------
+    name, summary, parameters, inputs, outputs, states, disturbances
+        As in `LinearModel`.
     """
 
     name: str = "one-axis"
@@ -156,6 +161,11 @@ class OneAxis:
         -------
         StateSpace
             Derivatives of A (3, 3), B (3, 1), E (3, 2), C (2, 3).
+
+        Raises
+        ------
+        ModelError
+            If the model has no such parameter.
         """
         m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
         d_a, d_b, d_e = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 2))
@@ -196,7 +206,13 @@ class OneAxis:
 
 @dataclass(frozen=True, slots=True)
 class Coil:
-    """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'."""
+    """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'.
+
+    Attributes
+    ----------
+    name, summary, parameters, inputs, outputs, states, disturbances
+        As in `LinearModel`.
+    """
 
     name: str = "coil"
     summary: str = "coil alone, rotor held at rest: voltage in, current out"
@@ -243,6 +259,11 @@ class Coil:
         -------
         StateSpace
             All of shape (1, 1).
+
+        Raises
+        ------
+        ModelError
+            If the model has no such parameter.
         """
         r, ell = theta["R"], theta["L"]
         zero = np.zeros((1, 1))
@@ -278,6 +299,11 @@ class Rotor:
 
     The current is the input, as with a transconductance amplifier; the data show only ratios to m
     (theory.md sec. 1), so m wants a fixed value or a prior.
+
+    Attributes
+    ----------
+    name, summary, parameters, inputs, outputs, states, disturbances
+        As in `LinearModel`.
     """
 
     name: str = "rotor"
@@ -328,6 +354,11 @@ class Rotor:
         -------
         StateSpace
             The derivatives.
+
+        Raises
+        ------
+        ModelError
+            If the model has no such parameter.
         """
         m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
         d_a, d_b, d_e = np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 1))
@@ -421,6 +452,7 @@ def model(name: str) -> LinearModel:
     """
     if name not in _MODELS:
         raise ModelError(
-            f"there is no model {name!r}; there are {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} See 'ambid models'"
+            f"there is no model {name!r}; there are {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} "
+            "See 'ambid models'"
         )
     return _MODELS[name]

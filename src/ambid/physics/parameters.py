@@ -57,6 +57,8 @@ class Parameter:
         if self.role in ("fixed", "prior") and self.value is None:
             raise ModelError(f"parameter {self.name!r} is {self.role} but has no value. Give value = ...")
         if self.role == "prior" and not (self.sd is not None and self.sd > 0):
-            raise ModelError(f"parameter {self.name!r} has a prior without a positive sd (got {self.sd}). Give sd = ...")
+            raise ModelError(
+                f"parameter {self.name!r} has a prior without a positive sd (got {self.sd}). Give sd = ..."
+            )
         if self.role != "prior" and self.sd is not None:
             raise ModelError(f"parameter {self.name!r} is {self.role} but has an sd. Remove sd, or set role = 'prior'")
