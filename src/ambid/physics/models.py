@@ -80,7 +80,7 @@ class LinearModel(Protocol):
         ...
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return natural scales at `theta` (SI) for the parameters that may rightly be zero; values are judged by them."""
+        """Return natural scales at `theta` (SI) of the parameters that may rightly be zero, to judge values against."""
         ...
 
 
