@@ -8,7 +8,7 @@ python=$1
     exit 1
 }
 "$python" -m venv --clear build/lock
-build/lock/bin/python -m pip install --quiet --require-hashes -r requirements/lock.txt
+build/lock/bin/python -m pip install -qq --require-hashes -r requirements/lock.txt
 
 # Its own settings, not the machine's: an additional local index would put hashes here that nobody else can match.
 export PIP_CONFIG_FILE=/dev/null
