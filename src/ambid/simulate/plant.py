@@ -48,7 +48,21 @@ class LinearPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Standing:
-    """A plant at its operating point: what the simulation loop needs to know, linear or not."""
+    """A plant at its operating point: what the simulation loop needs to know, linear or not.
+
+    Attributes
+    ----------
+    plant : LinearPlant or NonlinearPlant
+        The plant itself.
+    model : LinearModel
+        Its linear model, or the one that it linearises to.
+    point : OperatingPoint
+        Where it stands, SI.
+    centre : Array, shape (n_states,), SI
+        The states at `point`.
+    centre_input : float
+        The input at `point`, SI.
+    """
 
     plant: LinearPlant | NonlinearPlant
     model: LinearModel
@@ -58,7 +72,7 @@ class Standing:
 
     @classmethod
     def of(cls, plant: LinearPlant | NonlinearPlant, point: OperatingPoint | None) -> Standing:
-        """Return the plant at `point`, by default at rest at zero."""
+        """Return `plant` at `point`, by default at rest at zero."""
         if isinstance(plant, LinearPlant):
             of, point = plant.model, point or OperatingPoint()
         else:
@@ -89,7 +103,20 @@ class Standing:
         return (-math.inf, math.inf) if isinstance(self.plant, LinearPlant) else self.plant.magnet.range
 
     def matrices(self, period: float, fraction: float) -> tuple[Array, Array, Array, Array]:
-        """Return A, B, B_late and E over a `period` in s; zeros for a nonlinear plant."""
+        """Return A, B, B_late and E over a period; zeros for a nonlinear plant.
+
+        Parameters
+        ----------
+        period : float
+            In s.
+        fraction : float
+            Part of the period by which the input is late, 0 to 1.
+
+        Returns
+        -------
+        tuple of Array
+            Shapes (n_states, n_states), (n_states,), (n_states,), (n_states, n_disturbances).
+        """
         if not isinstance(self.plant, LinearPlant):
             return np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros((3, 2))
         d, _ = discretise(self.model.matrices(self.plant.parameters), period, fraction=fraction)
@@ -97,7 +124,7 @@ class Standing:
         return full, now, late, noise
 
     def nonlinear(self) -> tuple[Array, Array]:
-        """Return the co-energy's numbers and m, c, R, gravity; zeros for a linear plant."""
+        """Return the co-energy's numbers, shape (6,), and m, c, R, gravity, shape (4,); zeros for a linear plant."""
         if isinstance(self.plant, LinearPlant):
             return np.zeros(6), np.zeros(4)
         w, p = self.plant.magnet.coenergy, self.plant
