@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify import start as weak_form
 from ambid.identify.likelihood import Fit, evaluate, score_statistic, search
-from ambid.identify.predictor import PredictorProblem, Scales, assemble
+from ambid.identify.predictor import assemble
+from ambid.identify.problem import PredictorProblem, Scales
 from ambid.physics.discretise import discretise
 from ambid.physics.models import LinearModel
 from ambid.physics.parameters import Parameter

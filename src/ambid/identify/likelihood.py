@@ -13,7 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.predictor import PredictorProblem, Workspace, innovations, linearise
+from ambid.identify.problem import PredictorProblem
+from ambid.identify.sensitivity import Workspace, innovations, linearise
 
 Array = NDArray[np.float64]
 Status = Literal["converged", "stalled", "failed"]

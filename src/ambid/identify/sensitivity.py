@@ -1,0 +1,220 @@
+"""Innovations of a record and their exact Jacobian, compressed by QR block after block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.predictor import assemble
+from ambid.identify.problem import PredictorProblem
+
+Array = NDArray[np.float64]
+
+_BLOCK = 2048  # samples: sensitivities of one block stay in the second-level cache
+_QR_ROWS = 512  # rows of one small QR: below the size at which the linear algebra library starts threads
+
+
+class Workspace:
+    """What repeated evaluations of one problem share: scaled data, and the last gain as a start for the next Riccati solve.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+
+    Attributes
+    ----------
+    y : ndarray, shape (n_used, n_outputs)
+        Scaled outputs.
+    w : ndarray, shape (n_used, n_states + n_lags n_inputs + n_outputs + 1)
+        Columns: predictor state (filled by each run), inputs at the problem's lags, y, 1.
+    gain : ndarray or None
+    """
+
+    def __init__(self, problem: PredictorProblem) -> None:
+        n_samples, d = problem.y.shape[0], problem.delay
+        at = np.arange(problem.skip, n_samples, problem.stride)
+        self.y = np.ascontiguousarray(problem.y[at] / problem.scales.output)
+        # inputs after the last sample do not exist; they would act only after the last output
+        u = problem.u / problem.scales.input
+        lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
+        state, one = np.zeros((at.size, len(problem.model.states))), np.ones((at.size, 1))
+        self.w = np.hstack([state, *lagged, self.y, one])
+        self.gain: Array | None = None
+
+
+def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> Array | None:
+    """Return the innovations in scaled output units.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    work : Workspace, optional
+        Of this problem, to save making it again.
+
+    Returns
+    -------
+    ndarray, shape (n_used, n_outputs), or None where there is no predictor at `vector`
+    """
+    from ambid.identify._kernels import innovations_block
+
+    work = work or Workspace(problem)
+    predictor = assemble(problem, vector, near=work.gain, with_derivatives=False)
+    if predictor is None:
+        return None
+    work.gain = predictor.gain
+    e = np.empty_like(work.y)
+    innovations_block(predictor.M, predictor.C, work.y, work.w, predictor.x0, e)
+    return e if np.all(np.isfinite(e[-1])) else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearisation:
+    """Weighted innovations and Jacobian at one vector, compressed by QR.
+
+    Attributes
+    ----------
+    r : ndarray, shape (size + 1,)
+    J : ndarray, shape (size + 1, size)
+        Same norm, gradient and singular values as the full residual and Jacobian: they differ by an orthogonal matrix.
+    covariance : ndarray, shape (n_outputs, n_outputs)
+        Mean of e e^T, scaled output units.
+    """
+
+    r: Array
+    J: Array
+    covariance: Array
+
+
+def linearise(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace | None = None
+) -> Linearisation | None:
+    """Return the compressed weighted residual and its exact Jacobian.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    weight : ndarray, shape (n_outputs, n_outputs)
+        Lower triangular W with W^T W the inverse innovation covariance (scaled).
+    work : Workspace, optional
+        Of this problem.
+
+    Returns
+    -------
+    Linearisation or None where there is no predictor at `vector`
+    """
+    work = work or Workspace(problem)
+    p, moment = problem.size, np.zeros_like(weight)
+    blocks = []
+    for e, rows in residual_blocks(problem, vector, weight, work):
+        moment += e.T @ e
+        blocks.append(reduce_rows(rows))
+    if not blocks or not np.all(np.isfinite(moment)):
+        return None
+    reduced = reduce_rows(np.vstack(blocks), last=True)
+    full = np.zeros((p + 1, p + 1))
+    full[: reduced.shape[0]] = reduced
+    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=moment / problem.n_used)
+
+
+def reduce_rows(rows: Array, *, last: bool = False) -> Array:
+    """Replace rows by fewer that differ by an orthogonal matrix (QR of short stacks).
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n_rows, n_columns)
+    last : bool
+        Reduce to at most n_columns rows, instead of that many for each stack.
+
+    Returns
+    -------
+    ndarray, shape (fewer, n_columns)
+    """
+    if last:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+    whole = rows.shape[0] // _QR_ROWS * _QR_ROWS
+    if not whole:
+        return rows
+    factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, _QR_ROWS, rows.shape[1]), mode="r"))
+    return np.vstack([factors.reshape(-1, rows.shape[1]), rows[whole:]])
+
+
+def reduce_blocks(blocks: Iterable[Array]) -> Array:
+    """Reduce all rows of several blocks to at most as many as they have columns.
+
+    Parameters
+    ----------
+    blocks : iterable of ndarray, each of shape (n_rows, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (at most n_columns, n_columns)
+    """
+    return reduce_rows(np.vstack([reduce_rows(b) for b in blocks]), last=True)
+
+
+def residual_blocks(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace
+) -> Iterator[tuple[Array, Array]]:
+    """Yield innovations and rows [W de/dq, W e] block after block, so that memory does not grow with the record.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    weight : ndarray, shape (n_outputs, n_outputs)
+    work : Workspace
+
+    Yields
+    ------
+    e : ndarray, shape (block, n_outputs)
+        Innovations, scaled, unweighted.
+    rows : ndarray, shape (block * n_outputs, size + 1)
+        Time runs slowest. Nothing is yielded where there is no predictor at `vector`.
+    """
+    from ambid.identify._kernels import innovations_block, sensitivity_scan
+
+    predictor = assemble(problem, vector, near=work.gain)
+    if predictor is None:
+        return
+    work.gain = predictor.gain
+    n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
+    # a state basis in which the weighted outputs are the first states: sensitivities are then read off, not multiplied
+    whitened = weight @ predictor.C
+    basis = np.vstack([whitened, null_space(whitened)])
+    F = basis @ predictor.M[:, :n] @ np.linalg.inv(basis)
+    forcing = np.zeros((predictor.M.shape[1], n, p + 1))
+    forcing[:, :, :p] = np.einsum("ab,blq->laq", basis, predictor.dM)
+    flat = forcing.reshape(forcing.shape[0], -1)
+    s = np.zeros((min(_BLOCK, n_used) + 1, n, p + 1))
+    s[0, :, problem.slices["initial"]] = basis
+    x = predictor.x0
+    for a in range(0, n_used, _BLOCK):
+        b = min(a + _BLOCK, n_used)
+        e, block = np.empty((b - a, n_y)), s[: b - a + 1]
+        innovations_block(predictor.M, predictor.C, work.y[a:b], work.w[a:b], x, e)
+        np.matmul(work.w[a:b], flat, out=block[1:].reshape(b - a, -1))
+        sensitivity_scan(F, block)
+        rows = -block[:-1, :n_y]
+        rows[:, :, p] = e @ weight.T
+        yield e, rows.reshape(-1, p + 1)
+        s[0] = block[-1]
+
+
+def null_space(a: Array) -> Array:
+    """Return orthonormal rows that complete the row space of a full-rank wide matrix.
+
+    Parameters
+    ----------
+    a : ndarray, shape (r, n), r <= n
+
+    Returns
+    -------
+    ndarray, shape (n - r, n)
+    """
+    q, _ = np.linalg.qr(a.T, mode="complete")
+    return np.ascontiguousarray(q[:, a.shape[0] :].T)

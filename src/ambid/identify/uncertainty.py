@@ -1,0 +1,202 @@
+"""Covariance of the estimated physical parameters, and what the data do not show.
+
+The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound; Ljung 1999,
+sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores of stretches of the
+record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.likelihood import Fit, weight_of
+from ambid.identify.sensitivity import Workspace, residual_blocks
+
+Array = NDArray[np.float64]
+
+WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
+_BATCHES = 30  # stretches of the record for the robust covariance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Uncertainty:
+    """What a fit knows of its physical parameters.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Estimated physical parameters.
+    information : ndarray, shape (n, n), SI
+        Covariance from the information matrix, priors included.
+    robust : ndarray, shape (n, n), SI
+        Covariance from the scores of stretches of the record.
+    data_only_sd : ndarray, shape (n,), SI
+        Standard deviations that the data alone would give; very large where they show nothing.
+    scale : ndarray, shape (n,), SI
+        Size against which a standard deviation is judged: the value, or the natural scale of a parameter that may be zero.
+    singular_values : ndarray, shape (n,)
+        Of the information matrix of the physical parameters scaled by their values, largest first, as
+        1 / relative standard deviation along each direction.
+    weakest : dict of str to float
+        Direction with the smallest singular value: share of each parameter, largest in magnitude 1.
+    delay_sd : float or None
+        Standard deviation of an estimated delay in samples.
+    """
+
+    names: tuple[str, ...]
+    information: Array
+    robust: Array
+    data_only_sd: Array
+    scale: Array
+    singular_values: Array
+    weakest: dict[str, float]
+    delay_sd: float | None
+
+    @property
+    def inflation(self) -> float:
+        """Largest ratio of robust to information standard deviation."""
+        return float(np.max(np.sqrt(np.diag(self.robust) / np.diag(self.information))))
+
+    def covariance(self, *, robust: bool) -> Array:
+        """Return the covariance that goes with `standard_deviations`.
+
+        Parameters
+        ----------
+        robust : bool
+            Whether a check said that the model is only near the truth.
+
+        Returns
+        -------
+        ndarray, shape (n, n), SI
+            Correlations of the kind that is larger overall, scaled to the standard deviations.
+        """
+        if not robust:
+            return self.information
+        sd = self.standard_deviations(robust=True)
+        own = np.sqrt(np.diag(self.robust))
+        return np.asarray(self.robust / np.outer(own, own) * np.outer(sd, sd))
+
+    def standard_deviations(self, *, robust: bool) -> Array:
+        """Return standard deviations: from the information matrix, or the larger of both kinds.
+
+        Parameters
+        ----------
+        robust : bool
+            Whether a check said that the model is only near the truth.
+
+        Returns
+        -------
+        ndarray, shape (n,), SI
+        """
+        plain = np.sqrt(np.diag(self.information))
+        return np.maximum(plain, np.sqrt(np.diag(self.robust))) if robust else plain
+
+    def relative_sd(self, *, robust: bool) -> Array:
+        """Return standard deviations over `scale`.
+
+        Parameters
+        ----------
+        robust : bool
+            As for `standard_deviations`.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        return np.asarray(self.standard_deviations(robust=robust) / self.scale)
+
+    def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
+        """Return which parameters have a relative standard deviation below 25 %.
+
+        Parameters
+        ----------
+        robust : bool
+            As for `standard_deviations`.
+
+        Returns
+        -------
+        tuple of bool, length n
+        """
+        return tuple(bool(r < WEAK) for r in self.relative_sd(robust=robust))
+
+
+def uncertainty(fit: Fit) -> Uncertainty:
+    """Compute covariances and the identifiability verdict of a fit.
+
+    Parameters
+    ----------
+    fit : Fit
+        Not failed.
+
+    Returns
+    -------
+    Uncertainty
+    """
+    problem, sl = fit.problem, fit.problem.slices
+    n, size = problem.n_physical, problem.magnitude
+    whole = inverse_information(np.vstack([fit.J, fit.J_prior]))
+    unit = np.outer(size, size)
+    information = whole[:n, :n] * unit
+    noise_only = fit.J_prior.copy()
+    noise_only[:, :n] = 0.0
+    data_only = np.sqrt(np.diag(inverse_information(np.vstack([fit.J, noise_only])))[:n]) * size
+    values = fit.vector[sl["physical"]] * size
+    theta = problem.parameters(fit.vector)
+    reference = problem.model.references(theta)
+    scale = np.array([max(abs(v), reference.get(k, 0.0)) for k, v in zip(problem.estimated, values, strict=True)])
+    scale = np.maximum(scale, 1e-300)
+    eigenvalues, directions = np.linalg.eigh(information / np.outer(scale, scale))
+    weak = directions[:, -1] / directions[np.argmax(np.abs(directions[:, -1])), -1]
+    delay_sd = float(np.sqrt(whole[sl["fraction"], sl["fraction"]][0, 0])) if problem.fractional else None
+    return Uncertainty(
+        names=problem.estimated,
+        information=information,
+        robust=(whole @ _score_spread(fit) @ whole)[:n, :n] * unit,
+        data_only_sd=data_only,
+        scale=scale,
+        singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
+        weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
+        delay_sd=delay_sd,
+    )
+
+
+def inverse_information(J: Array) -> Array:
+    """Invert J^T J through the singular values of the column-scaled Jacobian.
+
+    A direction without any information gets a huge variance, not an infinite one.
+
+    Parameters
+    ----------
+    J : ndarray, shape (n_rows, p), n_rows >= p
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+    """
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1e-150
+    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+    s = np.maximum(s, 1e-15 * s[0])
+    half = vt.T / s / norm[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _score_spread(fit: Fit) -> Array:
+    """Sum over stretches of the record of the outer product of their scores: the middle of the sandwich."""
+    problem, work = fit.problem, Workspace(fit.problem)
+    p, n_y, n_used = problem.size, work.y.shape[1], problem.n_used
+    length = max(1, n_used // _BATCHES)
+    scores = np.zeros((-(-n_used // length), p))
+    first = 0
+    for e, rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
+        stretch = np.arange(first, first + e.shape[0]) // length
+        for b in range(stretch[0], stretch[-1] + 1):
+            part = rows[np.repeat(stretch == b, n_y)]
+            scores[b] += part[:, :p].T @ part[:, p]
+        first += e.shape[0]
+    scores -= scores.mean(axis=0)
+    count = scores.shape[0]
+    return np.asarray(scores.T @ scores * (count / max(count - 1, 1)))

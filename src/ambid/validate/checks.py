@@ -1,0 +1,135 @@
+"""All checks of an estimate on its own record, in the order of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.estimate import Check
+from ambid.identify.hints import experiment_hint
+from ambid.identify.likelihood import Fit
+from ambid.identify.uncertainty import Uncertainty
+from ambid.record import Record
+from ambid.signals.saturation import find_saturation
+from ambid.validate.plausibility import implausible
+from ambid.validate.residuals import ResidualTest, residuals_uncorrelated, residuals_white
+
+Array = NDArray[np.float64]
+
+_INFLATION = 2.0  # robust over information standard deviation from which the model, not the noise, sets the error
+_SATURATED = 0.005  # part of the samples at a limit that a check lets pass
+
+
+def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
+    """Check what the innovations say of the model, and with that of its standard deviations.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : ndarray, shape (n_used, n_outputs)
+        Innovations, scaled.
+    known : Uncertainty
+
+    Returns
+    -------
+    dict of str to Check
+        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``. Where one fails, the robust standard
+        deviations are to be used.
+    """
+    return {
+        "residuals_white": _residual_check(residuals_white(fit, e), "innovations against their own past"),
+        "residuals_uncorrelated": _residual_check(residuals_uncorrelated(fit, e), "innovations against past inputs"),
+        "uncertainty_consistent": Check(
+            passed=known.inflation < _INFLATION,
+            values={"inflation": known.inflation},
+            detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from the "
+            f"information matrix (at most {_INFLATION:g})",
+        ),
+    }
+
+
+def _residual_check(test: ResidualTest, what: str) -> Check:
+    verdict = "nothing is left" if test.passed else "something is left that the model does not explain"
+    return Check(
+        passed=test.passed,
+        p=test.p,
+        values={
+            "statistic": test.statistic,
+            "degrees_of_freedom": float(test.degrees),
+            "largest_correlation": test.largest,
+            "largest_lag": float(test.largest_lag),
+        },
+        detail=f"{what}: {verdict} (largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})",
+    )
+
+
+def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
+    """Check whether the parameters are shown by the data, can exist, and come from signals within their limits.
+
+    Parameters
+    ----------
+    fit : Fit
+    known : Uncertainty
+    record : Record
+        Channels named by role.
+    robust : bool
+        Which standard deviations count.
+
+    Returns
+    -------
+    dict of str to Check
+        ``identifiable``, ``plausible``, ``within_limits``.
+    """
+    theta = fit.problem.parameters(fit.vector)
+    sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
+    wrong = implausible(fit.problem.model, theta, sd)
+    return {
+        "identifiable": _identifiable(fit, known, theta, robust=robust),
+        "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical and the coil is passive"),
+        "within_limits": _within_limits(record),
+    }
+
+
+def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, robust: bool) -> Check:
+    seen = known.identifiable_at(robust=robust)
+    unseen = [
+        f"{name} (sd {100 * r:.0f} %)"
+        for name, ok, r in zip(known.names, seen, known.relative_sd(robust=robust), strict=True)
+        if not ok
+    ]
+    values = {"condition": float(known.singular_values[0] / known.singular_values[-1])}
+    if not unseen:
+        return Check(passed=True, values=values, detail="the record shows every estimated parameter")
+    hint = experiment_hint(known, theta, lowest_power_hz(fit.problem.u, fit.problem.rate_hz), robust=robust)
+    return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
+
+
+def lowest_power_hz(u: Array, rate_hz: float) -> float:
+    """Return the frequency below which the inputs have 0.1 % of their power.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_samples, n_inputs)
+    rate_hz : float
+
+    Returns
+    -------
+    float
+        Hz.
+    """
+    power = np.sum(np.abs(np.fft.rfft(u - u.mean(axis=0), axis=0)) ** 2, axis=1)
+    total = np.cumsum(power)
+    return float(np.searchsorted(total, 1e-3 * total[-1]) * rate_hz / u.shape[0])
+
+
+def _within_limits(record: Record) -> Check:
+    found = {c.name: find_saturation(record, c.name) for c in record.channels}
+    bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
+    detail = "; ".join(f"{name}: {s}" for name, s in bad.items())
+    return Check(
+        passed=not bad,
+        values={f"{name}_fraction": s.fraction for name, s in found.items()},
+        detail=f"{detail}. Lower the excitation, or cut those parts out" if bad else "no channel dwells at its limits",
+    )

@@ -1,0 +1,34 @@
+"""Plausibility: does the estimate describe a thing that can exist?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ambid.physics.models import LinearModel
+
+
+def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+    """List what physics forbids in an estimate.
+
+    Mass, resistance and inductance have to be positive: a coil with R > 0 and L > 0 is passive, it never gives out more energy than
+    was put in; damping may not be negative beyond its uncertainty.
+
+    Parameters
+    ----------
+    model : LinearModel
+    values, sd : Mapping[str, float]
+        Parameters and their standard deviations, SI.
+
+    Returns
+    -------
+    list of str
+        One line each; empty where all is well.
+    """
+    found = []
+    for spec in model.parameters:
+        value, spread = values[spec.name], sd.get(spec.name, 0.0)
+        if spec.positive and value <= 0:
+            found.append(f"{spec.name} = {value:.4g} {spec.unit} is not positive ({spec.meaning})")
+        if spec.name == "c" and value < -3.3 * spread:
+            found.append(f"c = {value:.4g} {spec.unit} is negative: the rotor would gain energy by moving")
+    return found

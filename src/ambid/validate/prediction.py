@@ -1,0 +1,108 @@
+"""Prediction and simulation with an identified model: how far ahead is it worth anything?"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify._kernels import innovations_block
+from ambid.identify.likelihood import Fit
+from ambid.identify.predictor import Predictor, assemble
+from ambid.identify.sensitivity import Workspace
+
+Array = NDArray[np.float64]
+
+
+def fit_of(error: Array, y: Array) -> Array:
+    """Return 1 - |e| / |y - mean| of each column: 1 is perfect, 0 as good as the mean.
+
+    Parameters
+    ----------
+    error, y : ndarray, shape (n_samples, n_outputs)
+
+    Returns
+    -------
+    ndarray, shape (n_outputs,)
+    """
+    spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
+    return np.asarray(1 - np.linalg.norm(error, axis=0) / np.where(spread > 0, spread, np.nan))
+
+
+def simulation_error(fit: Fit) -> Array | None:
+    """Return y minus its simulation from the input, offsets and initial state alone, SI.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    ndarray, shape (n_used, n_outputs), or None
+        None where the plant is unstable in open loop: its simulation runs away and says nothing.
+    """
+    predictor = _predictor(fit)
+    A = predictor.A
+    if np.max(np.abs(np.linalg.eigvals(A))) >= 1.0:
+        return None
+    work, n = Workspace(fit.problem), A.shape[0]
+    M = predictor.M.copy()
+    M[:, :n] = A
+    M[:, -1 - work.y.shape[1] : -1] = 0.0  # the gain is off: measurements do not correct the state
+    e = np.empty_like(work.y)
+    innovations_block(M, predictor.C, work.y, work.w, predictor.x0.copy(), e)
+    return e * fit.problem.scales.output
+
+
+def prediction_error(fit: Fit, steps: int) -> Array:
+    """Return y minus its prediction `steps` samples ahead, SI, with the inputs known up to then.
+
+    Parameters
+    ----------
+    fit : Fit
+    steps : int
+        At least 1.
+
+    Returns
+    -------
+    ndarray, shape (n_used - steps + 1, n_outputs)
+        Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
+    """
+    predictor, work = _predictor(fit), Workspace(fit.problem)
+    e = np.empty_like(work.y)
+    innovations_block(predictor.M, predictor.C, work.y, work.w, predictor.x0.copy(), e)
+    # error now = sum over the innovations since: what the gain has fed in between was not known
+    n_used, A, K, C = e.shape[0], predictor.A, predictor.gain, predictor.C
+    out = e[steps - 1 :].copy()
+    power = K
+    for j in range(1, steps):
+        out += e[steps - 1 - j : n_used - j] @ (C @ power).T
+        power = A @ power
+    return out * fit.problem.scales.output
+
+
+def expected_prediction_sd(fit: Fit, steps: int) -> Array:
+    """Return the standard deviation that the model gives its own predictions `steps` samples ahead, SI.
+
+    Parameters
+    ----------
+    fit : Fit
+    steps : int
+
+    Returns
+    -------
+    ndarray, shape (n_outputs,)
+    """
+    predictor = _predictor(fit)
+    total, power = fit.covariance.copy(), predictor.gain
+    for _ in range(1, steps):
+        h = predictor.C @ power
+        total += h @ fit.covariance @ h.T
+        power = predictor.A @ power
+    return np.asarray(np.sqrt(np.diag(total)) * fit.problem.scales.output)
+
+
+def _predictor(fit: Fit) -> Predictor:
+    predictor = assemble(fit.problem, fit.vector, with_derivatives=False)
+    if predictor is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    return predictor

@@ -1,0 +1,147 @@
+"""Residual tests: is anything left in the innovations that the past explains?
+
+Both tests are score tests: lagged signals are added to the weighted Jacobian as further regressors of the innovations, and the fall
+of their sum of squares is chi-squared with as many degrees of freedom if the model is right. Because the regressors compete with the
+Jacobian, the estimated numbers are accounted for, and because only the past is used, feedback does not disturb them: future inputs
+do depend on present innovations when a controller is at work (Ljung 1999, sec. 16.6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.likelihood import Fit, weight_of
+from ambid.identify.sensitivity import Workspace, reduce_blocks, residual_blocks
+
+Array = NDArray[np.float64]
+
+P_LEAST = 1e-3  # 99.9 % bounds
+_WHITE_LAGS = (1, 2, 3, 4, 5, 6, 8, 10)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualTest:
+    """Outcome of a residual test.
+
+    Attributes
+    ----------
+    p : float
+        Probability of at least this much if the model is right.
+    statistic : float
+        Fall of the weighted sum of squares.
+    degrees : int
+        Degrees of freedom.
+    largest : float
+        Largest correlation coefficient among the tested pairs, in magnitude.
+    largest_lag : int
+        Its lag in samples.
+    """
+
+    p: float
+    statistic: float
+    degrees: int
+    largest: float
+    largest_lag: int
+
+    @property
+    def passed(self) -> bool:
+        """Whether p is at least 0.001."""
+        return self.p >= P_LEAST
+
+
+def residuals_white(fit: Fit, e: Array) -> ResidualTest:
+    """Test the innovations against their own past.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : ndarray, shape (n_used, n_outputs)
+        Innovations at the fit, scaled.
+
+    Returns
+    -------
+    ResidualTest
+    """
+    white = e @ weight_of(fit.covariance).T
+    lags = tuple(k for k in _WHITE_LAGS if k < len(e) // 10)
+    return _score_test(fit, white, white, lags)
+
+
+def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
+    """Test the innovations against past inputs.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : ndarray, shape (n_used, n_outputs)
+        Innovations at the fit, scaled.
+
+    Returns
+    -------
+    ResidualTest
+    """
+    problem = fit.problem
+    u = problem.u[problem.skip :] / problem.scales.input
+    longest = max(2, len(e) // 20)
+    lags = tuple(sorted({int(round(k)) for k in np.geomspace(1, min(longest, 400), 12)}))
+    white = e @ weight_of(fit.covariance).T
+    return _score_test(fit, white, u, lags)
+
+
+def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -> ResidualTest:
+    """Score test of lagged `signals` as further regressors of every whitened innovation."""
+    from scipy.special import chdtrc
+
+    problem, n_y = fit.problem, white.shape[1]
+    p, per_output = problem.size, len(lags) * signals.shape[1]
+    lagged = _lagged(signals, lags)
+    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
+    blocks, first, work = list[Array](), 0, Workspace(problem)
+    for e, rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
+        m = e.shape[0]
+        wide = np.zeros((m, n_y, p + n_y * per_output + 1))
+        wide[:, :, :p] = rows[:, :p].reshape(m, n_y, p)
+        wide[:, :, -1] = rows[:, p].reshape(m, n_y)
+        for o in range(n_y):
+            wide[:, o, p + o * per_output : p + (o + 1) * per_output] = lagged[first : first + m]
+        blocks.append(wide.reshape(m * n_y, -1))
+        first += m
+    R = reduce_blocks(blocks)
+    statistic, degrees = _explained(R, p, fit.J_prior)
+    correlation = (white.T @ lagged) / np.linalg.norm(white, axis=0)[:, None]
+    place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
+    return ResidualTest(
+        p=float(chdtrc(max(degrees, 1), statistic)),
+        statistic=statistic,
+        degrees=degrees,
+        largest=float(np.abs(correlation[place])),
+        largest_lag=lags[int(place[1]) // signals.shape[1]],
+    )
+
+
+def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
+    """Columns of all signals at all lags, lag by lag, zero before the record."""
+    out = np.zeros((signals.shape[0], len(lags) * signals.shape[1]))
+    for j, lag in enumerate(lags):
+        out[lag:, j * signals.shape[1] : (j + 1) * signals.shape[1]] = signals[:-lag]
+    return out
+
+
+def _explained(R: Array, p: int, J_prior: Array) -> tuple[float, int]:
+    """Sum of squares that the added columns explain beyond the Jacobian's, and their rank beyond it."""
+    prior = np.zeros((J_prior.shape[0], R.shape[1]))
+    prior[:, :p] = J_prior
+    a = np.vstack([R, prior])
+    norm = np.linalg.norm(a[:, :-1], axis=0)
+    norm[norm == 0] = 1.0
+    a[:, :-1] /= norm
+    base, s, _ = np.linalg.svd(a[:, :p], full_matrices=False)
+    base = base[:, s > 1e-10 * s[0]]
+    rest = a[:, p:] - base @ (base.T @ a[:, p:])
+    u, s, _ = np.linalg.svd(rest[:, :-1], full_matrices=False)
+    u = u[:, s > 1e-6]  # lags of a slow input are nearly the same column
+    inside = u.T @ rest[:, -1]
+    return float(inside @ inside), int(u.shape[1])
