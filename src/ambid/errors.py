@@ -1,6 +1,6 @@
 """The exceptions of `ambid`.
 
-Every error that input can cause is an :class:`AmbidError`; the command line prints it on one line and exits with code 2.
+Every error that input can cause is an :class:`AmbidError`; the command line prints it on one line and exits with 2.
 Anything else that escapes is a defect of the program.
 """
 
