@@ -18,8 +18,8 @@ from ambid.errors import EstimationError
 from ambid.identify import start as weak_form
 from ambid.identify.likelihood import Fit, evaluate, score_statistic, search
 from ambid.identify.predictor import assemble
-from ambid.identify.problem import PredictorProblem, Scales
-from ambid.physics.discretise import discretise
+from ambid.identify.problem import PredictorProblem
+from ambid.identify.scaling import noise_floor, scales_for
 from ambid.physics.models import LinearModel
 from ambid.physics.parameters import Parameter
 
@@ -153,7 +153,7 @@ def _scored(
     u, y = signals.u - signals.u.mean(axis=0), signals.y - signals.y.mean(axis=0)
     columns = {**dict(zip(model.inputs, u.T, strict=True)), **dict(zip(model.outputs, y.T, strict=True))}
     m = weak_form.moments(columns, model.inputs, signals.rate_hz)
-    noise = dict(zip(model.outputs, _noise_floor(y), strict=True))
+    noise = dict(zip(model.outputs, noise_floor(y), strict=True))
     busy = _busiest(u)
     coarse: list[tuple[float, PredictorProblem, dict[str, float]]] = []
     for d in delays:
@@ -217,33 +217,11 @@ def _problem(
         magnitude=magnitude,
         prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in estimated]),
         prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in estimated]),
-        scales=_scales(model, values, u, y, signals.rate_hz),
+        scales=scales_for(model, values, u, y, signals.rate_hz),
         delay=int(delay),
         lag=delay - int(delay),
         skip=skip,
         noise_center=np.r_[np.full(len(model.disturbances), _LEVELS[0]), np.zeros(len(model.outputs) - 1)],
-    )
-
-
-def _noise_floor(y: Array) -> Array:
-    """About the white noise of each output: third differences remove smooth motion and amplify noise by sqrt(1 + 9 + 9 + 1)."""
-    floor = np.sqrt(np.mean(np.diff(y, n=3, axis=0) ** 2, axis=0) / 20)
-    return np.maximum(floor, 1e-9 * np.std(y, axis=0))
-
-
-def _scales(model: LinearModel, values: Mapping[str, float], u: Array, y: Array, rate_hz: float) -> Scales:
-    """Units of order one: sensor noise for outputs, what moves the outputs by that within two samples for disturbances."""
-    output = _noise_floor(y)
-    space = model.matrices(values)
-    discrete, _ = discretise(space, 1.0 / rate_hz)
-    reach = np.maximum(np.abs(discrete.C @ discrete.E), np.abs(discrete.C @ discrete.A @ discrete.E))
-    state = np.array([output[model.outputs.index(s)] if s in model.outputs else 0.0 for s in model.states])
-    state[state == 0] = output[0] * rate_hz / 20  # velocity, the only state that is not measured
-    return Scales(
-        state=state,
-        input=np.std(u, axis=0),
-        output=output,
-        disturbance=1 / np.max(reach / output[:, None], axis=0),
     )
 
 

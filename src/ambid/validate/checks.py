@@ -39,8 +39,8 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
         deviations are to be used.
     """
     return {
-        "residuals_white": _residual_check(residuals_white(fit, e), "innovations against their own past"),
-        "residuals_uncorrelated": _residual_check(residuals_uncorrelated(fit, e), "innovations against past inputs"),
+        "residuals_white": residual_check(residuals_white(fit, e), "innovations against their own past"),
+        "residuals_uncorrelated": residual_check(residuals_uncorrelated(fit, e), "innovations against past inputs"),
         "uncertainty_consistent": Check(
             passed=known.inflation < _INFLATION,
             values={"inflation": known.inflation},
@@ -50,7 +50,19 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
     }
 
 
-def _residual_check(test: ResidualTest, what: str) -> Check:
+def residual_check(test: ResidualTest, what: str) -> Check:
+    """Put a residual test into words.
+
+    Parameters
+    ----------
+    test : ResidualTest
+    what : str
+        What was tested against what.
+
+    Returns
+    -------
+    Check
+    """
     verdict = "nothing is left" if test.passed else "something is left that the model does not explain"
     return Check(
         passed=test.passed,

@@ -1,0 +1,174 @@
+"""An estimate on other data: the model is kept as it is, only offsets and initial state are fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Check, Estimate
+from ambid.identify.greybox import Signals
+from ambid.identify.likelihood import Fit, search
+from ambid.identify.problem import PredictorProblem
+from ambid.identify.scaling import scales_for
+from ambid.identify.sensitivity import innovations
+from ambid.physics.models import model
+from ambid.validate.checks import residual_check
+from ambid.validate.prediction import fit_of, prediction_error, simulation_error
+from ambid.validate.residuals import residuals_uncorrelated, residuals_white
+
+Array = NDArray[np.float64]
+
+_RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
+_HORIZONS = (1, 10, 100)  # samples ahead
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replay:
+    """A record run through an estimate, SI units.
+
+    Attributes
+    ----------
+    fit : Fit
+        Offsets and initial state on this record; its problem holds data and model.
+    first : int
+        Sample of the record at which row 0 of the arrays stands.
+    measured, predicted : ndarray, shape (n_used, n_outputs)
+        Outputs, and their predictions from all samples before.
+    innovations : ndarray, shape (n_used, n_outputs)
+        Their difference.
+    simulated : ndarray, shape (n_used, n_outputs), or None
+        Outputs from the input alone; None where the plant is unstable in open loop.
+    """
+
+    fit: Fit
+    first: int
+    measured: Array
+    predicted: Array
+    innovations: Array
+    simulated: Array | None
+
+
+def replay(estimate: Estimate, signals: Signals) -> Replay:
+    """Run a record through the predictor of an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    signals : Signals
+        Of the same bench, at the same rate.
+
+    Returns
+    -------
+    Replay
+
+    Raises
+    ------
+    EstimationError
+        If the rates differ, the record is too short, or the estimate makes no predictor.
+    """
+    fit = _fit(estimate, signals)
+    problem = fit.problem
+    e = innovations(problem, fit.vector)
+    if e is None:
+        raise EstimationError("the estimate makes no predictor for this record. Check that both are of the same bench")
+    e = e * problem.scales.output
+    mean = signals.y.mean(axis=0)
+    measured, error = problem.y[problem.skip :] + mean, simulation_error(fit)
+    return Replay(
+        fit=fit,
+        first=problem.skip,
+        measured=measured,
+        predicted=measured - e,
+        innovations=e,
+        simulated=None if error is None else measured - error,
+    )
+
+
+def _fit(estimate: Estimate, signals: Signals) -> Fit:
+    plant = model(estimate.model)
+    rate = float(str(estimate.record["rate_hz"]))
+    if abs(signals.rate_hz / rate - 1) > 1e-6:
+        raise EstimationError(
+            f"the record is sampled at {signals.rate_hz:g} Hz, the estimate's predictor at {rate:g} Hz; they have to agree. "
+            "Resample the record, or identify from it"
+        )
+    delay = estimate.delay[plant.inputs[0]]
+    skip = delay.samples + 2
+    if signals.y.shape[0] < skip + 20 * len(plant.states):
+        raise EstimationError(f"the record has {signals.y.shape[0]} samples; too few to judge an estimate. Give a longer one")
+    u, y = signals.u - signals.u.mean(axis=0), signals.y - signals.y.mean(axis=0)
+    for role, column in zip((*plant.inputs, *plant.outputs), np.hstack([u, y]).T, strict=True):
+        if not np.any(column):
+            raise EstimationError(f"channel {role!r} is constant over the whole record; nothing can be judged on it. Check it")
+    scales = scales_for(plant, estimate.values, u, y, signals.rate_hz)
+    problem = PredictorProblem(
+        model=plant, rate_hz=signals.rate_hz, u=u, y=y, estimated=(), known=estimate.values, magnitude=np.zeros(0),
+        prior_mean=np.zeros(0), prior_sd=np.zeros(0), scales=scales, delay=delay.samples, lag=delay.fraction, skip=skip,
+        noise="given", gain=estimate.noise.gain * scales.output / scales.state[:, None],
+    )  # fmt: skip
+    fit = search(problem, np.zeros(problem.size))
+    if fit.status == "failed":
+        raise EstimationError("the estimate makes no predictor for this record. Check that both are of the same bench")
+    return fit
+
+
+def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
+    """Judge an estimate on a second record.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    signals : Signals
+
+    Returns
+    -------
+    dict
+        ``fit``: by output one_step, simulation, rms of the innovation in SI, and k_step fits; ``checks``: residuals_white,
+        residuals_uncorrelated and innovations_consistent (sizes as at identification), each with ``passed`` and ``detail``;
+        ``passed``.
+
+    Raises
+    ------
+    EstimationError
+        As `replay`.
+    """
+    run = replay(estimate, signals)
+    one_step = fit_of(run.innovations, run.measured)
+    simulation = None if run.simulated is None else fit_of(run.measured - run.simulated, run.measured)
+    rms = np.sqrt(np.mean(run.innovations**2, axis=0))
+    before = np.sqrt(np.diag(estimate.noise.innovation_covariance))
+    roles = model(estimate.model).outputs
+    horizons = [k for k in _HORIZONS if k < run.measured.shape[0] // 2]
+    ahead = {k: fit_of(prediction_error(run.fit, k), run.measured[k - 1 :]) for k in horizons}
+    checks = _checks(run, dict(zip(roles, (rms / before).tolist(), strict=True)))
+    return {
+        "fit": {
+            role: {
+                "one_step": float(one_step[j]),
+                "simulation": None if simulation is None else float(simulation[j]),
+                "innovation_rms": float(rms[j]),
+                "k_step": {str(k): float(f[j]) for k, f in ahead.items()},
+            }
+            for j, role in enumerate(roles)
+        },
+        "checks": {name: {"passed": c.passed, "p": c.p, "detail": c.detail, **c.values} for name, c in checks.items()},
+        "passed": all(c.passed for c in checks.values()),
+        "samples": signals.y.shape[0],
+    }
+
+
+def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
+    e = run.innovations / run.fit.problem.scales.output
+    worst = max(ratios, key=lambda role: abs(np.log(ratios[role])))
+    return {
+        "residuals_white": residual_check(residuals_white(run.fit, e), "innovations against their own past"),
+        "residuals_uncorrelated": residual_check(residuals_uncorrelated(run.fit, e), "innovations against past inputs"),
+        "innovations_consistent": Check(
+            passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
+            values={f"{role}_ratio": r for role, r in ratios.items()},
+            detail=f"innovations of {worst} are {ratios[worst]:.2f} times as large as at identification (within a factor {_RATIO:g})",
+        ),
+    }
