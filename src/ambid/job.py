@@ -118,6 +118,7 @@ def judged(
     """
     from ambid.identify.result import estimate_of
     from ambid.identify.sensitivity import innovations
+    from ambid.validate.agreement import agreement
     from ambid.validate.checks import physical_checks, residual_checks
     from ambid.validate.prediction import fit_of, simulation_error
 
@@ -125,7 +126,9 @@ def judged(
     e = innovations(problem, fit.vector)
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
-    checks = residual_checks(fit, e, known)
+    moved = agreement(fit)
+    known = replace(known, disagreement=moved.disagreement())
+    checks = residual_checks(fit, e, known, moved)
     robust = not all(c.passed for c in checks.values())
     checks |= physical_checks(fit, known, bench, robust=robust)
     y, error = problem.y[problem.skip :], simulation_error(fit)
@@ -157,8 +160,8 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
-            "the model explains the record only in part: standard deviations are the larger of the information matrix's and of "
-            "the scatter over the record, and cannot cover a bias that is the same everywhere"
+            "the model explains the record only in part: standard deviations are robust ones (scatter over the record and "
+            "disagreement of refits included), and still cannot cover a bias that is the same everywhere"
         )
     return tuple(found)
 

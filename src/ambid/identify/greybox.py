@@ -257,7 +257,7 @@ def carry(fit: Fit, problem: PredictorProblem) -> Array:
         vector[problem.slices["fraction"]] = old.delay_samples(fit.vector) - problem.delay
     if problem.noise == old.noise:
         vector[problem.slices["noise"]] = fit.vector[old.slices["noise"]]
-    else:
+    elif problem.noise == "gain":
         predictor = assemble(old, fit.vector, with_derivatives=False)
         assert predictor is not None
         vector[problem.slices["noise"]] = predictor.gain.ravel()

@@ -44,6 +44,9 @@ class Uncertainty:
         Direction with the smallest singular value: share of each parameter, largest in magnitude 1.
     delay_sd : float or None
         Standard deviation of an estimated delay in samples.
+    disagreement : ndarray, shape (n,), SI
+        How far the parameters move when the data are used differently, where that is more than chance allows; else 0. Part
+        of the robust standard deviations: a bias of this size cannot be ruled out.
     """
 
     names: tuple[str, ...]
@@ -54,6 +57,7 @@ class Uncertainty:
     singular_values: Array
     weakest: dict[str, float]
     delay_sd: float | None
+    disagreement: Array
 
     @property
     def inflation(self) -> float:
@@ -71,16 +75,16 @@ class Uncertainty:
         Returns
         -------
         ndarray, shape (n, n), SI
-            Correlations of the kind that is larger overall, scaled to the standard deviations.
+            If robust: correlations from the scores, the larger of both standard deviations, plus the disagreement.
         """
         if not robust:
             return self.information
-        sd = self.standard_deviations(robust=True)
-        own = np.sqrt(np.diag(self.robust))
-        return np.asarray(self.robust / np.outer(own, own) * np.outer(sd, sd))
+        plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
+        larger = np.maximum(1.0, plain / own)
+        return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
 
     def standard_deviations(self, *, robust: bool) -> Array:
-        """Return standard deviations: from the information matrix, or the larger of both kinds.
+        """Return standard deviations: from the information matrix, or robust ones, which are never smaller.
 
         Parameters
         ----------
@@ -91,8 +95,7 @@ class Uncertainty:
         -------
         ndarray, shape (n,), SI
         """
-        plain = np.sqrt(np.diag(self.information))
-        return np.maximum(plain, np.sqrt(np.diag(self.robust))) if robust else plain
+        return np.asarray(np.sqrt(np.diag(self.covariance(robust=robust))))
 
     def relative_sd(self, *, robust: bool) -> Array:
         """Return standard deviations over `scale`.
@@ -160,6 +163,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
         singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
         weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
         delay_sd=delay_sd,
+        disagreement=np.zeros(n),
     )
 
 

@@ -13,6 +13,7 @@ from ambid.identify.likelihood import Fit
 from ambid.identify.uncertainty import Uncertainty
 from ambid.record import Record
 from ambid.signals.saturation import find_saturation
+from ambid.validate.agreement import STRIDES, Agreement
 from ambid.validate.plausibility import implausible
 from ambid.validate.residuals import ResidualTest, residuals_uncorrelated, residuals_white
 
@@ -22,7 +23,7 @@ _INFLATION = 2.0  # robust over information standard deviation from which the mo
 _SATURATED = 0.005  # part of the samples at a limit that a check lets pass
 
 
-def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
+def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
     """Check what the innovations say of the model, and with that of its standard deviations.
 
     Parameters
@@ -31,12 +32,14 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
     e : ndarray, shape (n_used, n_outputs)
         Innovations, scaled.
     known : Uncertainty
+    moved : Agreement
+        Estimates from the record used in other ways.
 
     Returns
     -------
     dict of str to Check
-        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``. Where one fails, the robust standard
-        deviations are to be used.
+        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails, the
+        robust standard deviations are to be used.
     """
     return {
         "residuals_white": residual_check(residuals_white(fit, e), "innovations against their own past"),
@@ -47,7 +50,24 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty) -> dict[str, Check]:
             detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from the "
             f"information matrix (at most {_INFLATION:g})",
         ),
+        "estimates_agree": _agreement_check(moved),
     }
+
+
+def _agreement_check(moved: Agreement) -> Check:
+    n_refits = moved.shift.shape[0]
+    every = " and ".join(str(s) for s in STRIDES[:n_refits])
+    if not n_refits:
+        detail = "the record could not be fitted with fewer outputs; nothing is known of agreement"
+    elif moved.passed:
+        detail = f"refits with every {every}th output give the same parameters (largest shift {moved.largest:.1f} sd)"
+    else:
+        far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
+        detail = (
+            f"refits with every {every}th output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): the model "
+            "does not fit this record; excite more against the noise, work in a smaller range, or look for what is missing"
+        )
+    return Check(passed=moved.passed, values={"largest_shift_sd": moved.largest, "refits": float(n_refits)}, detail=detail)
 
 
 def residual_check(test: ResidualTest, what: str) -> Check:

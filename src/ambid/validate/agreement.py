@@ -1,0 +1,110 @@
+"""Do the parameters stay the same when the data are used differently?
+
+Under the right model the estimate does not depend on how far ahead the predictor has to look. Here the same record is
+fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor gain
+that follows from the fit, and the parameters are compared: the specification test of Hausman (1978). Where they move by more
+than chance allows, the model is wrong in a way that the residuals of one step may hide, and the difference says how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.greybox import carry
+from ambid.identify.likelihood import Fit, search
+from ambid.identify.predictor import assemble
+from ambid.identify.uncertainty import inverse_information
+
+Array = NDArray[np.float64]
+
+STRIDES = (2, 4)
+MOST = 4.0  # difference in standard deviations of the refit that chance allows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Agreement:
+    """Estimates from a record used in other ways.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Estimated physical parameters.
+    shift : ndarray, shape (n_refits, n), SI
+        Refitted value minus estimate.
+    sd : ndarray, shape (n_refits, n), SI
+        Standard deviation of the refitted value, from its information matrix.
+    """
+
+    names: tuple[str, ...]
+    shift: Array
+    sd: Array
+
+    @property
+    def largest(self) -> float:
+        """Largest shift in standard deviations; 0 where no refit converged."""
+        return float(np.max(np.abs(self.shift / self.sd), initial=0.0))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every shift is within 4 standard deviations."""
+        return self.largest < MOST
+
+    def disagreement(self) -> Array:
+        """Return how far each parameter moves beyond what chance allows for any; 0 where the test passed.
+
+        Returns
+        -------
+        ndarray, shape (n,), SI
+            Shift of the refit that moved most.
+        """
+        if self.passed:
+            return np.zeros(len(self.names))
+        return np.asarray(self.shift[np.argmax(np.max(np.abs(self.shift / self.sd), axis=1))])
+
+
+def agreement(fit: Fit) -> Agreement:
+    """Refit a record with every second and every fourth output.
+
+    Parameters
+    ----------
+    fit : Fit
+        Not failed.
+
+    Returns
+    -------
+    Agreement
+        Refits that do not converge are left out.
+    """
+    problem = fit.problem
+    size, n = problem.magnitude, problem.n_physical
+    shifts, spreads = [], []
+    for stride in STRIDES:
+        sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
+        start = carry(fit, sparse)
+        again = search(sparse, start, rounds=6, evaluations=10)
+        if again.status != "converged":
+            continue
+        spread = inverse_information(np.vstack([again.J, again.J_prior]))[:n, :n]
+        shifts.append((again.vector[:n] - fit.vector[:n]) * size)
+        spreads.append(np.sqrt(np.diag(spread)) * size)
+    return Agreement(
+        names=problem.estimated, shift=np.array(shifts).reshape(-1, n), sd=np.array(spreads).reshape(-1, n)
+    )
+
+
+def _sparse_gain(fit: Fit, stride: int) -> Array:
+    """Predictor gain for every stride-th output, from the innovations form of the fit: x+ = A x + K e, y = C x + e."""
+    from scipy.linalg import solve_discrete_are
+
+    predictor = assemble(fit.problem, fit.vector, with_derivatives=False)
+    if predictor is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    A, C, K, S = predictor.A, predictor.C, predictor.gain, fit.covariance
+    powers = [np.linalg.matrix_power(A, stride - 1 - j) for j in range(stride)]
+    Q = sum((p @ K @ S @ K.T @ p.T for p in powers), np.zeros_like(A))
+    cross, whole = powers[0] @ K @ S, A @ powers[0]
+    P = solve_discrete_are(whole.T, C.T, Q, S, s=cross)
+    return np.asarray(np.linalg.solve(C @ P @ C.T + S, (whole @ P @ C.T + cross).T).T)
