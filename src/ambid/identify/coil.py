@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify._kernels import innovations_block
+from ambid.identify.sensitivity import run
 
 Array = NDArray[np.float64]
 
@@ -118,10 +118,7 @@ def _regression(voltage: Array, current: Array) -> tuple[Array, Array]:
 
 def _first_order(alpha: float, drive: Array, first: float) -> Array:
     """x[k+1] = alpha x[k] + drive[k], from x[0] = first; returns x at the samples of `drive`."""
-    w, e = np.zeros((drive.size, 2)), np.zeros((drive.size, 1))
-    w[:, 1] = drive
-    innovations_block(np.array([[alpha, 1.0]]), np.array([[-1.0]]), np.zeros((drive.size, 1)), w, np.array([first]), e)
-    return e[:, 0]
+    return run(np.array([[alpha, 1.0]]), drive[:, None], np.array([first]))[:-1, 0]
 
 
 def _filtered(alpha: float, columns: Array) -> Array:

@@ -100,9 +100,9 @@ def solve_lyapunov(F: Array, Q: Array) -> Array:
         Symmetric solutions.
     """
     n = F.shape[0]
-    rhs = Q.reshape(-1, n * n).T
-    P = np.linalg.solve(np.eye(n * n) - np.kron(F, F), rhs).T.reshape(Q.shape)
-    return 0.5 * (P + np.swapaxes(P, -1, -2))
+    kronecker = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
+    P = np.linalg.solve(np.eye(n * n) - kronecker, Q.reshape(-1, n * n).T).T.reshape(Q.shape)
+    return np.asarray(0.5 * (P + np.swapaxes(P, -1, -2)), dtype=np.float64)
 
 
 def gain_derivatives(A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array) -> Array:

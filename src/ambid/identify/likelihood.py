@@ -20,9 +20,10 @@ Array = NDArray[np.float64]
 Status = Literal["converged", "stalled", "failed"]
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
-_ROUNDS = 10  # of reweighting by the innovation covariance
-_EVALUATIONS = 30  # of the residual in one round
-_DECREMENT = 1e-3  # squared Newton step, in standard deviations, below which a search has converged
+_ROUNDS = 20  # of reweighting by the innovation covariance
+_EVALUATIONS = 10  # of the residual in one round
+_SETTLED = 0.03  # Newton step of every physical parameter, in standard deviations, below which a search has converged
+_FLAT = 0.1  # fall of the criterion in one round below which a search has converged: a twentieth of what a needless number earns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,6 +171,17 @@ def _decrement(J: Array, r: Array) -> float:
     return float(inside @ inside)
 
 
+def _step_left(J: Array, r: Array, n_physical: int) -> float:
+    """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+    s = np.maximum(s, 1e-12 * s[0])
+    step, half = vt.T @ ((u.T @ r) / s), vt.T / s
+    ratio = np.abs(step) / np.linalg.norm(half, axis=1)
+    return float(np.max(ratio[: n_physical or None]))
+
+
 def search(
     problem: PredictorProblem,
     start: Array,
@@ -205,8 +217,8 @@ def search(
     count = 1
     for _ in range(rounds):
         target.weight = weight_of(covariance)
-        # cost is about n_used * n_outputs / 2; a fall of 1e-3 is 3 % of a standard deviation
-        small = 1e-3 / (problem.n_used * problem.y.shape[1])
+        # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
+        small = 4e-3 / (problem.n_used * problem.y.shape[1])
         found = least_squares(
             target.residual, vector, jac=target.jacobian, method="trf", x_scale="jac",
             ftol=small, xtol=1e-12, gtol=1e-14, max_nfev=evaluations,
@@ -216,8 +228,8 @@ def search(
         J = target.jacobian(vector)
         r, covariance = target.r, target.covariance
         value = criterion(problem, vector, covariance)
-        # the covariance moved since r was weighted: that changes the decrement only to second order
-        if before - value < 0.01 and _decrement(J, r) < _DECREMENT:
+        # the covariance moved since r was weighted: that changes the step only to second order
+        if before - value < _FLAT and _step_left(J, r, problem.n_physical) < _SETTLED:
             status = "converged"
             break
     at = linearise(problem, vector, weight_of(covariance), work)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.innovations import Innovations, gain_derivatives, predictor_gain, stable, stack
-from ambid.identify.problem import PredictorProblem, Scales
+from ambid.identify.problem import PredictorProblem
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.models import StateSpace
 
@@ -106,27 +106,23 @@ def _discrete(
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
     """Scaled discrete plant, and its derivatives by the physical parameters and the delay."""
     model, sc = problem.model, problem.scales
-    directions = [
-        _scaled(model.derivative(theta, name), sc, size)
-        for name, size in zip(problem.estimated if with_derivatives else (), problem.magnitude, strict=False)
-    ]
-    plant, slopes = discretise(
-        _scaled(model.matrices(theta), sc),
-        1.0 / problem.rate_hz,
-        fraction=lag - np.floor(lag) if len(problem.taps) > 1 else None,
-        derivatives=directions,
+    names = problem.estimated if with_derivatives else ()
+    spaces = [model.matrices(theta), *(model.derivative(theta, name) for name in names)]
+    # a derivative by a parameter becomes one by its scaled value
+    factor = np.concatenate([[1.0], problem.magnitude[: len(names)]])[:, None, None]
+    A, B, E = (
+        factor * np.array(stacked) * size / sc.state[:, None]
+        for stacked, size in (
+            ([x.A for x in spaces], sc.state),
+            ([x.B for x in spaces], sc.input),
+            ([x.E for x in spaces], sc.disturbance),
+        )
     )
+    C = spaces[0].C * sc.state / sc.output[:, None]
+    scaled = [StateSpace(A=a, B=b, E=e, C=C) for a, b, e in zip(A, B, E, strict=True)]
+    fraction = lag - np.floor(lag) if len(problem.taps) > 1 else None
+    plant, slopes = discretise(scaled[0], 1.0 / problem.rate_hz, fraction=fraction, derivatives=scaled[1:])
     return plant, slopes[: problem.slices["fraction"].stop] if with_derivatives else ()
-
-
-def _scaled(space: StateSpace, sc: Scales, factor: float = 1.0) -> StateSpace:
-    """Scale states, inputs, outputs, disturbances; `factor` turns a derivative by a parameter into one by its scaled value."""
-    return StateSpace(
-        A=factor * space.A * sc.state / sc.state[:, None],
-        B=factor * space.B * sc.input / sc.state[:, None],
-        E=factor * space.E * sc.disturbance / sc.state[:, None],
-        C=factor * space.C * sc.state / sc.output[:, None],
-    )
 
 
 def _gain(

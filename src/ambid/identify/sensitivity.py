@@ -28,8 +28,8 @@ class Workspace:
     ----------
     y : ndarray, shape (n_used, n_outputs)
         Scaled outputs.
-    w : ndarray, shape (n_used, n_states + n_lags n_inputs + n_outputs + 1)
-        Columns: predictor state (filled by each run), inputs at the problem's lags, y, 1.
+    z : ndarray, shape (n_used, n_lags n_inputs + n_outputs + 1)
+        What drives the predictor: inputs at the problem's lags, y, 1.
     gain : ndarray or None
     """
 
@@ -40,8 +40,7 @@ class Workspace:
         # inputs after the last sample do not exist; they would act only after the last output
         u = problem.u / problem.scales.input
         lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
-        state, one = np.zeros((at.size, len(problem.model.states))), np.ones((at.size, 1))
-        self.w = np.hstack([state, *lagged, self.y, one])
+        self.z = np.hstack([*lagged, self.y, np.ones((at.size, 1))])
         self.gain: Array | None = None
 
 
@@ -59,16 +58,37 @@ def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None
     -------
     ndarray, shape (n_used, n_outputs), or None where there is no predictor at `vector`
     """
-    from ambid.identify._kernels import innovations_block
-
     work = work or Workspace(problem)
     predictor = assemble(problem, vector, near=work.gain, with_derivatives=False)
     if predictor is None:
         return None
     work.gain = predictor.gain
-    e = np.empty_like(work.y)
-    innovations_block(predictor.M, predictor.C, work.y, work.w, predictor.x0, e)
+    e = work.y - run(predictor.M, work.z, predictor.x0)[:-1] @ predictor.C.T
     return e if np.all(np.isfinite(e[-1])) else None
+
+
+def run(M: Array, z: Array, x0: Array) -> Array:
+    """Run the recursion x+ = M [x; z].
+
+    Parameters
+    ----------
+    M : ndarray, shape (n, n + n_z)
+    z : ndarray, shape (n_samples, n_z)
+    x0 : ndarray, shape (n,)
+
+    Returns
+    -------
+    ndarray, shape (n_samples + 1, n)
+        States before each sample, and after the last.
+    """
+    from ambid.identify._kernels import state_scan
+
+    n = x0.size
+    x = np.empty((z.shape[0] + 1, n))
+    x[0] = x0
+    np.matmul(z, M[:, n:].T, out=x[1:])
+    state_scan(np.ascontiguousarray(M[:, :n]), x)
+    return x
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,7 +158,7 @@ def reduce_rows(rows: Array, *, last: bool = False) -> Array:
         return np.asarray(np.linalg.qr(rows, mode="r"))
     whole = rows.shape[0] // _QR_ROWS * _QR_ROWS
     if not whole:
-        return rows
+        return rows.copy()
     factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, _QR_ROWS, rows.shape[1]), mode="r"))
     return np.vstack([factors.reshape(-1, rows.shape[1]), rows[whole:]])
 
@@ -174,34 +194,37 @@ def residual_blocks(
     e : ndarray, shape (block, n_outputs)
         Innovations, scaled, unweighted.
     rows : ndarray, shape (block * n_outputs, size + 1)
-        Time runs slowest. Nothing is yielded where there is no predictor at `vector`.
+        Time runs slowest; overwritten by the next block. Nothing is yielded where there is no predictor at `vector`.
     """
-    from ambid.identify._kernels import innovations_block, sensitivity_scan
+    from ambid.identify._kernels import sensitivity_scan
 
     predictor = assemble(problem, vector, near=work.gain)
     if predictor is None:
         return
     work.gain = predictor.gain
     n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
-    # a state basis in which the weighted outputs are the first states: sensitivities are then read off, not multiplied
+    # a state basis in which the weighted outputs are the first states: sensitivities are then read off, not multiplied;
+    # they are carried with the sign of e = y - C x
     whitened = weight @ predictor.C
-    basis = np.vstack([whitened, null_space(whitened)])
+    basis = -np.vstack([whitened, null_space(whitened)])
     F = basis @ predictor.M[:, :n] @ np.linalg.inv(basis)
     forcing = np.zeros((predictor.M.shape[1], n, p + 1))
-    forcing[:, :, :p] = np.einsum("ab,blq->laq", basis, predictor.dM)
-    flat = forcing.reshape(forcing.shape[0], -1)
+    forcing[:, :, :p] = np.tensordot(basis, predictor.dM, axes=1).swapaxes(0, 1)
+    flat = forcing.reshape(-1, n * (p + 1))
     s = np.zeros((min(_BLOCK, n_used) + 1, n, p + 1))
     s[0, :, problem.slices["initial"]] = basis
-    x = predictor.x0
+    x0, w = predictor.x0, np.empty((s.shape[0] - 1, n + work.z.shape[1]))
+    rows = np.empty((s.shape[0] - 1, n_y, p + 1))
     for a in range(0, n_used, _BLOCK):
         b = min(a + _BLOCK, n_used)
-        e, block = np.empty((b - a, n_y)), s[: b - a + 1]
-        innovations_block(predictor.M, predictor.C, work.y[a:b], work.w[a:b], x, e)
-        np.matmul(work.w[a:b], flat, out=block[1:].reshape(b - a, -1))
+        x, block, part = run(predictor.M, work.z[a:b], x0), s[: b - a + 1], w[: b - a]
+        e = work.y[a:b] - x[:-1] @ predictor.C.T
+        part[:, :n], part[:, n:], x0 = x[:-1], work.z[a:b], x[-1]
+        np.matmul(part, flat, out=block[1:].reshape(b - a, -1))
         sensitivity_scan(F, block)
-        rows = -block[:-1, :n_y]
-        rows[:, :, p] = e @ weight.T
-        yield e, rows.reshape(-1, p + 1)
+        rows[: b - a] = block[:-1, :n_y]
+        rows[: b - a, :, p] = e @ weight.T
+        yield e, rows[: b - a].reshape(-1, p + 1)
         s[0] = block[-1]
 
 

@@ -134,8 +134,8 @@ def candidates(
                 ("current", 1 + 0 * jw, force),
             ]
             stiffness, current = regress(terms, 1.0 / np.abs(jw + corner) ** 2, level)
-            if "m" not in known:
-                found["m"] = found["k_i"] / current if "k_i" in found and current != 0 else 1.0
+            if "m" not in known:  # its sign may come out wrong where the motional voltage is lost in the noise
+                found["m"] = abs(found["k_i"] / current) if "k_i" in found and current != 0 else 1.0
             found = {**found, "k_x": stiffness * found["m"], "k_i": current * found["m"], "c": damping, **known}
         yield {name: float(value) for name, value in found.items()}
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify._kernels import innovations_block
 from ambid.identify.likelihood import Fit
 from ambid.identify.predictor import Predictor, assemble
-from ambid.identify.sensitivity import Workspace
+from ambid.identify.sensitivity import Workspace, innovations, run
 
 Array = NDArray[np.float64]
 
@@ -48,9 +47,8 @@ def simulation_error(fit: Fit) -> Array | None:
     M = predictor.M.copy()
     M[:, :n] = A
     M[:, -1 - work.y.shape[1] : -1] = 0.0  # the gain is off: measurements do not correct the state
-    e = np.empty_like(work.y)
-    innovations_block(M, predictor.C, work.y, work.w, predictor.x0.copy(), e)
-    return e * fit.problem.scales.output
+    e = work.y - run(M, work.z, predictor.x0)[:-1] @ predictor.C.T
+    return np.asarray(e * fit.problem.scales.output)
 
 
 def prediction_error(fit: Fit, steps: int) -> Array:
@@ -67,9 +65,9 @@ def prediction_error(fit: Fit, steps: int) -> Array:
     ndarray, shape (n_used - steps + 1, n_outputs)
         Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
     """
-    predictor, work = _predictor(fit), Workspace(fit.problem)
-    e = np.empty_like(work.y)
-    innovations_block(predictor.M, predictor.C, work.y, work.w, predictor.x0.copy(), e)
+    predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
+    if e is None:
+        raise ValueError("the fit has no predictor; it has failed")
     # error now = sum over the innovations since: what the gain has fed in between was not known
     n_used, A, K, C = e.shape[0], predictor.A, predictor.gain, predictor.C
     out = e[steps - 1 :].copy()
@@ -77,7 +75,7 @@ def prediction_error(fit: Fit, steps: int) -> Array:
     for j in range(1, steps):
         out += e[steps - 1 - j : n_used - j] @ (C @ power).T
         power = A @ power
-    return out * fit.problem.scales.output
+    return np.asarray(out * fit.problem.scales.output)
 
 
 def expected_prediction_sd(fit: Fit, steps: int) -> Array:

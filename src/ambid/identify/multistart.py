@@ -1,0 +1,224 @@
+"""Many start values, one search: the weak-form candidates of all bands and delays are scored by the likelihood.
+
+Each candidate is scored on the busiest stretch of the record, the best on all of it and at several noise levels; candidates that
+differ in more than chance are searched a little way, and the search goes on from the winner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify import start as weak_form
+from ambid.identify.likelihood import Fit, evaluate, search
+from ambid.identify.problem import PredictorProblem
+from ambid.identify.scaling import noise_floor, scales_for
+from ambid.identify.sensitivity import Workspace
+from ambid.physics.models import LinearModel
+from ambid.physics.parameters import Parameter
+
+Array = NDArray[np.float64]
+Delay = float | Literal["auto"]
+
+MAX_DELAY = 6  # samples, searched when the delay is "auto"
+_LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
+_STRETCH = 8192  # samples on which candidates are first compared
+_KEPT = 6  # candidates scored on the whole record
+_RACE = 3  # candidates searched a little way
+_CLOSE = 0.5  # difference of the criterion per sample within which candidates race
+_ALIKE = 0.3  # relative difference of all parameters within which candidates are taken for the same
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Signals:
+    """What the estimator sees of a record.
+
+    Attributes
+    ----------
+    u : ndarray, shape (n_samples, n_inputs), SI
+        Inputs in the order of the model's, held over a sample.
+    y : ndarray, shape (n_samples, n_outputs), SI
+    rate_hz : float
+    """
+
+    u: Array
+    y: Array
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Candidate:
+    """Start values of one band and delay, with the criterion at them."""
+
+    criterion: float
+    problem: PredictorProblem
+    vector: Array
+
+    def like(self, other: _Candidate) -> bool:
+        """Whether a search from here would end where one from `other` does."""
+        a, b = self.problem.parameters(self.vector), other.problem.parameters(other.vector)
+        same = all(abs(a[k] - b[k]) <= _ALIKE * max(abs(a[k]), abs(b[k])) for k in self.problem.estimated)
+        return same and self.problem.delay == other.problem.delay
+
+
+def best_start(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    delay: Delay,
+    *,
+    tick: Callable[[], None] | None = None,
+) -> Fit:
+    """Score all start values, race the best that differ, and search on from the winner.
+
+    Parameters
+    ----------
+    model : LinearModel
+    signals : Signals
+    parameters : Sequence of Parameter
+    delay : float or "auto"
+    tick : callable, optional
+        Called after each evaluation of a search.
+
+    Returns
+    -------
+    Fit
+        At the best whole-sample delay, noise described by levels.
+
+    Raises
+    ------
+    EstimationError
+        If no start values make a predictor.
+    """
+    scored = sorted(_scored(model, signals, parameters, delay), key=lambda c: c.criterion)
+    if not scored:
+        raise EstimationError(
+            "no start values make a physical plant (positive m and L) with this record: it holds too little excitation, or "
+            "voltage, current and position are not what the rig says. Check columns and signs, or give start values"
+        )
+    racers: list[_Candidate] = []
+    for candidate in scored:
+        close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
+        if close and not any(candidate.like(r) for r in racers):
+            racers.append(candidate)
+    short = [search(c.problem, c.vector, rounds=1, evaluations=8, tick=tick) for c in racers[:_RACE]]
+    found: Fit | None = None
+    for fit in sorted(short, key=lambda f: f.criterion):
+        # noise levels move slowly on a logarithmic scale: look again where they stand best before going on
+        vectors = [fit.vector, *(_with_level(fit.problem, fit.vector, level) for level in _LEVELS)]
+        vector = min(vectors, key=lambda v: evaluate(fit.problem, v)[0])
+        longer = search(fit.problem, vector, tick=tick)
+        found = longer if found is None or longer.criterion < found.criterion else found
+        if longer.status == "converged":
+            break
+    assert found is not None
+    return found
+
+
+def _scored(
+    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay
+) -> list[_Candidate]:
+    """Return the best candidates of all bands and delays, each at several noise levels."""
+    delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
+    centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
+    stretch = _busiest(centred.u)
+    coarse: list[tuple[float, PredictorProblem, Mapping[str, float]]] = []
+    work: Workspace | None = None
+    for d, values in _values(model, centred, parameters, delays):
+        problem = _problem(model, centred, parameters, values, d, int(max(delays)) + 2)
+        part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
+        # the scaled data are the same for all candidates of a delay
+        if work is None or coarse[-1][1].delay != problem.delay:
+            work = Workspace(part)
+        coarse.append((evaluate(part, _vector(part, values), work)[0], problem, values))
+    coarse.sort(key=lambda c: c[0])
+    found = []
+    for _, problem, values in coarse[:_KEPT]:
+        work = Workspace(problem)
+        for level in _LEVELS:
+            vector = _with_level(problem, _vector(problem, values), level)
+            value, _ = evaluate(problem, vector, work)
+            if np.isfinite(value):
+                found.append(_Candidate(criterion=value, problem=problem, vector=vector))
+    return found
+
+
+def _values(
+    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float]
+) -> Iterator[tuple[float, dict[str, float]]]:
+    """Yield delay and start values: from the data, and with the values that were given."""
+    given = {p.name: p.value for p in parameters if p.value is not None}
+    anchored = {p.name: p.value for p in parameters if p.value is not None and p.role != "free"}
+    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([signals.u, signals.y]).T, strict=True))
+    moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
+    noise = dict(zip(model.outputs, noise_floor(signals.y).tolist(), strict=True))
+    for d in delays:
+        from_data = list(weak_form.candidates(model.name, moments, noise, d, signals.rate_hz, anchored))
+        if given != anchored:
+            from_data += [{**values, **given} for values in (from_data or [given])[:1]]
+        for values in from_data:
+            possible = all(np.isfinite(v) for v in values.values()) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0
+            if possible and len(values) == len(model.parameters):
+                yield d, values
+
+
+def _busiest(u: Array) -> slice:
+    """The stretch of at most `_STRETCH` samples in which the inputs move most."""
+    n = u.shape[0]
+    if n <= _STRETCH:
+        return slice(0, n)
+    power = np.cumsum(np.concatenate([[0.0], np.sum((u / np.std(u, axis=0)) ** 2, axis=1)]))
+    first = int(np.argmax(power[_STRETCH:] - power[:-_STRETCH]))
+    return slice(first, first + _STRETCH)
+
+
+def _problem(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    values: Mapping[str, float],
+    delay: float,
+    skip: int,
+) -> PredictorProblem:
+    """Scale a problem around start values."""
+    estimated = [p for p in parameters if p.role != "fixed"]
+    reference = model.references(values)
+    return PredictorProblem(
+        model=model,
+        rate_hz=signals.rate_hz,
+        u=signals.u,
+        y=signals.y,
+        estimated=tuple(p.name for p in estimated),
+        known={p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None},
+        magnitude=np.array([max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0), 1e-300) for p in estimated]),
+        prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in estimated]),
+        prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in estimated]),
+        scales=scales_for(model, values, signals.u, signals.y, signals.rate_hz),
+        delay=int(delay),
+        lag=delay - int(delay),
+        skip=skip,
+        noise_center=np.concatenate([np.full(len(model.disturbances), _LEVELS[0]), np.zeros(len(model.outputs) - 1)]),
+    )
+
+
+def _vector(problem: PredictorProblem, values: Mapping[str, float]) -> Array:
+    """Write start values as a vector: outputs at the first sample for the state, nothing known of offsets."""
+    vector, model = np.zeros(problem.size), problem.model
+    vector[problem.slices["physical"]] = np.array([values[k] for k in problem.estimated]) / problem.magnitude
+    first, initial = problem.y[problem.skip], problem.slices["initial"].start
+    for j, state in enumerate(model.states):
+        if state in model.outputs:
+            vector[initial + j] = first[model.outputs.index(state)] / problem.scales.state[j]
+    return _with_level(problem, vector, _LEVELS[0])
+
+
+def _with_level(problem: PredictorProblem, vector: Array, level: float) -> Array:
+    """Return a copy with all log disturbance levels at `level`."""
+    out, first = vector.copy(), problem.slices["noise"].start
+    out[first : first + len(problem.model.disturbances)] = level
+    return out
