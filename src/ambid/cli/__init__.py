@@ -1,0 +1,79 @@
+"""The command ``ambid``: one file per verb, each of which parses, calls and prints."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command and leave the program.
+
+    Exit codes: 0 done; 2 input refused; 3 done, but a check failed under ``--strict``; 1 a defect of the program;
+    130 interrupted; 141 nobody read the output to its end.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Words after ``ambid``; by default those of the command line.
+    """
+    # Matrices here are small: threads of the linear algebra libraries only cost time. They look at this when they are
+    # first imported, which is later.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command and turn whatever happens into an exit code and at most one line of error.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        Words after ``ambid``. ``--traceback`` anywhere among them shows where an error arose.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    words, trace = [w for w in arguments if w != "--traceback"], "--traceback" in arguments
+    try:
+        from ambid.cli.app import run_verb
+
+        code = run_verb(words)
+        sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        # A second Ctrl-C while the first one is answered would end in a traceback after all.
+        return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
+    except BrokenPipeError:
+        # The interpreter flushes standard output once more when it ends: give it somewhere to go.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except Exception as error:
+        from ambid.cli.app import refusal
+        from ambid.errors import AmbidError
+
+        said = str(error) if isinstance(error, AmbidError) else refusal(error)
+        if said is not None:
+            return _refused(said, 2, trace=trace)
+        where = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        advice = "" if trace else ". Run with --traceback, and report it"
+        return _refused(f"a defect of ambid: {where}{advice}", 1, trace=trace)
+
+
+def _refused(line: str, code: int, *, trace: bool) -> int:
+    """Print one line on standard error, after the traceback if it is wanted."""
+    if trace:
+        import traceback
+
+        traceback.print_exc()
+    if sys.stderr is not None:
+        print(f"ambid: {line}", file=sys.stderr, flush=True)
+    return code

@@ -1,0 +1,90 @@
+"""All verbs under one command. The files of the verbs import nothing heavy before they run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from ambid.cli import demo, identify, info, init, models, simulate, validate
+from ambid.cli.terminal import plain_where_needed
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
+    no_args_is_help=False,
+    help="Physical parameters of active magnetic bearings, with honest uncertainty, from measured voltage, current and"
+    " position.",
+    epilog="Start with 'ambid demo', then 'ambid info RECORD' and 'ambid init RECORD -o RIG' for a record of your own.",
+)
+app.command("demo", short_help="the main job on the embedded record, beside the truth")(demo.command)
+app.command("identify", short_help="physical parameters with uncertainty from a record")(identify.command)
+app.command("init", short_help="a first rig file, guessed from a record")(init.command)
+app.command("simulate", short_help="a record from the physics")(simulate.command)
+app.command("validate", short_help="the checks of an estimate on another record")(validate.command)
+app.command("info", short_help="what a record holds")(info.command)
+app.command("models", short_help="models, parameters, units, excitations, presets")(models.command)
+
+
+@app.callback(invoke_without_command=True)
+def _global(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+    traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error arose (after any verb).")] = False,
+) -> None:
+    del traceback  # taken out of the words before they come here
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"ambid {installed('ambid')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def run_verb(words: Sequence[str]) -> int:
+    """Parse the words, run the verb and return its exit code.
+
+    Errors come out as they are raised: `ambid.cli.run` is the one place that puts them into words.
+
+    Parameters
+    ----------
+    words : sequence of str
+        After ``ambid``.
+
+    Returns
+    -------
+    int
+        0, or 3 for a failed check under ``--strict``.
+    """
+    plain_where_needed(sys.stdout)
+    plain_where_needed(sys.stderr)
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("ambid", list(words)) as context:
+            command.invoke(context)
+    except typer.Exit as end:
+        return int(end.exit_code)
+    return 0
+
+
+def refusal(error: Exception) -> str | None:
+    """Put an error of usage into one line.
+
+    Parameters
+    ----------
+    error : Exception
+        Anything that a verb raised.
+
+    Returns
+    -------
+    str or None
+        What is wrong with the words, and where help is; None for an error of another kind.
+    """
+    if not isinstance(error, typer.TyperException) or not hasattr(error, "format_message"):
+        return None
+    context = getattr(error, "ctx", None)
+    path = "ambid" if context is None else context.command_path
+    said = " ".join(str(error.format_message()).split()).rstrip(".")
+    return f"{said}{'' if said.endswith('?') else '.'} See '{path} --help'"

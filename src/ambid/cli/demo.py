@@ -1,0 +1,112 @@
+"""``ambid demo``: the main job on the embedded record, beside the truth."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter, progress
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from ambid.identify.estimate import EstimatedParameter
+    from ambid.report.text import Paint
+
+# Truth of the thesis's simulation rig (table 4.1, corrected) and what its own identification found there (eq. 4.11).
+_THESIS = {
+    "m": (0.1, 0.0976), "k_x": (587.22, 608.1), "k_i": (-310.08, -320.0), "R": (1.25, 1.138), "L": (59.6e-3, 60.2e-3)
+}  # fmt: skip
+_INSIDE = 3.29  # standard deviations of a 99.9 % interval
+_FILES = ("demo.csv.gz", "demo.toml")
+
+
+def command(
+    copy: Annotated[
+        Path | None,
+        typer.Option("--copy", metavar="FOLDER", help="Also put the record and its rig there.", show_default=False),
+    ] = None,
+) -> None:
+    """Identify the embedded record and print the estimate beside the truth.
+
+    The record: 0.4 s of an unstable bearing, levitated by a PID, simulated with noise. Nothing is known beforehand.
+    """
+    from ambid.cli.demo_record import PRESET, demo_file
+    from ambid.job import identify
+    from ambid.physics.presets import preset
+    from ambid.report.text import check_lines, columns, delay_lines, fit_rows, header_line
+
+    with as_file(demo_file(_FILES[0])) as record, as_file(demo_file(_FILES[1])) as rig, Outputs() as outputs:
+        if copy is not None:
+            _copy((record, rig), copy, outputs)
+        with progress("identify") as tick:
+            estimate = identify(record, rig, tick=tick)
+    paint = painter()
+    truth = preset(PRESET).parameters
+    typer.echo(f"{header_line(estimate, paint)}\nsimulated in closed loop; nothing was known beforehand\n")
+    typer.echo("\n".join(truth_lines(estimate.parameters, truth, paint)))
+    typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(fit_rows(estimate))]))
+    typer.echo("\n" + "\n".join(check_lines(estimate.checks, paint=paint)))
+    whole = sum(estimate.timing_s.values())
+    typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate; the thesis needed about 5 s")
+    if copy is not None:
+        typer.echo(f"\n{copy / _FILES[0]} and {copy / _FILES[1]} written. Try:")
+        typer.echo(f"  ambid identify {copy / _FILES[0]} --rig {copy / _FILES[1]} --plot {copy / 'demo.png'}")
+
+
+def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float], paint: Paint) -> list[str]:
+    """Write estimated parameters beside their truth.
+
+    Parameters
+    ----------
+    found : tuple of EstimatedParameter
+        Fixed ones are left out.
+    truth : Mapping[str, float]
+        SI.
+    paint : callable
+        Adds colour.
+
+    Returns
+    -------
+    list of str
+        A table, and a line on how many truths lie inside their 99.9 % intervals.
+    """
+    from ambid.report.numbers import quantity
+    from ambid.report.text import columns
+
+    rows = [("", "estimate ± sd", "truth", "error", "in sd", "thesis*", "verdict")]
+    inside = []
+    for p in (p for p in found if p.role != "fixed"):
+        true, (was, got) = truth[p.name], _THESIS[p.name]
+        z = (p.value - true) / p.sd
+        inside.append(abs(z) < _INSIDE)
+        q = quantity(p.value, p.sd, p.unit)
+        scale, decimals = p.value / float(q.value), len(q.value.partition(".")[2])
+        shown = f"{true / scale:.{decimals}f} {q.unit}"
+        errors = (_percent(p.value - true, true, 2), f"{z:+.1f}", _percent(got - was, was, 1))
+        rows.append((p.name, q.text, shown, *errors, "identified" if p.identifiable else "NOT SHOWN"))
+    mark = paint("✓", "good") if all(inside) else paint("✗", "bad")
+    return [
+        *columns(rows, right=(3, 4, 5)),
+        "* what the thesis's own method was off by, on its simulation rig (4.10 → 4.11)",
+        f"{mark} {sum(inside)} of {len(inside)} truths lie inside their 99.9 % intervals",
+    ]
+
+
+def _percent(error: float, of: float, decimals: int) -> str:
+    return f"{100 * error / abs(of):+.{decimals}f} %"
+
+
+def _copy(files: tuple[Path, ...], folder: Path, outputs: Outputs) -> None:
+    for name, source in zip(_FILES, files, strict=True):
+        target = folder / name
+        outputs.claim(target, "--copy")
+        if target.exists():
+            raise AmbidError(f"--copy {target} exists already. Remove it, or choose another folder")
+        content = source.read_bytes()
+        outputs.stage(target, lambda path, content=content: path.write_bytes(content))  # type: ignore[misc]

@@ -1,0 +1,124 @@
+"""``ambid identify``: physical parameters with uncertainty from one record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter, progress
+
+if TYPE_CHECKING:
+    from ambid.identify.estimate import Estimate
+    from ambid.record import Record
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+
+PlotFile = Annotated[
+    Path | None,
+    typer.Option("--plot", metavar="FILE.png", help="Draw signals, residuals, Bode and poles.", show_default=False),
+]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE.html", help="Write a report, all in one file.", show_default=False),
+]
+
+
+def command(
+    record: RecordFile,
+    rig: RigFile = None,
+    second: Annotated[
+        Path | None,
+        typer.Option(
+            "--validate", metavar="RECORD2", help="Judge the estimate on this second record.", show_default=False
+        ),
+    ] = None,
+    from_s: From = None,
+    to_s: To = None,
+    rate: Rate = None,
+    gaps: Gaps = None,
+    json: JsonFile = None,
+    plot: PlotFile = None,
+    report: ReportFile = None,
+    strict: Strict = False,
+) -> None:
+    """Identify the physical parameters of a bench from a record of voltage, current and position.
+
+    Without --rig: columns named voltage, current and position, model one-axis, everything free.
+    """
+    from ambid.job import identify, load
+    from ambid.rig import default_rig, load_rig
+
+    with Outputs(record, rig, second) as outputs:
+        outputs.claim(json_path(json), "--json")
+        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+        outputs.claim(report, "--report", (".html", ".htm"))
+        bench = default_rig() if rig is None else load_rig(rig)
+        with progress("identify") as tick:
+            estimate = identify(
+                record, bench, validate=second, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick
+            )
+            if plot or report:
+                tick("draw")
+                used = load(record, bench, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
+                draw(estimate, used, outputs, plot=plot, report=report)
+        stage_json(estimate, json, outputs)
+    if json != "-":
+        from ambid.report.text import estimate_text
+
+        typer.echo(estimate_text(estimate, paint=painter()))
+    if strict and not (estimate.passed and (estimate.validation is None or estimate.validation["passed"])):
+        raise typer.Exit(FAILED_CHECK)
+
+
+def stage_json(estimate: Estimate, json: str | None, outputs: Outputs) -> None:
+    """Give the estimate out as JSON, where that is wanted.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What to write.
+    json : str or None
+        The option ``--json``.
+    outputs : Outputs
+        Takes the file.
+    """
+    path = json_path(json)
+    if path is not None:
+        outputs.stage_text(path, estimate.dumps())
+    elif json == "-":
+        typer.echo(estimate.dumps(), nl=False)
+
+
+def draw(estimate: Estimate, used: Record, outputs: Outputs, *, plot: Path | None, report: Path | None) -> None:
+    """Draw the figures of an estimate, and write its report.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is shown.
+    used : Record
+        The record it came from, cut, channels named by role.
+    outputs : Outputs
+        Takes the files.
+    plot, report : Path or None
+        Where figures and report go.
+    """
+    from datetime import UTC, datetime
+
+    from ambid.job import signals_of
+    from ambid.physics.models import model
+    from ambid.report.figures import Evidence, overview, save
+    from ambid.report.page import report_html
+    from ambid.validate.second_record import replay
+
+    run = replay(estimate, signals_of(used, model(estimate.model)))
+    evidence = Evidence(estimate=estimate, run=run, start_s=used.start_s)
+    if plot is not None:
+        outputs.stage(plot, lambda path: save(overview(evidence), path))
+    if report is not None:
+        made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        outputs.stage_text(report, report_html(evidence, made=made))

@@ -1,0 +1,35 @@
+"""``ambid models``: what there is to identify, and the benches that can be simulated."""
+
+from __future__ import annotations
+
+import textwrap
+
+import typer
+
+
+def command() -> None:
+    """List the models with their parameters and units, the excitations and the preset benches."""
+    from ambid.cli.terminal import painter
+    from ambid.physics.models import model, model_names
+    from ambid.physics.presets import preset, preset_names
+    from ambid.report.text import columns
+    from ambid.signals import EXCITATIONS
+
+    paint = painter()
+    for name in model_names():
+        of = model(name)
+        signals = [f"{role} [{of.units[role]}]" for role in (*of.inputs, *of.outputs)]
+        count = len(of.inputs)
+        typer.echo(f"{paint(name, 'strong')}\n  {of.summary}")
+        typer.echo(f"  in: {', '.join(signals[:count])}; out: {', '.join(signals[count:])}")
+        rows = [
+            (f"  {p.name}", f"[{p.unit}]", p.meaning + ("" if p.default is None else f" ({p.default:g} unless given)"))
+            for p in of.parameters
+        ]
+        typer.echo("\n".join(columns(rows)) + "\n")
+    typer.echo(f"{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
+    typer.echo(f"{paint('presets', 'strong')}  benches for 'ambid simulate'")
+    wide = max(len(name) for name in preset_names())
+    for name in preset_names():
+        typer.echo(textwrap.fill(preset(name).summary, 80, initial_indent=f"  {name.ljust(wide)}  ",
+                                 subsequent_indent=" " * (wide + 4)))  # fmt: skip

@@ -1,0 +1,62 @@
+"""Arguments and options that several verbs share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+RecordFile = Annotated[
+    Path, typer.Argument(metavar="RECORD", help="Record: .csv, .csv.gz, .h5 or .mat.", show_default=False)
+]
+RigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--rig", metavar="RIG", help="Rig file (TOML), which says what is known of the bench.", show_default=False
+    ),
+]
+From = Annotated[
+    float | None,
+    typer.Option("--from", metavar="S", help="Use the record from this time on, in s.", show_default=False),
+]
+To = Annotated[
+    float | None, typer.Option("--to", metavar="S", help="Use the record up to this time, in s.", show_default=False)
+]
+Rate = Annotated[
+    float | None,
+    typer.Option("--rate", metavar="HZ", help="Sampling rate in Hz, for a record without time.", show_default=False),
+]
+Gaps = Annotated[
+    Literal["error", "interpolate", "cut"] | None,
+    typer.Option(
+        "--gaps",
+        help="What to do about missing values: refuse them, interpolate, or cut the longest part without any out.",
+        show_default="error, or as the rig says",
+    ),
+]
+JsonFile = Annotated[
+    str | None,
+    typer.Option("--json", metavar="FILE", help="Write the result as JSON; - for standard output.", show_default=False),
+]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="End with exit code 3 if the search did not converge or a check failed.")
+]
+
+FAILED_CHECK = 3
+
+
+def json_path(json: str | None) -> Path | None:
+    """Return the file that ``--json`` names.
+
+    Parameters
+    ----------
+    json : str or None
+        As given; ``"-"`` is standard output.
+
+    Returns
+    -------
+    Path or None
+        None where no file is to be written.
+    """
+    return None if json in (None, "-") else Path(str(json))

@@ -1,0 +1,124 @@
+"""Files that a verb writes: checked before the work begins, and put in place all together when it is done."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from ambid.errors import AmbidError
+
+
+class Outputs:
+    """The files that a verb is going to write.
+
+    Each is written beside its place under another name; only when everything is there are all of them moved. After an
+    error or Ctrl-C nothing is left behind.
+
+    Parameters
+    ----------
+    inputs : sequence of Path
+        Files that are read; none of them may be written over.
+    """
+
+    def __init__(self, *inputs: Path | None) -> None:
+        """Take note of the `inputs`, which may not be written over."""
+        self._inputs = [path for path in inputs if path is not None]
+        self._claimed: list[Path] = []
+        self._staged: dict[Path, Path] = {}
+
+    def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = ()) -> None:
+        """Check that a file can be written, before any work is done.
+
+        Parameters
+        ----------
+        path : Path or None
+            The file; None: the option was not given.
+        option : str
+            The option that names it, for messages.
+        suffixes : sequence of str
+            Endings that it may have; any if empty.
+
+        Raises
+        ------
+        AmbidError
+            If the file is a folder or an input, its folder is missing or may not be written, or its ending is wrong.
+        """
+        if path is None:
+            return
+        folder = path.parent
+        if path.is_dir():
+            raise AmbidError(f"{option} {path} is a folder; a file is wanted. Name a file inside it")
+        if suffixes and not path.name.lower().endswith(tuple(suffixes)):
+            raise AmbidError(f"{option} {path} has to end in {' or '.join(suffixes)}. Rename it")
+        if not folder.is_dir():
+            raise AmbidError(f"{option} {path}: there is no folder {folder}. Make it first, or correct the path")
+        if not os.access(folder, os.W_OK):
+            raise AmbidError(f"{option} {path}: folder {folder} may not be written. Choose another folder")
+        for other in self._inputs:
+            if _same(path, other):
+                raise AmbidError(f"{option} {path} is also read; writing would destroy it. Choose another file")
+        for other in self._claimed:
+            if _same(path, other):
+                raise AmbidError(f"{option} {path} is named by two options. Choose another file for one of them")
+        self._claimed.append(path)
+
+    def stage(self, path: Path, write: Callable[[Path], object]) -> None:
+        """Write a file under a name beside its own.
+
+        Parameters
+        ----------
+        path : Path
+            Where the file will be.
+        write : callable
+            Takes the present name, which ends like `path`, and writes it.
+
+        Raises
+        ------
+        AmbidError
+            If the system does not let it be written.
+        """
+        beside = path.with_name(f".{os.getpid()}-{path.name}")
+        self._staged[path] = beside
+        try:
+            write(beside)
+        except OSError as failure:
+            raise AmbidError(
+                f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk"
+            ) from None
+
+    def stage_text(self, path: Path, text: str) -> None:
+        """Write a text file under a name beside its own.
+
+        Parameters
+        ----------
+        path : Path
+            Where the file will be.
+        text : str
+            What it holds, in UTF-8.
+
+        Raises
+        ------
+        AmbidError
+            If the system does not let it be written.
+        """
+        self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+    def __enter__(self) -> Outputs:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                for path, beside in self._staged.items():
+                    os.replace(beside, path)
+        finally:
+            for beside in self._staged.values():
+                beside.unlink(missing_ok=True)
+
+
+def _same(a: Path, b: Path) -> bool:
+    return a.resolve() == b.resolve()

@@ -1,0 +1,177 @@
+"""``ambid simulate``: a record from the physics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import progress
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.physics.loop import Limits
+    from ambid.physics.nonlinear import OperatingPoint
+    from ambid.physics.presets import Preset
+    from ambid.record.record import Array
+    from ambid.simulate import Simulation
+
+    Respond = Callable[[Array], Simulation]
+
+_FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
+
+
+def command(
+    rig: Annotated[
+        str,
+        typer.Argument(
+            metavar="RIG|PRESET", help="Rig file, or a bench that 'ambid models' lists.", show_default=False
+        ),
+    ],
+    record: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Record to write: .csv, .csv.gz or .h5.", show_default=False
+        ),
+    ],
+    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Length in s.")] = 1.0,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Sampling rate in Hz.", show_default="the preset's, or the rig's"),
+    ] = None,
+    excitation: Annotated[
+        str, typer.Option("--excitation", metavar="NAME", help="Excitation, as 'ambid models' lists them.")
+    ] = "multisine",
+    amplitude: Annotated[
+        float | None,
+        typer.Option(
+            "--amplitude",
+            metavar="A",
+            help="Peak in V (rms for gaussian).",
+            show_default="what half of the limits allows",
+        ),
+    ] = None,
+    band: Annotated[
+        str | None,
+        typer.Option(
+            "--band",
+            metavar="LO:HI",
+            help="Band of the excitation in Hz.",
+            show_default="one period to a fifth of the rate",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and noise.", min=0)] = 0,
+    loop: Annotated[
+        Literal["open", "closed"] | None,
+        typer.Option("--loop", help="With or without the controller.", show_default="as the bench usually works"),
+    ] = None,
+    nonlinear: Annotated[
+        bool, typer.Option("--nonlinear", help="The nonlinear magnet instead of its linearisation (presets only).")
+    ] = False,
+) -> None:
+    """Simulate a bench and write the record that it would log; equal seeds give equal records."""
+    from ambid.record import write_record
+    from ambid.signals import excitation as make_excitation
+
+    preset = _preset(rig)
+    with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
+        outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"))
+        closed = None if loop is None else loop == "closed"
+        respond, rate_hz, limits, point = (
+            _of_preset(preset, rate, seed, closed, nonlinear)
+            if preset
+            else _of_rig(Path(rig), rate, seed, closed, nonlinear)
+        )
+        n = _samples(duration, rate_hz)
+        shape = make_excitation(excitation, n, rate_hz, amplitude=1.0, band=_band(band), seed=seed)
+        size = _largest(respond, shape, limits, point) if amplitude is None else amplitude
+        done = respond(size * shape)
+        comments = () if record.suffix in (".h5", ".hdf5") else _comments(rig, excitation, size, band, seed, done)
+        outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
+    for warning in done.warnings:
+        typer.echo(f"ambid: warning: {warning}", err=True)
+    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {excitation} of {size:.4g} V, seed {seed}")
+    typer.echo("truth: " + _truth(done))
+
+
+def _preset(name: str) -> Preset | None:
+    """Take the word for a preset if it is one, or cannot be a file."""
+    from ambid.physics.presets import preset, preset_names
+
+    if name in preset_names() or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
+        return preset(name)
+    return None
+
+
+def _of_preset(preset: Preset, rate: float | None, seed: int, closed: bool | None, nonlinear: bool) -> tuple[Any, ...]:
+    from ambid.simulate import simulate_preset
+
+    rate_hz = preset.rate_hz if rate is None else rate
+
+    def respond(u: Array) -> Simulation:
+        return simulate_preset(preset, u, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
+
+    return respond, rate_hz, preset.limits, preset.operating_point
+
+
+def _of_rig(path: Path, rate: float | None, seed: int, closed: bool | None, nonlinear: bool) -> tuple[Any, ...]:
+    from ambid.rig import load_rig
+    from ambid.simulate import simulate_rig
+
+    rig = load_rig(path)
+    rate_hz = rig.record.rate_hz if rate is None else rate
+    if rate_hz is None:
+        raise AmbidError(f"rig {path} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
+    if nonlinear:
+        raise AmbidError(f"rig {path} describes a linear model; only presets are nonlinear. Leave --nonlinear out")
+
+    def respond(u: Array) -> Simulation:
+        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed)
+
+    return respond, rate_hz, rig.limits, None
+
+
+def _largest(respond: Respond, shape: Array, limits: Limits | None, point: OperatingPoint | None) -> float:
+    from ambid.simulate import largest_amplitude
+
+    if limits is None:
+        raise AmbidError("no amplitude is given, and the rig has no limits to find one from. Give --amplitude A in V")
+    return float(f"{largest_amplitude(respond, shape, limits=limits, operating_point=point, fraction=_FRACTION):.3g}")
+
+
+def _samples(duration: float, rate_hz: float) -> int:
+    count = duration * rate_hz
+    if not 1 <= count <= 1e8:
+        raise AmbidError(
+            f"--duration {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
+        )
+    return round(count)
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    low, colon, high = text.partition(":")
+    try:
+        if colon:
+            return float(low), float(high)
+    except ValueError:
+        pass
+    raise AmbidError(f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000")
+
+
+def _truth(done: Simulation) -> str:
+    return ", ".join(f"{name} {value:.6g}" for name, value in done.truth.items()) + " (SI; delay in samples)"
+
+
+def _comments(rig: str, excitation: str, size: float, band: str | None, seed: int, done: Simulation) -> tuple[str, ...]:
+    from importlib.metadata import version
+
+    between = "" if band is None else f" in {band} Hz"
+    made = (
+        f"simulated by ambid {version('ambid')}: {Path(rig).name}, {excitation} of {size:.6g} V{between}, seed {seed}"
+    )
+    return made, f"truth: {_truth(done)}"

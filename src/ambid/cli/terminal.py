@@ -1,0 +1,133 @@
+"""The terminal: colour where there is one, letters that it can show, and progress on standard error."""
+
+from __future__ import annotations
+
+import codecs
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
+from typing import TYPE_CHECKING, TextIO
+
+import typer
+
+if TYPE_CHECKING:
+    from ambid.report.text import Paint, Style
+
+Tick = Callable[[str], None]
+
+_PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
+_COLOURS = {"good": {"fg": "green"}, "bad": {"fg": "red", "bold": True}, "dim": {"dim": True}, "strong": {"bold": True}}
+_QUIET_S = 1.0  # a job that is done sooner shows no progress
+_EXPECTED = 40  # evaluations of a whole identification, from which the time left is judged
+
+
+def plain_where_needed(stream: TextIO) -> None:
+    """Write ± … ✓ ✗ in plain letters on a stream whose encoding has none of them, instead of failing.
+
+    Parameters
+    ----------
+    stream : text file
+        Standard output or error; left alone where it cannot be reconfigured.
+    """
+    codecs.register_error("ambid-plain", _in_plain_letters)
+    if hasattr(stream, "reconfigure"):
+        stream.reconfigure(errors="ambid-plain")
+
+
+def _in_plain_letters(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return "".join(_PLAIN.get(c, "?") for c in error.object[error.start : error.end]), error.end
+
+
+def painter() -> Paint:
+    """Return the way of painting that standard output can show: colour on a terminal, nothing elsewhere.
+
+    Returns
+    -------
+    callable
+        Takes a text and a style.
+    """
+    from ambid.report.text import plain
+
+    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
+        return plain
+
+    def paint(text: str, style: Style) -> str:
+        return typer.style(text, **_COLOURS[style])  # type: ignore[arg-type]
+
+    return paint
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Tick]:
+    """Show that a job of unknown length goes on, how long it has taken, and about how long it still will.
+
+    Nothing is shown in the first second, nor where standard error is no terminal.
+
+    Parameters
+    ----------
+    title : str
+        What is done.
+
+    Yields
+    ------
+    callable
+        To be called with the name of the stage at each evaluation.
+    """
+    if not sys.stderr.isatty():
+        yield _silent
+        return
+    display = _Display(title)
+    try:
+        yield display.tick
+    finally:
+        display.stop()
+
+
+def _silent(stage: str) -> None:
+    del stage
+
+
+class _Display:
+    """A line of progress, drawn by a thread of its own so that it also lives while loops are compiled."""
+
+    def __init__(self, title: str) -> None:
+        self._stage, self._count, self._begin = title, 0, time.monotonic()
+        self._done = Event()
+        self._thread = Thread(target=self._show, daemon=True)
+        self._thread.start()
+
+    def tick(self, stage: str) -> None:
+        self._stage, self._count = stage, self._count + 1
+
+    def stop(self) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _show(self) -> None:
+        if self._done.wait(_QUIET_S):
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
+            console=Console(stderr=True), transient=True,
+        )  # fmt: skip
+        with bar:
+            task = bar.add_task(self._stage, total=1.0, left="")
+            while not self._done.wait(0.1):
+                part, left = self._part_and_left()
+                bar.update(task, completed=part, description=self._stage, left=left)
+
+    def _part_and_left(self) -> tuple[float, str]:
+        """Part that is done and time left: evaluations come at an even pace, and their number is known only roughly."""
+        count, elapsed = self._count, time.monotonic() - self._begin
+        if count < 3:
+            return 0.0, "(the first run compiles its loops)" if elapsed > 3 else ""
+        total = max(_EXPECTED, 1.25 * count)
+        return count / total, f"about {elapsed * (total / count - 1):.0f} s left"

@@ -1,0 +1,109 @@
+"""``ambid validate``: the checks of an estimate on other data."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter, progress
+from ambid.errors import EstimationError
+
+if TYPE_CHECKING:
+    from ambid.identify.estimate import Estimate
+    from ambid.rig import Rig
+
+
+def command(
+    estimate: Annotated[
+        Path,
+        typer.Argument(metavar="ESTIMATE.json", help="What 'ambid identify --json' wrote.", show_default=False),
+    ],
+    record: RecordFile,
+    rig: RigFile = None,
+    from_s: From = None,
+    to_s: To = None,
+    rate: Rate = None,
+    gaps: Gaps = None,
+    json: JsonFile = None,
+    strict: Strict = False,
+) -> None:
+    """Judge an estimate on another record of the same bench: nothing is fitted but offsets and initial state.
+
+    Without --rig: the record is read as the one that the estimate came from.
+    """
+    from ambid.job import load, signals_of
+    from ambid.physics.models import model
+    from ambid.report.text import validation_lines
+    from ambid.validate.second_record import validation
+
+    with Outputs(estimate, record, rig) as outputs:
+        outputs.claim(json_path(json), "--json")
+        known = read_estimate(estimate)
+        bench = _rig_of(known, estimate, rig)
+        with progress("validate"):
+            used = load(record, bench, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
+            found = validation(known, signals_of(used, model(known.model)))
+        document = {"schema": "ambid.validation/1", "estimate": estimate.name, "record": record.name, **found}
+        text = json_format.dumps(document, indent=1, allow_nan=False) + "\n"
+        if (path := json_path(json)) is not None:
+            outputs.stage_text(path, text)
+    if json == "-":
+        typer.echo(text, nl=False)
+    else:
+        paint = painter()
+        typer.echo(f"{paint(record.name, 'strong')} judged with {estimate.name}, model {known.model}\n")
+        typer.echo("\n".join(validation_lines(found, paint=paint)))
+    if strict and not found["passed"]:
+        raise typer.Exit(FAILED_CHECK)
+
+
+def read_estimate(path: Path) -> Estimate:
+    """Read an estimate from its file.
+
+    Parameters
+    ----------
+    path : Path
+        JSON, schema ``ambid.estimate/1``.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    EstimationError
+        If the file cannot be read, is no JSON or no estimate.
+    """
+    from ambid.identify.estimate import estimate_from_json
+    from ambid.record.files import file_bytes, utf8_text
+
+    text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
+    try:
+        document = json_format.loads(text)
+    except json_format.JSONDecodeError as failure:
+        raise EstimationError(
+            f"estimate {path}, row {failure.lineno}: not JSON ({failure.msg}). Give what 'ambid identify --json' wrote"
+        ) from None
+    return estimate_from_json(document, f"estimate {path}")
+
+
+def _rig_of(estimate: Estimate, path: Path, rig: Path | None) -> Rig:
+    """Load the rig that is given, or the one that the estimate remembers."""
+    from tempfile import TemporaryDirectory
+
+    from ambid.rig import load_rig
+
+    if rig is not None:
+        return load_rig(rig)
+    text = estimate.rig.get("text")
+    if not isinstance(text, str):
+        raise EstimationError(f"estimate {path} does not hold its rig. Give --rig")
+    with TemporaryDirectory() as folder:
+        kept = Path(folder) / "rig.toml"
+        kept.write_text(text, encoding="utf-8")
+        return load_rig(kept)
