@@ -133,7 +133,8 @@ class NoiseModel:
 
     Attributes
     ----------
-    form : {"levels", "gain"}
+    form : {"sensors", "levels", "gain"}
+        Sensor noise alone; disturbance and sensor levels; or a free predictor gain.
     gain : ndarray, shape (n_states, n_outputs)
         Predictor gain K of x[k+1] = A x[k] + B u + K e[k].
     innovation_covariance : ndarray, shape (n_outputs, n_outputs)
@@ -141,7 +142,7 @@ class NoiseModel:
         Held-over-a-sample disturbances and sensor noise; empty for a free gain.
     """
 
-    form: Literal["levels", "gain"]
+    form: Literal["sensors", "levels", "gain"]
     gain: Array
     innovation_covariance: Array
     disturbance_sd: Mapping[str, float]

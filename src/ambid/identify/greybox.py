@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.likelihood import Fit, score_statistic, search
-from ambid.identify.multistart import MAX_DELAY, Delay, Signals, best_start
+from ambid.identify.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
+from ambid.identify.innovations import stable
 from ambid.identify.predictor import assemble
 from ambid.identify.problem import PredictorProblem
 from ambid.physics.models import LinearModel
@@ -46,8 +47,9 @@ def greybox(
     delay : float or "auto"
         Delay of the inputs in samples; "auto": searched from 0 to 6 samples, in fractions where the data show one.
     noise : {"auto", "levels", "gain"}
-        Disturbance and sensor noise levels through the Riccati equation, a free predictor gain, or the levels unless the
-        likelihood favours the gain by more than its numbers cost (BIC).
+        Disturbance and sensor noise levels through the Riccati equation; a free predictor gain; or ("auto") the simplest that
+        does: sensor noise alone where the plant is stable, levels, or a gain, more numbers only where the likelihood rises
+        by more than they cost (BIC).
     tick : callable, optional
         Called after each evaluation; may raise to interrupt.
 
@@ -62,12 +64,40 @@ def greybox(
         If the record is too short, a channel is constant, or no start value makes a predictor.
     """
     _check(model, signals, parameters)
-    fit = best_start(model, signals, parameters, delay, tick=tick)
+    fit: Fit | None = None
+    for candidate in starts(model, signals, parameters, delay, tick=tick):
+        found = _searched(candidate, tick, with_disturbances=noise != "auto")
+        fit = found if fit is None or found.criterion < fit.criterion else fit
+        if found.status == "converged":
+            break
+    assert fit is not None
     if delay == "auto":
         fit = _with_fraction(fit, tick)
     if noise != "levels":
         fit = _with_gain(fit, tick, force=noise == "gain")
     return fit
+
+
+def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
+    """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
+    problem = candidate.problem
+    at = assemble(problem, candidate.vector, with_derivatives=False)
+    if not with_disturbances and at is not None and stable(at.A):
+        quiet = replace(problem, noise="given", gain=np.zeros_like(at.gain))
+        start = np.zeros(quiet.size)
+        for group in ("physical", "fraction", "offset", "initial"):
+            start[quiet.slices[group]] = candidate.vector[problem.slices[group]]
+        fit = search(quiet, start, tick=tick)
+        if fit.status == "converged" and _gain_promise(fit) <= 0:
+            return fit
+    return search(problem, candidate.vector, tick=tick)
+
+
+def _gain_promise(fit: Fit) -> float:
+    """Fall of the criterion that a free gain promises, less what its numbers cost (BIC)."""
+    free = replace(fit.problem, noise="gain")
+    price = (free.size - fit.problem.size) * float(np.log(fit.problem.n_used))
+    return score_statistic(free, carry(fit, free), fit.covariance) - price
 
 
 def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]) -> None:
@@ -150,10 +180,7 @@ def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit
     """Free the predictor gain where the likelihood rises by more than the added numbers cost."""
     free = replace(fit.problem, noise="gain")
     price = (free.size - fit.problem.size) * np.log(fit.problem.n_used)
-    if price <= 0 and not force:
+    if not force and (price <= 0 or _gain_promise(fit) <= 0):
         return fit
-    start = carry(fit, free)
-    if not force and score_statistic(free, start, fit.covariance) < price:
-        return fit
-    found = search(free, start, tick=tick)
+    found = search(free, carry(fit, free), tick=tick)
     return found if force or fit.criterion - found.criterion > price else fit

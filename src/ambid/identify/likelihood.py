@@ -171,6 +171,32 @@ def _decrement(J: Array, r: Array) -> float:
     return float(inside @ inside)
 
 
+def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:
+    """Return a copy with the offsets and the initial state that fit best; they enter linearly, so one solve finds them.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    work : Workspace
+
+    Returns
+    -------
+    ndarray, shape (size,)
+        Unchanged where there is no predictor at `vector`.
+    """
+    _, covariance = evaluate(problem, vector, work)
+    at = None if covariance is None else linearise(problem, vector, weight_of(covariance), work)
+    if at is None:
+        return vector.copy()
+    out, linear = vector.copy(), slice(problem.slices["offset"].start, problem.size)
+    J = at.J[:, linear]
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1.0
+    out[linear] -= np.linalg.lstsq(J / norm, at.r, rcond=1e-10)[0] / norm
+    return out
+
+
 def _step_left(J: Array, r: Array, n_physical: int) -> float:
     """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
     norm = np.linalg.norm(J, axis=0)
@@ -208,7 +234,8 @@ def search(
     """
     from scipy.optimize import least_squares
 
-    work, vector = Workspace(problem), start.copy()
+    work = Workspace(problem)
+    vector = with_linear_part(problem, start, work)
     value, covariance = evaluate(problem, vector, work)
     if covariance is None:
         return _failed(problem, start)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify import start as weak_form
-from ambid.identify.likelihood import Fit, evaluate, search
-from ambid.identify.problem import PredictorProblem
+from ambid.identify.likelihood import Fit, evaluate, search, with_linear_part
+from ambid.identify.problem import PredictorProblem, Scales
 from ambid.identify.scaling import noise_floor, scales_for
 from ambid.identify.sensitivity import Workspace
 from ambid.physics.models import LinearModel
@@ -28,6 +28,7 @@ Delay = float | Literal["auto"]
 MAX_DELAY = 6  # samples, searched when the delay is "auto"
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STRETCH = 8192  # samples on which candidates are first compared
+_SHORT = 4096  # samples on which racers are searched
 _KEPT = 6  # candidates scored on the whole record
 _RACE = 3  # candidates searched a little way
 _CLOSE = 0.5  # difference of the criterion per sample within which candidates race
@@ -52,29 +53,37 @@ class Signals:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Candidate:
-    """Start values of one band and delay, with the criterion at them."""
+class Candidate:
+    """A place to search from.
+
+    Attributes
+    ----------
+    criterion : float
+        At `vector`, see `ambid.identify.likelihood.criterion`.
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+    """
 
     criterion: float
     problem: PredictorProblem
     vector: Array
 
-    def like(self, other: _Candidate) -> bool:
-        """Whether a search from here would end where one from `other` does."""
+    def like(self, other: Candidate) -> bool:
+        """Return whether a search from here would end where one from `other` does."""
         a, b = self.problem.parameters(self.vector), other.problem.parameters(other.vector)
         same = all(abs(a[k] - b[k]) <= _ALIKE * max(abs(a[k]), abs(b[k])) for k in self.problem.estimated)
         return same and self.problem.delay == other.problem.delay
 
 
-def best_start(
+def starts(
     model: LinearModel,
     signals: Signals,
     parameters: Sequence[Parameter],
     delay: Delay,
     *,
     tick: Callable[[], None] | None = None,
-) -> Fit:
-    """Score all start values, race the best that differ, and search on from the winner.
+) -> list[Candidate]:
+    """Score all start values and race the best that differ.
 
     Parameters
     ----------
@@ -87,8 +96,8 @@ def best_start(
 
     Returns
     -------
-    Fit
-        At the best whole-sample delay, noise described by levels.
+    list of Candidate
+        Best first; noise described by levels, delays whole where they are searched.
 
     Raises
     ------
@@ -101,36 +110,41 @@ def best_start(
             "no start values make a physical plant (positive m and L) with this record: it holds too little excitation, or "
             "voltage, current and position are not what the rig says. Check columns and signs, or give start values"
         )
-    racers: list[_Candidate] = []
+    racers: list[Candidate] = []
     for candidate in scored:
         close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
         if close and not any(candidate.like(r) for r in racers):
             racers.append(candidate)
-    short = [search(c.problem, c.vector, rounds=1, evaluations=8, tick=tick) for c in racers[:_RACE]]
-    found: Fit | None = None
-    for fit in sorted(short, key=lambda f: f.criterion):
-        # noise levels move slowly on a logarithmic scale: look again where they stand best before going on
-        vectors = [fit.vector, *(_with_level(fit.problem, fit.vector, level) for level in _LEVELS)]
-        vector = min(vectors, key=lambda v: evaluate(fit.problem, v)[0])
-        longer = search(fit.problem, vector, tick=tick)
-        found = longer if found is None or longer.criterion < found.criterion else found
-        if longer.status == "converged":
-            break
-    assert found is not None
-    return found
+    return sorted((_raced(c, tick) for c in racers[:_RACE]), key=lambda c: c.criterion)
 
 
-def _scored(
-    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay
-) -> list[_Candidate]:
+def _raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
+    """Search a little way on a short stretch, and keep what does best on the whole record."""
+    problem, vector = candidate.problem, candidate.vector
+    stretch = _busiest(problem.u, _SHORT)
+    part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
+    fit = search(part, _on(part, vector), rounds=3, tick=tick)
+    moved = _on(problem, fit.vector)
+    # noise levels move slowly on a logarithmic scale: look again where they stand best
+    work = Workspace(problem)
+    both = (moved, with_linear_part(problem, moved, work), vector)
+    vectors = [w for v in both for w in (v, *(_with_level(problem, v, level) for level in _LEVELS))]
+    scored = [(evaluate(problem, v, work)[0], j) for j, v in enumerate(vectors)]
+    value, best = min(scored)
+    return Candidate(criterion=value, problem=problem, vector=vectors[best])
+
+
+def _scored(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> list[Candidate]:
     """Return the best candidates of all bands and delays, each at several noise levels."""
     delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
-    stretch = _busiest(centred.u)
-    coarse: list[tuple[float, PredictorProblem, Mapping[str, float]]] = []
+    stretch = _busiest(centred.u, _STRETCH)
+    coarse: list[tuple[float, PredictorProblem, dict[str, float]]] = []
     work: Workspace | None = None
-    for d, values in _values(model, centred, parameters, delays):
-        problem = _problem(model, centred, parameters, values, d, int(max(delays)) + 2)
+    floor, spread = noise_floor(centred.y), np.std(centred.u, axis=0)
+    for d, values in _values(model, centred, parameters, delays, floor):
+        scales = scales_for(model, values, spread, floor, signals.rate_hz)
+        problem = _problem(model, centred, parameters, values, scales, d, int(max(delays)) + 2)
         part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
         # the scaled data are the same for all candidates of a delay
         if work is None or coarse[-1][1].delay != problem.delay:
@@ -144,37 +158,39 @@ def _scored(
             vector = _with_level(problem, _vector(problem, values), level)
             value, _ = evaluate(problem, vector, work)
             if np.isfinite(value):
-                found.append(_Candidate(criterion=value, problem=problem, vector=vector))
+                found.append(Candidate(criterion=value, problem=problem, vector=vector))
     return found
 
 
 def _values(
-    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float]
+    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float], floor: Array
 ) -> Iterator[tuple[float, dict[str, float]]]:
     """Yield delay and start values: from the data, and with the values that were given."""
     given = {p.name: p.value for p in parameters if p.value is not None}
     anchored = {p.name: p.value for p in parameters if p.value is not None and p.role != "free"}
     columns = dict(zip((*model.inputs, *model.outputs), np.hstack([signals.u, signals.y]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
-    noise = dict(zip(model.outputs, noise_floor(signals.y).tolist(), strict=True))
+    noise = dict(zip(model.outputs, floor.tolist(), strict=True))
     for d in delays:
         from_data = list(weak_form.candidates(model.name, moments, noise, d, signals.rate_hz, anchored))
         if given != anchored:
             from_data += [{**values, **given} for values in (from_data or [given])[:1]]
         for values in from_data:
-            possible = all(np.isfinite(v) for v in values.values()) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0
+            possible = (
+                all(np.isfinite(v) for v in values.values()) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0
+            )
             if possible and len(values) == len(model.parameters):
                 yield d, values
 
 
-def _busiest(u: Array) -> slice:
-    """The stretch of at most `_STRETCH` samples in which the inputs move most."""
+def _busiest(u: Array, length: int) -> slice:
+    """The stretch of at most `length` samples in which the inputs move most."""
     n = u.shape[0]
-    if n <= _STRETCH:
+    if n <= length:
         return slice(0, n)
     power = np.cumsum(np.concatenate([[0.0], np.sum((u / np.std(u, axis=0)) ** 2, axis=1)]))
-    first = int(np.argmax(power[_STRETCH:] - power[:-_STRETCH]))
-    return slice(first, first + _STRETCH)
+    first = int(np.argmax(power[length:] - power[:-length]))
+    return slice(first, first + length)
 
 
 def _problem(
@@ -182,10 +198,11 @@ def _problem(
     signals: Signals,
     parameters: Sequence[Parameter],
     values: Mapping[str, float],
+    scales: Scales,
     delay: float,
     skip: int,
 ) -> PredictorProblem:
-    """Scale a problem around start values."""
+    """Set up the problem of one candidate."""
     estimated = [p for p in parameters if p.role != "fixed"]
     reference = model.references(values)
     return PredictorProblem(
@@ -198,7 +215,7 @@ def _problem(
         magnitude=np.array([max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0), 1e-300) for p in estimated]),
         prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in estimated]),
         prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in estimated]),
-        scales=scales_for(model, values, signals.u, signals.y, signals.rate_hz),
+        scales=scales,
         delay=int(delay),
         lag=delay - int(delay),
         skip=skip,
@@ -207,14 +224,20 @@ def _problem(
 
 
 def _vector(problem: PredictorProblem, values: Mapping[str, float]) -> Array:
-    """Write start values as a vector: outputs at the first sample for the state, nothing known of offsets."""
-    vector, model = np.zeros(problem.size), problem.model
+    """Write start values as a vector; nothing is known of offsets."""
+    vector = np.zeros(problem.size)
     vector[problem.slices["physical"]] = np.array([values[k] for k in problem.estimated]) / problem.magnitude
+    return _on(problem, _with_level(problem, vector, _LEVELS[0]))
+
+
+def _on(problem: PredictorProblem, vector: Array) -> Array:
+    """Return a copy whose initial state is that of the problem's data: its outputs at the first sample."""
+    out, model = vector.copy(), problem.model
     first, initial = problem.y[problem.skip], problem.slices["initial"].start
     for j, state in enumerate(model.states):
-        if state in model.outputs:
-            vector[initial + j] = first[model.outputs.index(state)] / problem.scales.state[j]
-    return _with_level(problem, vector, _LEVELS[0])
+        measured = state in model.outputs
+        out[initial + j] = first[model.outputs.index(state)] / problem.scales.state[j] if measured else 0.0
+    return out
 
 
 def _with_level(problem: PredictorProblem, vector: Array, level: float) -> Array:

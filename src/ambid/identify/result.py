@@ -135,9 +135,15 @@ def _noise(fit: Fit) -> NoiseModel:
     predictor = assemble(problem, fit.vector, with_derivatives=False)
     if predictor is None:
         raise ValueError("the fit has no predictor; it has failed")
-    disturbance, sensor = _levels(fit, predictor) if problem.noise == "levels" else ({}, {})
+    disturbance: dict[str, float] = {}
+    sensor: dict[str, float] = {}
+    if problem.noise == "levels":
+        disturbance, sensor = _levels(fit, predictor)
+    elif not np.any(predictor.gain):
+        disturbance = dict.fromkeys(problem.model.disturbances, 0.0)
+        sensor = dict(zip(problem.model.outputs, (np.sqrt(np.diag(fit.covariance)) * sc.output).tolist(), strict=True))
     return NoiseModel(
-        form="levels" if problem.noise == "levels" else "gain",
+        form="levels" if problem.noise == "levels" else "gain" if np.any(predictor.gain) else "sensors",
         gain=predictor.gain * sc.state[:, None] / sc.output,
         innovation_covariance=fit.covariance * np.outer(sc.output, sc.output),
         disturbance_sd=disturbance,

@@ -32,30 +32,35 @@ def noise_floor(y: Array) -> Array:
     return np.asarray(np.maximum(floor, 1e-9 * np.std(y, axis=0)))
 
 
-def scales_for(model: LinearModel, values: Mapping[str, float], u: Array, y: Array, rate_hz: float) -> Scales:
-    """Return scales: sensor noise for outputs and states, what moves the outputs by that within two samples for disturbances.
+def scales_for(
+    model: LinearModel, values: Mapping[str, float], inputs: Array, outputs: Array, rate_hz: float
+) -> Scales:
+    """Return the scales of a predictor.
+
+    Sensor noise for outputs and states; for disturbances, what moves the outputs by that within two samples.
 
     Parameters
     ----------
     model : LinearModel
     values : Mapping[str, float]
         Rough parameters, SI.
-    u : ndarray, shape (n_samples, n_inputs), SI
-    y : ndarray, shape (n_samples, n_outputs), SI
+    inputs : ndarray, shape (n_inputs,), SI
+        Standard deviations of the inputs.
+    outputs : ndarray, shape (n_outputs,), SI
+        About the noise of the outputs, see `noise_floor`.
     rate_hz : float
 
     Returns
     -------
     Scales
     """
-    output = noise_floor(y)
     discrete, _ = discretise(model.matrices(values), 1.0 / rate_hz)
     reach = np.maximum(np.abs(discrete.C @ discrete.E), np.abs(discrete.C @ discrete.A @ discrete.E))
-    state = np.array([output[model.outputs.index(s)] if s in model.outputs else 0.0 for s in model.states])
-    state[state == 0] = output[0] * rate_hz / 20  # velocity, the only state that is not measured
+    state = np.array([outputs[model.outputs.index(s)] if s in model.outputs else 0.0 for s in model.states])
+    state[state == 0] = outputs[0] * rate_hz / 20  # velocity, the only state that is not measured
     return Scales(
         state=state,
-        input=np.std(u, axis=0),
-        output=output,
-        disturbance=1 / np.max(reach / output[:, None], axis=0),
+        input=inputs,
+        output=outputs,
+        disturbance=1 / np.max(reach / outputs[:, None], axis=0),
     )

@@ -103,6 +103,8 @@ def _sparse_gain(fit: Fit, stride: int) -> Array:
     if predictor is None:
         raise ValueError("the fit has no predictor; it has failed")
     A, C, K, S = predictor.A, predictor.C, predictor.gain, fit.covariance
+    if not np.any(K):  # sensor noise alone: no state is ever corrected
+        return K
     powers = [np.linalg.matrix_power(A, stride - 1 - j) for j in range(stride)]
     Q = sum((p @ K @ S @ K.T @ p.T for p in powers), np.zeros_like(A))
     cross, whole = powers[0] @ K @ S, A @ powers[0]

@@ -67,7 +67,9 @@ def _agreement_check(moved: Agreement) -> Check:
             f"refits with every {every}th output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): the model "
             "does not fit this record; excite more against the noise, work in a smaller range, or look for what is missing"
         )
-    return Check(passed=moved.passed, values={"largest_shift_sd": moved.largest, "refits": float(n_refits)}, detail=detail)
+    return Check(
+        passed=moved.passed, values={"largest_shift_sd": moved.largest, "refits": float(n_refits)}, detail=detail
+    )
 
 
 def residual_check(test: ResidualTest, what: str) -> Check:

@@ -12,7 +12,7 @@ from ambid.identify.estimate import Check, Estimate
 from ambid.identify.greybox import Signals
 from ambid.identify.likelihood import Fit, search
 from ambid.identify.problem import PredictorProblem
-from ambid.identify.scaling import scales_for
+from ambid.identify.scaling import noise_floor, scales_for
 from ambid.identify.sensitivity import innovations
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
@@ -98,12 +98,16 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
     delay = estimate.delay[plant.inputs[0]]
     skip = delay.samples + 2
     if signals.y.shape[0] < skip + 20 * len(plant.states):
-        raise EstimationError(f"the record has {signals.y.shape[0]} samples; too few to judge an estimate. Give a longer one")
+        raise EstimationError(
+            f"the record has {signals.y.shape[0]} samples; too few to judge an estimate. Give a longer one"
+        )
     u, y = signals.u - signals.u.mean(axis=0), signals.y - signals.y.mean(axis=0)
     for role, column in zip((*plant.inputs, *plant.outputs), np.hstack([u, y]).T, strict=True):
         if not np.any(column):
-            raise EstimationError(f"channel {role!r} is constant over the whole record; nothing can be judged on it. Check it")
-    scales = scales_for(plant, estimate.values, u, y, signals.rate_hz)
+            raise EstimationError(
+                f"channel {role!r} is constant over the whole record; nothing can be judged on it. Check it"
+            )
+    scales = scales_for(plant, estimate.values, np.std(u, axis=0), noise_floor(y), signals.rate_hz)
     problem = PredictorProblem(
         model=plant, rate_hz=signals.rate_hz, u=u, y=y, estimated=(), known=estimate.values, magnitude=np.zeros(0),
         prior_mean=np.zeros(0), prior_sd=np.zeros(0), scales=scales, delay=delay.samples, lag=delay.fraction, skip=skip,
