@@ -1,8 +1,8 @@
 """The same job written straight with SciPy: modes of the predictor, `lfilter`, finite differences.
 
-This is what an engineer would write: discretise with `cont2discrete`, get the Kalman gain from `solve_discrete_are`, split the
-predictor into its modes, filter with `lfilter`, and let forward differences make the Jacobian. (With `ss2tf` and third-order
-filters instead of modes it takes a third longer, and at 20 kHz rounding in the polynomials makes the differences worthless.)
+This is what an engineer would write: discretise with `cont2discrete`, get the Kalman gain from `solve_discrete_are`, split
+the predictor into its modes, filter with `lfilter`, and let forward differences make the Jacobian. (With `ss2tf` and
+third-order filters instead of modes it takes longer, and at 20 kHz rounding in the polynomials spoils the differences.)
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def discrete_plant(theta, period):
 
 
 def residual(vector, u, y, period, scale, weight):
-    """Weighted innovations (n_samples * 2,) at 13 numbers: 5 physical, 3 log noise ratios, 2 offsets, 3 initial states."""
+    """Weighted innovations at 13 numbers: 5 physical, 3 log noise ratios, 2 offsets, 3 initial states."""
     theta, noise, offset, x0 = vector[:5] * scale["theta"], vector[5:8], vector[8:10], vector[10:13] * scale["state"]
     a, b, e, c = discrete_plant(theta, period)
     q = (e * np.exp(2 * noise[:2]) * scale["disturbance"] ** 2) @ e.T

@@ -4,6 +4,9 @@ Every error that input can cause is an :class:`AmbidError`; the command line pri
 Anything else that escapes is a defect of the program.
 """
 
+import difflib
+from collections.abc import Sequence
+
 
 class AmbidError(Exception):
     """Input refused.
@@ -34,3 +37,22 @@ class ModelError(AmbidError):
 
 class EstimationError(AmbidError):
     """The data cannot be turned into an estimate at all (as opposed to a poor one, which is given with its flags)."""
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """Return `` Did you mean 'x'?`` for the known word closest to `word`, or an empty string.
+
+    Parameters
+    ----------
+    word : str
+        What was written.
+    known : Sequence[str]
+        What may be written.
+
+    Returns
+    -------
+    str
+        A sentence that begins with a space, or ``""``.
+    """
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
+    return f" Did you mean {close[0]!r}?" if close else ""

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Check, Estimate
-from ambid.physics.models import LinearModel, model
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
 from ambid.signals.samples import cut
@@ -68,7 +69,7 @@ def identify(
     from ambid.identify.greybox import greybox
     from ambid.identify.uncertainty import uncertainty
 
-    say = tick or (lambda stage: None)
+    say = tick or _silent
     clock = _Clock()
     rig = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
     bench = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
@@ -160,10 +161,15 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
-            "the model explains the record only in part: standard deviations are robust ones (scatter over the record and "
-            "disagreement of refits included), and still cannot cover a bias that is the same everywhere"
+            "the model explains the record only in part: standard deviations are robust ones (scatter over the record "
+            "and disagreement of refits included), and still cannot cover a bias that is the same everywhere"
         )
     return tuple(found)
+
+
+def _silent(stage: str) -> None:
+    """Report no progress."""
+    del stage
 
 
 class _Clock:
@@ -230,7 +236,7 @@ def signals_of(record: Record, plant: LinearModel) -> Any:
     """
     import numpy as np
 
-    from ambid.identify.greybox import Signals
+    from ambid.identify.multistart import Signals
 
     return Signals(
         u=np.stack([record[r] for r in plant.inputs], axis=1),

@@ -1,7 +1,8 @@
 """Compiled recursions of the innovations-form predictor and its exact sensitivities.
 
-One step of the predictor is x+ = F x + G z; its derivative by estimated number q is s_q+ = F s_q + f_q, with a forcing f_q
-that is linear in x and z. Drive and forcing of a whole block are matrix products; only the recursion itself is compiled.
+One step of the predictor is x+ = F x + G z; its derivative by estimated number q is s_q+ = F s_q + f_q, with a forcing
+f_q that is linear in x and z. Drive and forcing of a whole block are matrix products; only the recursion itself is
+compiled.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ Array = NDArray[np.float64]
 def state_scan(F: Array, x: Array) -> None:
     """Turn a drive into states in place.
 
-    `x` (block + 1, n) holds the first state in x[0] and the drive of sample k in x[k + 1]; on return x[k + 1] = F x[k] + drive.
-    Three states, the one-axis plant, are spelled out: they stay in registers.
+    `x` (block + 1, n) holds the first state in x[0] and the drive of sample k in x[k + 1]; on return x[k + 1] = F x[k]
+    + drive. Three states, the one-axis plant, are spelled out: they stay in registers.
     """
     n = x.shape[1]
     if n == 3:
@@ -45,8 +46,9 @@ def state_scan(F: Array, x: Array) -> None:
 def sensitivity_scan(F: Array, s: Array) -> None:
     """Turn forcings into sensitivities in place, many at once.
 
-    `s` (block + 1, n, p) holds the sensitivities at the first sample in s[0] and the forcing of sample k in s[k + 1]; on
-    return s[k + 1] = F s[k] + forcing. Estimated numbers run along the last axis, so that vector instructions serve them.
+    `s` (block + 1, n, p) holds the sensitivities at the first sample in s[0] and the forcing of sample k in s[k + 1];
+    on return s[k + 1] = F s[k] + forcing. Estimated numbers run along the last axis, so that vector instructions serve
+    them.
     """
     n, p = s.shape[1], s.shape[2]
     if n == 3:

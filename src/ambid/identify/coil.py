@@ -1,7 +1,8 @@
 """Coil from voltage and current, rotor at rest: V = R i + L i' (thesis eq. 4.1 to 4.3).
 
-Least squares on the first-order difference equation, as the thesis does it, is biased by noise on the measured current, because
-the regressor is that same current. The instrumental variable, the current simulated from the voltage alone, removes the bias.
+Least squares on the first-order difference equation, as the thesis does it, is biased by noise on the measured current,
+because the regressor is that same current. The instrumental variable, the current simulated from the voltage alone,
+removes the bias.
 """
 
 from __future__ import annotations
@@ -61,15 +62,16 @@ def coil_least_squares(voltage: Array, current: Array, rate_hz: float) -> CoilEs
         If the lengths differ, the signals hold no information, or no decaying first-order coil fits.
     """
     rows, target = _regression(voltage, current)
-    return _coil(np.linalg.lstsq(rows, target, rcond=None)[0], rate_hz, "least squares")
+    found = np.asarray(np.linalg.lstsq(rows, target, rcond=None)[0], dtype=np.float64)
+    return _coil(found, rate_hz, "least squares")
 
 
 def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEstimate:
     """Estimate a coil by the refined instrumental variable (Young 2011, ch. 7); the bias of least squares is gone.
 
-    The instrument is the current of the estimated coil under the same voltage, free of measurement noise; it and the data are
-    filtered by the coil's own lag, and all is repeated until it settles. Wants a voltage that does not depend on the current
-    (no feedback).
+    The instrument is the current of the estimated coil under the same voltage, free of measurement noise; it and the
+    data are filtered by the coil's own lag, and all is repeated until it settles. Wants a voltage that does not depend
+    on the current (no feedback).
 
     Parameters
     ----------
@@ -100,16 +102,16 @@ def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEst
         if np.max(np.abs(found - before) / np.maximum(np.abs(found), 1e-12)) < _SETTLED:
             return _coil(found, rate_hz, "instrumental variable")
     raise EstimationError(
-        "the instrumental variable for the coil does not settle; voltage and current are not those of a coil at rest, or too "
-        "noisy. Check channels.voltage and channels.current, or use the 'coil' model"
+        "the instrumental variable for the coil does not settle; voltage and current are not those of a coil at rest, "
+        "or too noisy. Check channels.voltage and channels.current, or use the 'coil' model"
     )
 
 
 def _regression(voltage: Array, current: Array) -> tuple[Array, Array]:
     if voltage.shape != current.shape or voltage.ndim != 1 or voltage.size < 10:
         raise EstimationError(
-            f"voltage has shape {voltage.shape} and current {current.shape}; the coil wants two columns of one length, at least "
-            "10 samples. Check the record"
+            f"voltage has shape {voltage.shape} and current {current.shape}; the coil wants two columns of one length, "
+            "at least 10 samples. Check the record"
         )
     if np.ptp(voltage) == 0 or np.ptp(current) == 0:
         raise EstimationError("voltage or current is constant; a coil shows only when both change. Excite the coil")
@@ -130,7 +132,8 @@ def _coil(found: Array, rate_hz: float, method: Literal["least squares", "instru
     alpha, beta = float(found[0]), float(found[1])
     if not (0 < alpha < 1 and np.isfinite(beta) and beta != 0):
         raise EstimationError(
-            f"no decaying first-order coil fits (i[k+1] = {alpha:.4g} i[k] + {beta:.4g} V[k]). Check sign, delay and sampling rate"
+            f"no decaying first-order coil fits (i[k+1] = {alpha:.4g} i[k] + {beta:.4g} V[k]). "
+            "Check sign, delay and sampling rate"
         )
     a = -np.log(alpha) * rate_hz
     b = beta * a / (1 - alpha)

@@ -1,26 +1,27 @@
 """Grey-box estimation of the physical parameters of a linear model (theory.md sec. 2; Ljung 1999, sec. 7.5).
 
-Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for stable and
-unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole samples and then as a
-real number; noise is described by disturbance and sensor levels, or by a free predictor gain where the data ask for it.
+Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for
+stable and unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole
+samples and then as a real number; noise is described by disturbance and sensor levels, or by a free predictor gain
+where the data ask for it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
+from ambid.identify.innovations import stable
 from ambid.identify.likelihood import Fit, score_statistic, search
 from ambid.identify.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
-from ambid.identify.innovations import stable
 from ambid.identify.predictor import assemble
 from ambid.identify.problem import PredictorProblem
-from ambid.physics.models import LinearModel
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
 Array = NDArray[np.float64]
@@ -47,9 +48,9 @@ def greybox(
     delay : float or "auto"
         Delay of the inputs in samples; "auto": searched from 0 to 6 samples, in fractions where the data show one.
     noise : {"auto", "levels", "gain"}
-        Disturbance and sensor noise levels through the Riccati equation; a free predictor gain; or ("auto") the simplest that
-        does: sensor noise alone where the plant is stable, levels, or a gain, more numbers only where the likelihood rises
-        by more than they cost (BIC).
+        Disturbance and sensor noise levels through the Riccati equation; a free predictor gain; or ("auto") the
+        simplest that does: sensor noise alone where the plant is stable, levels, or a gain, more numbers only where the
+        likelihood rises by more than they cost (BIC).
     tick : callable, optional
         Called after each evaluation; may raise to interrupt.
 
@@ -107,15 +108,15 @@ def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]
     least = 10 * (n_estimated + 3 * len(model.states)) + MAX_DELAY
     if signals.y.shape[0] < least:
         raise EstimationError(
-            f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters wants at least {least}. "
-            "Record longer, or cut less"
+            f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters wants at least "
+            f"{least}. Record longer, or cut less"
         )
     for roles, values in ((model.inputs, signals.u), (model.outputs, signals.y)):
         for role, column in zip(roles, values.T, strict=True):
             if np.ptp(column) == 0:
                 raise EstimationError(
-                    f"channel {role!r} is constant at {column[0]:g} over the whole record; nothing can be identified from it. "
-                    "Check the sensor and its wiring, or the column the rig names"
+                    f"channel {role!r} is constant at {column[0]:g} over the whole record; nothing can be identified "
+                    "from it. Check the sensor and its wiring, or the column the rig names"
                 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ambid.identify.uncertainty import WEAK, Uncertainty
 
 _ADVICE = {
-    "k_x": "k_x shows where the displacement force counts: excite more at low frequency (from about {low:.2g} Hz), or larger",
+    "k_x": "k_x shows where the displacement force counts: excite more at low frequency (from {low:.2g} Hz), or larger",
     "k_i": "k_i shows in the motional voltage and in the force: excite larger motion near {mid:.3g} Hz",
     "m": "m shows in the acceleration: excite up to {mid:.3g} Hz and beyond, larger",
     "R": "R shows in slow currents: add steps of the voltage that are held for {settle:.2g} s or longer",
@@ -44,8 +44,8 @@ def experiment_hint(u: Uncertainty, values: Mapping[str, float], lowest_hz: floa
         "R" not in values and {"k_x", "k_i", "m"} & in_direction and len(in_direction) > 1
     ):
         return (
-            "m, k_x and k_i can only be told up to a common factor: the motional voltage k_i x' is lost in the noise. Weigh the rotor "
-            "and fix m (or give a prior), or excite faster and larger motion"
+            "m, k_x and k_i can only be told up to a common factor: the motional voltage k_i x' is lost in the noise. "
+            "Weigh the rotor and fix m (or give a prior), or excite faster and larger motion"
         )
     frequencies = _frequencies(values, lowest_hz)
     advice = [_ADVICE[name].format(**frequencies) for name in unseen if name in _ADVICE]

@@ -1,4 +1,4 @@
-"""From disturbance and sensor noise levels to the predictor: Kalman gain, innovation covariance and their exact derivatives.
+"""From noise levels to the predictor: Kalman gain, innovation covariance and their exact derivatives.
 
 Solves the filter Riccati equation with SciPy and differentiates it implicitly: with F = A - K C,
 dP = F dP F^T + dA P F^T + F P dA^T + dQ + K dR K^T (a Lyapunov equation, because the gain is stationary in P).
@@ -65,11 +65,11 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
 
         P = solve_discrete_are(A.T, C.T, Q, R)
         # the general solver's accuracy suffers where poles crowd at one; Newton takes it to rounding
-        P = _newton(A, C, Q, R, np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T)
+        P = _newton(A, C, Q, R, _gain_of(A, C, P, R))
         if P is None:
             raise np.linalg.LinAlgError("the Riccati equation has no stabilising solution")
     S = C @ P @ C.T + R
-    return Innovations(K=np.linalg.solve(S, C @ P @ A.T).T, P=P, S=S)
+    return Innovations(K=_gain_of(A, C, P, R), P=P, S=S)
 
 
 def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array) -> Array | None:
@@ -80,8 +80,13 @@ def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array) -> Array | None:
         P = solve_lyapunov(F, Q + K @ R @ K.T)
         if before is not None and np.max(np.abs(P - before)) <= 1e-12 * np.max(np.abs(P)):
             return P
-        K, before = np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T, P
+        K, before = _gain_of(A, C, P, R), P
     return None
+
+
+def _gain_of(A: Array, C: Array, P: Array, R: Array) -> Array:
+    """Predictor gain A P C^T (C P C^T + R)^-1."""
+    return np.asarray(np.linalg.solve(C @ P @ C.T + R, C @ P @ A.T).T, dtype=np.float64)
 
 
 def solve_lyapunov(F: Array, Q: Array) -> Array:

@@ -1,7 +1,7 @@
 """Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2).
 
-The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given to SciPy's
-trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
+The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given
+to SciPy's trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not
 _ROUNDS = 20  # of reweighting by the innovation covariance
 _EVALUATIONS = 10  # of the residual in one round
 _SETTLED = 0.03  # Newton step of every physical parameter, in standard deviations, below which a search has converged
-_FLAT = 0.1  # fall of the criterion in one round below which a search has converged: a twentieth of what a needless number earns
+_FLAT = 0.1  # fall of the criterion in one round below which a search has converged; a needless number earns one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -163,7 +163,7 @@ def score_statistic(problem: PredictorProblem, vector: Array, covariance: Array)
 
 
 def _decrement(J: Array, r: Array) -> float:
-    """Squared length of the residual inside the Jacobian's column space: the Newton step in standard deviations, squared."""
+    """Squared length of the residual inside the Jacobian's column space: the fall that a Newton step promises."""
     norm = np.linalg.norm(J, axis=0)
     norm[norm == 0] = 1.0
     u, s, _ = np.linalg.svd(J / norm, full_matrices=False)

@@ -1,7 +1,7 @@
 """Many start values, one search: the weak-form candidates of all bands and delays are scored by the likelihood.
 
-Each candidate is scored on the busiest stretch of the record, the best on all of it and at several noise levels; candidates that
-differ in more than chance are searched a little way, and the search goes on from the winner.
+Each candidate is scored on the busiest stretch of the record, the best on all of it and at several noise levels;
+candidates that differ in more than chance are searched a little way, and the search goes on from the winner.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify import start as weak_form
-from ambid.identify.likelihood import Fit, evaluate, search, with_linear_part
+from ambid.identify.likelihood import evaluate, search, with_linear_part
 from ambid.identify.problem import PredictorProblem, Scales
 from ambid.identify.scaling import noise_floor, scales_for
 from ambid.identify.sensitivity import Workspace
-from ambid.physics.models import LinearModel
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
 Array = NDArray[np.float64]
@@ -107,8 +107,9 @@ def starts(
     scored = sorted(_scored(model, signals, parameters, delay), key=lambda c: c.criterion)
     if not scored:
         raise EstimationError(
-            "no start values make a physical plant (positive m and L) with this record: it holds too little excitation, or "
-            "voltage, current and position are not what the rig says. Check columns and signs, or give start values"
+            "no start values make a physical plant (positive m and L) with this record: it holds too little "
+            "excitation, or voltage, current and position are not what the rig says. Check columns and signs, or give "
+            "start values"
         )
     racers: list[Candidate] = []
     for candidate in scored:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ambid.identify.innovations import Innovations, gain_derivatives, predictor_gain, stable, stack
 from ambid.identify.problem import PredictorProblem
 from ambid.physics.discretise import DiscreteSpace, discretise
-from ambid.physics.models import StateSpace
+from ambid.physics.linear_model import StateSpace
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,15 @@ class Predictor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Step:
-    """Plant over one step of the recursion: A (n, n), inputs (n, n_lags n_inputs), E (n, n_disturbances)."""
+    """Plant over one step of the recursion.
+
+    Attributes
+    ----------
+    A : ndarray, shape (n, n)
+    inputs : ndarray, shape (n, n_lags n_inputs)
+        Input matrices at the problem's lags.
+    E : ndarray, shape (n, n_disturbances)
+    """
 
     A: Array
     inputs: Array
@@ -72,7 +80,7 @@ def assemble(
     Predictor or None
         None where the vector makes no stable predictor or no physical plant (mass or inductance not positive).
     """
-    model, sl = problem.model, problem.slices
+    sl = problem.slices
     theta, lag = problem.parameters(vector), problem.lag_at(vector)
     possible = np.all(np.isfinite(vector)) and all(theta.get(name, 1.0) > 0 for name in ("m", "L"))
     if not possible or not -1.0 < lag < 2.0 or problem.delay + lag < 0.0:
@@ -97,8 +105,14 @@ def assemble(
         dM[:, first_y:-1, : len(dK)] += np.moveaxis(dK, 0, 2)
         dM[:, -1, sl["offset"]] = step.E
     return Predictor(
-        M=M, dM=dM, A=step.A, C=np.ascontiguousarray(plant.C), x0=vector[sl["initial"]].copy(), gain=K, innovations=inner
-    )  # fmt: skip
+        M=M,
+        dM=dM,
+        A=step.A,
+        C=np.ascontiguousarray(plant.C),
+        x0=vector[sl["initial"]].copy(),
+        gain=K,
+        innovations=inner,
+    )
 
 
 def _discrete(

@@ -1,8 +1,8 @@
 """What is estimated from what: data, model, and the layout of the vector of estimated numbers.
 
-The vector holds, in this order: free and prior physical parameters (over their magnitudes), the delay where it is estimated,
-the noise description (log levels, or the gain itself), constant disturbances (offsets), initial state. States, inputs and
-outputs are scaled to order one before anything is factorised.
+The vector holds, in this order: free and prior physical parameters (over their magnitudes), the delay where it is
+estimated, the noise description (log levels, or the gain itself), constant disturbances (offsets), initial state.
+States, inputs and outputs are scaled to order one before anything is factorised.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.physics.models import LinearModel
+from ambid.physics.linear_model import LinearModel
 
 Array = NDArray[np.float64]
 NoiseForm = Literal["levels", "gain", "given"]
@@ -126,7 +126,7 @@ class PredictorProblem:
     @property
     def size(self) -> int:
         """Length of the vector."""
-        return self.slices["initial"].stop
+        return int(self.slices["initial"].stop)
 
     @property
     def taps(self) -> tuple[int, ...]:
@@ -143,7 +143,7 @@ class PredictorProblem:
     @property
     def n_used(self) -> int:
         """Samples of each output that enter the fit."""
-        return -(-(self.y.shape[0] - self.skip) // self.stride)
+        return int(-(-(self.y.shape[0] - self.skip) // self.stride))
 
     def parameters(self, vector: Array) -> dict[str, float]:
         """Return all physical parameters in SI at `vector`.
@@ -160,9 +160,9 @@ class PredictorProblem:
         return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
 
     def lag_at(self, vector: Array) -> float:
-        """Return the delay in samples beyond `delay` at `vector`."""
+        """Return the delay in samples beyond `delay` at `vector`, shape (size,)."""
         return float(vector[self.slices["fraction"]][0]) if self.fractional else self.lag
 
     def delay_samples(self, vector: Array) -> float:
-        """Return the whole delay at `vector` in samples."""
+        """Return the whole delay in samples at `vector`, shape (size,)."""
         return self.delay + self.lag_at(vector)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.problem import Scales
 from ambid.physics.discretise import discretise
-from ambid.physics.models import LinearModel
+from ambid.physics.linear_model import LinearModel
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ _QR_ROWS = 512  # rows of one small QR: below the size at which the linear algeb
 
 
 class Workspace:
-    """What repeated evaluations of one problem share: scaled data, and the last gain as a start for the next Riccati solve.
+    """What repeated evaluations of one problem share: scaled data, and the last gain to start the next Riccati solve.
 
     Parameters
     ----------

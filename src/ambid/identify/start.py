@@ -1,8 +1,9 @@
 """Start values found without the user's help: weak-form regression over frequency bands.
 
-Each equation of motion is multiplied by Fourier modulating functions phi_k(t) = w(t) exp(-j w_k t), with a window w that vanishes
-with three derivatives at both ends, and integrated by parts, so that no measured signal is differentiated (theory.md sec. 2.7,
-thesis eq. 3.8; Shinbrot 1957). All moments come from a few FFTs. Each band gives a candidate; the likelihood chooses.
+Each equation of motion is multiplied by Fourier modulating functions phi_k(t) = w(t) exp(-j w_k t), with a window w
+that vanishes with three derivatives at both ends, and integrated by parts, so that no measured signal is differentiated
+(theory.md sec. 2.7, thesis eq. 3.8; Shinbrot 1957). All moments come from a few FFTs. Each band gives a candidate; the
+likelihood chooses.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Spectrum = NDArray[np.complex128]
+Spectrum = NDArray[np.complexfloating]
 
-# upper band edges as fractions of the Nyquist frequency: wide bands want the errors-in-variables regression (sensor noise
-# dominates up there), narrow ones plain least squares (disturbances dominate, and few lines are left)
+# upper band edges as fractions of the Nyquist frequency: wide bands want the errors-in-variables regression (sensor
+# noise dominates up there), narrow ones plain least squares (disturbances dominate, and few lines are left)
 _BANDS = (
     (0.6, True),
     (0.3, True),
@@ -75,7 +76,7 @@ def moments(signals: Mapping[str, Array], held: tuple[str, ...], rate_hz: float)
         value = m0 * np.sinc(omega * period / (2 * np.pi)) * np.exp(-0.5j * omega * period) if role in held else m0
         # integration by parts: int phi x' = -int phi' x with phi' = (w' - jw w) e, and again for x''
         result[role] = (value, jw * m0 - m1, m2 - 2 * jw * m1 - omega**2 * m0)
-    return Moments(omega=omega, signals=result)
+    return Moments(omega=np.asarray(omega, dtype=np.float64), signals=result)
 
 
 def candidates(
@@ -143,14 +144,14 @@ def candidates(
 def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: Mapping[str, float]) -> Array:
     """Regress the first term on the others, over complex lines with real coefficients.
 
-    With noise levels given, generalised total least squares: the combination of terms that is smallest against what the noise alone
-    would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares by QR.
+    With noise levels given, generalised total least squares: the combination of terms that is smallest against what the
+    noise alone would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares by QR.
 
     Parameters
     ----------
     terms : list of (role, factor, spectrum)
-        Measured role a term is made of ("" where it is exact), factor by which it carries that role's noise, (n_lines,), and its
-        spectrum, (n_lines,).
+        Measured role a term is made of ("" where it is exact), factor by which it carries that role's noise,
+        (n_lines,), and its spectrum, (n_lines,).
     weight : ndarray, shape (n_lines,)
     noise : Mapping[str, float]
         Role -> noise standard deviation; empty: ordinary least squares.
@@ -166,7 +167,8 @@ def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: M
     norm[norm == 0] = 1.0
     a = a / norm
     if not noise:
-        return np.asarray(np.linalg.lstsq(a[:, 1:], a[:, 0], rcond=None)[0]) / norm[1:] * norm[0]
+        found = np.linalg.lstsq(a[:, 1:], a[:, 0], rcond=None)[0]
+        return np.asarray(found / norm[1:] * norm[0], dtype=np.float64)
     spread = np.full((len(terms), len(terms)), 0.0)
     for role, sd in noise.items():
         f = np.stack([t[1] * (t[0] == role) for t in terms], axis=1) * (weight * sd)[:, None] / norm
@@ -175,6 +177,7 @@ def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: M
     if not spread[0, 0] > 0:
         return np.full(len(terms) - 1, np.nan)
     # smallest generalised singular vector of a against the noise: exact columns get a tiny one
-    _, _, vt = np.linalg.svd(np.linalg.solve(np.linalg.cholesky(spread), np.linalg.qr(a, mode="r").T).T)
-    v = np.linalg.solve(np.linalg.cholesky(spread).T, vt[-1]) / norm
+    factor, short = np.linalg.cholesky(spread), np.asarray(np.linalg.qr(a, mode="r"))
+    _, _, vt = np.linalg.svd(np.linalg.solve(factor, short.T).T)
+    v = np.linalg.solve(factor.T, vt[-1]) / norm
     return -v[1:] / v[0] if v[0] != 0 else np.full(len(terms) - 1, np.nan)

@@ -1,8 +1,8 @@
 """Covariance of the estimated physical parameters, and what the data do not show.
 
-The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound; Ljung 1999,
-sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores of stretches of the
-record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
+The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound;
+Ljung 1999, sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores
+of stretches of the record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class Uncertainty:
     data_only_sd : ndarray, shape (n,), SI
         Standard deviations that the data alone would give; very large where they show nothing.
     scale : ndarray, shape (n,), SI
-        Size against which a standard deviation is judged: the value, or the natural scale of a parameter that may be zero.
+        Size against which a standard deviation is judged: the value, or the natural scale of a parameter that may be
+        zero.
     singular_values : ndarray, shape (n,)
         Of the information matrix of the physical parameters scaled by their values, largest first, as
         1 / relative standard deviation along each direction.
@@ -45,8 +46,8 @@ class Uncertainty:
     delay_sd : float or None
         Standard deviation of an estimated delay in samples.
     disagreement : ndarray, shape (n,), SI
-        How far the parameters move when the data are used differently, where that is more than chance allows; else 0. Part
-        of the robust standard deviations: a bias of this size cannot be ruled out.
+        How far the parameters move when the data are used differently, where that is more than chance allows; else 0.
+        Part of the robust standard deviations: a bias of this size cannot be ruled out.
     """
 
     names: tuple[str, ...]

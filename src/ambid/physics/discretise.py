@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.physics.models import StateSpace
+from ambid.physics.linear_model import StateSpace
 
 Array = NDArray[np.float64]
 

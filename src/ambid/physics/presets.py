@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from ambid.errors import ModelError
+from ambid.errors import ModelError, nearest
 from ambid.physics.loop import Limits, Loop, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
-from ambid.physics.models import nearest
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
 

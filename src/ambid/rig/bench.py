@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from ambid.errors import RecordError, UnitError
-from ambid.physics.models import model, nearest
+from ambid.errors import RecordError, UnitError, nearest
+from ambid.physics.models import model
 from ambid.record import Channel, GapPolicy, Record, Step, read_record
 from ambid.rig.load import role_units
 from ambid.rig.rig import Rig, RigChannel

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ambid.physics.models import LinearModel, model
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.models import model
 from ambid.record.record import Channel, Record
 from ambid.rig.load import role_units
 from ambid.rig.write import toml_text

@@ -8,9 +8,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.errors import AmbidError, ModelError, RigError, UnitError
+from ambid.errors import AmbidError, ModelError, RigError, UnitError, nearest
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import LinearModel, model, nearest
+from ambid.physics.models import model
 from ambid.physics.parameters import Parameter, ParameterSpec
 from ambid.record.calibration import Calibration, read_calibration_table
 from ambid.rig.rig import RecordSettings, Rig, RigChannel

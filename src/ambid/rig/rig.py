@@ -8,9 +8,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from ambid.errors import RigError
+from ambid.errors import RigError, nearest
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import nearest
 from ambid.physics.parameters import Parameter
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy

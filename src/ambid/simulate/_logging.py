@@ -10,8 +10,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import LinearModel
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.plant import Standing
 

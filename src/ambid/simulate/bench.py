@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import ModelError
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import LinearModel, model
+from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.presets import Preset
 from ambid.record.record import Record

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ambid.errors import ModelError
 from ambid.physics.discretise import discretise
-from ambid.physics.models import LinearModel, model
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
 Array = NDArray[np.float64]

@@ -1,9 +1,10 @@
 """Do the parameters stay the same when the data are used differently?
 
 Under the right model the estimate does not depend on how far ahead the predictor has to look. Here the same record is
-fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor gain
-that follows from the fit, and the parameters are compared: the specification test of Hausman (1978). Where they move by more
-than chance allows, the model is wrong in a way that the residuals of one step may hide, and the difference says how much.
+fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor
+gain that follows from the fit, and the parameters are compared: the specification test of Hausman (1978). Where they
+move by more than chance allows, the model is wrong in a way that the residuals of one step may hide, and the difference
+says how much.
 """
 
 from __future__ import annotations

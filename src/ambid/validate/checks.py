@@ -38,8 +38,8 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) ->
     Returns
     -------
     dict of str to Check
-        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails, the
-        robust standard deviations are to be used.
+        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one
+        fails, the robust standard deviations are to be used.
     """
     return {
         "residuals_white": residual_check(residuals_white(fit, e), "innovations against their own past"),
@@ -47,8 +47,8 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) ->
         "uncertainty_consistent": Check(
             passed=known.inflation < _INFLATION,
             values={"inflation": known.inflation},
-            detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from the "
-            f"information matrix (at most {_INFLATION:g})",
+            detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from "
+            f"the information matrix (at most {_INFLATION:g})",
         ),
         "estimates_agree": _agreement_check(moved),
     }
@@ -64,8 +64,8 @@ def _agreement_check(moved: Agreement) -> Check:
     else:
         far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
         detail = (
-            f"refits with every {every}th output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): the model "
-            "does not fit this record; excite more against the noise, work in a smaller range, or look for what is missing"
+            f"refits with every {every}th output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): "
+            "the model does not fit this record; excite more, work in a smaller range, or look for what is missing"
         )
     return Check(
         passed=moved.passed, values={"largest_shift_sd": moved.largest, "refits": float(n_refits)}, detail=detail
@@ -95,7 +95,8 @@ def residual_check(test: ResidualTest, what: str) -> Check:
             "largest_correlation": test.largest,
             "largest_lag": float(test.largest_lag),
         },
-        detail=f"{what}: {verdict} (largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})",
+        detail=f"{what}: {verdict} "
+        f"(largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})",
     )
 
 

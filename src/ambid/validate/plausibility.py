@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ambid.physics.models import LinearModel
+from ambid.physics.linear_model import LinearModel
 
 
 def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
     """List what physics forbids in an estimate.
 
-    Mass, resistance and inductance have to be positive: a coil with R > 0 and L > 0 is passive, it never gives out more energy than
-    was put in; damping may not be negative beyond its uncertainty.
+    Mass, resistance and inductance have to be positive: a coil with R > 0 and L > 0 is passive, it never gives out more
+    energy than was put in; damping may not be negative beyond its uncertainty.
 
     Parameters
     ----------

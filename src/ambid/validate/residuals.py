@@ -1,9 +1,10 @@
 """Residual tests: is anything left in the innovations that the past explains?
 
-Both tests are score tests: lagged signals are added to the weighted Jacobian as further regressors of the innovations, and the fall
-of their sum of squares is chi-squared with as many degrees of freedom if the model is right. Because the regressors compete with the
-Jacobian, the estimated numbers are accounted for, and because only the past is used, feedback does not disturb them: future inputs
-do depend on present innovations when a controller is at work (Ljung 1999, sec. 16.6).
+Both tests are score tests: lagged signals are added to the weighted Jacobian as further regressors of the innovations,
+and the fall of their sum of squares is chi-squared with as many degrees of freedom if the model is right. Because the
+regressors compete with the Jacobian, the estimated numbers are accounted for, and because only the past is used,
+feedback does not disturb them: future inputs do depend on present innovations when a controller is at work (Ljung 1999,
+sec. 16.6).
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
     problem = fit.problem
     u = problem.u[problem.skip :] / problem.scales.input
     longest = max(2, len(e) // 20)
-    lags = tuple(sorted({int(round(k)) for k in np.geomspace(1, min(longest, 400), 12)}))
+    lags = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 12)}))
     white = e @ weight_of(fit.covariance).T
     return _score_test(fit, white, u, lags)
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Check, Estimate
-from ambid.identify.greybox import Signals
 from ambid.identify.likelihood import Fit, search
+from ambid.identify.multistart import Signals
 from ambid.identify.problem import PredictorProblem
 from ambid.identify.scaling import noise_floor, scales_for
 from ambid.identify.sensitivity import innovations
@@ -92,8 +92,8 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
     rate = float(str(estimate.record["rate_hz"]))
     if abs(signals.rate_hz / rate - 1) > 1e-6:
         raise EstimationError(
-            f"the record is sampled at {signals.rate_hz:g} Hz, the estimate's predictor at {rate:g} Hz; they have to agree. "
-            "Resample the record, or identify from it"
+            f"the record is sampled at {signals.rate_hz:g} Hz, the estimate's predictor at {rate:g} Hz; they have to "
+            "agree. Resample the record, or identify from it"
         )
     delay = estimate.delay[plant.inputs[0]]
     skip = delay.samples + 2
@@ -130,9 +130,9 @@ def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
     Returns
     -------
     dict
-        ``fit``: by output one_step, simulation, rms of the innovation in SI, and k_step fits; ``checks``: residuals_white,
-        residuals_uncorrelated and innovations_consistent (sizes as at identification), each with ``passed`` and ``detail``;
-        ``passed``.
+        ``fit``: by output one_step, simulation, rms of the innovation in SI, and k_step fits; ``checks``:
+        residuals_white, residuals_uncorrelated and innovations_consistent (sizes as at identification), each with
+        ``passed`` and ``detail``; ``passed``.
 
     Raises
     ------
@@ -173,6 +173,7 @@ def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
         "innovations_consistent": Check(
             passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
             values={f"{role}_ratio": r for role, r in ratios.items()},
-            detail=f"innovations of {worst} are {ratios[worst]:.2f} times as large as at identification (within a factor {_RATIO:g})",
+            detail=f"innovations of {worst} are {ratios[worst]:.2f} times as large as at identification "
+            f"(within a factor {_RATIO:g})",
         ),
     }
