@@ -44,7 +44,7 @@ def entries_of(parameters: dict[str, float]) -> dict[str, float]:
 
 
 def identified(seed: int) -> Estimate:
-    """Simulate the rig of table 4.1 as corrected (theory page, "Printed numbers"), and identify its record."""
+    """Simulate the rig of table 4.1 as corrected (docs/theory.md sec. 6), and identify its record."""
     rig = preset("thesis")
     voltage = multisine(N_SAMPLES, RATE_HZ, band=(1.0, 2000.0), amplitude=1.0, shape="pink", seed=seed)
     clean = simulate_preset(rig, voltage, seed=seed, noise=Noise())

@@ -1,0 +1,114 @@
+"""The documentation's pieces of code run, its rig files load, its links lead somewhere, its commands exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from ambid.rig import load_rig
+from tests.examples.conftest import EXAMPLES
+
+ROOT = EXAMPLES.parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def test_python_pieces_of_the_howto_run_in_their_order(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for number, piece in enumerate(blocks(ROOT / "docs" / "howto.md", "python"), start=1):
+        exec(compile(piece, f"howto.md, piece {number}", "exec"), names)
+    assert "k_i with the mass free" in capsys.readouterr().out
+
+
+RIGS = [(page, k, text) for page in PAGES for k, text in enumerate(blocks(page, "toml"), start=1)]
+
+
+@pytest.mark.parametrize(("page", "k", "text"), RIGS, ids=[f"{page.stem}-{k}" for page, k, _ in RIGS])
+def test_rig_files_on_the_pages_load(page, k, text, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    rig = load_rig(path)
+    assert rig.parameters
+
+
+def test_the_bench_of_the_rig_page_is_stable_and_keeps_its_limits(tmp_path):
+    from ambid.signals import multisine
+    from ambid.simulate import simulate_rig
+
+    text = next(t for t in blocks(ROOT / "docs" / "rig.md", "toml") if "[loop]" in t)
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    voltage = multisine(4000, 20_000.0, amplitude=5.0, band=(5.0, 2000.0), seed=1)
+    done = simulate_rig(load_rig(tmp_path / "rig.toml"), voltage, rate_hz=20_000.0, seed=1)
+    assert done.largest_pole < 1.0
+    assert done.warnings == ()
+
+
+def slug(heading: str) -> str:
+    """Anchor of a heading, as code hosts and MyST make it."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def anchors(page: Path) -> set[str]:
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return {slug(h) for h in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target or target.startswith("api/"):  # outside, or made by the documentation's build
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name) if name else page
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert not broken
+
+
+COMMANDS = [
+    shlex.split(line, comments=True)[1:]
+    for page in PAGES
+    for piece in blocks(page, "sh")
+    for line in piece.splitlines()
+    if line.startswith("ambid ")
+]
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_commands_on_the_pages_have_known_verbs_and_options(words):
+    import typer
+
+    from ambid.cli.app import app
+
+    command = typer.main.get_command(app).commands[words[0]]
+    known = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}
+    assert {word for word in words[1:] if word.startswith("-") and not re.fullmatch(r"-?[\d.]+", word)} <= known
+
+
+def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys):
+    from ambid.cli.app import run_verb
+
+    monkeypatch.chdir(tmp_path)
+    for piece in blocks(ROOT / "README.md", "sh"):
+        for line in piece.splitlines():
+            words = shlex.split(line, comments=True)
+            if words[0] == "ambid":
+                assert run_verb(words[1:]) == 0, line
+            elif words[0] == "sed":  # the one edit that the page makes to the rig file
+                old, new = re.fullmatch(r"s/(.*?)/(.*)/", words[2]).groups()
+                rig = Path(words[3])
+                rig.write_text(re.sub(old, new, rig.read_text(encoding="utf-8"), flags=re.MULTILINE), encoding="utf-8")
+            else:
+                assert words[0] in (".", "cd"), f"unforeseen command: {line}"
+    printed = capsys.readouterr().out
+    assert re.search(r"^m    60 g .* fixed$", printed, re.MULTILINE)  # the edit took
+    assert "NOT SHOWN" not in printed
+    assert {"mine.json", "mine.png", "mine.html"} <= {p.name for p in tmp_path.iterdir()}
