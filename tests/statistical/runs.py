@@ -1,0 +1,76 @@
+"""One run of a Monte Carlo experiment, and many of them on two processes."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from unittest import mock
+
+import numpy as np
+
+from ambid.identify.greybox import greybox
+from ambid.identify.likelihood import weight_of
+from ambid.identify.predictor import assemble
+from ambid.identify.sensitivity import innovations, linearise
+from ambid.identify.uncertainty import uncertainty
+from ambid.validate.residuals import residuals_uncorrelated, residuals_white
+from tests.identify.benches import parameters, problem_of, run
+
+NAMES = ("m", "k_x", "k_i", "R", "L")
+EXCITATION_SEED = 5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What one run found, in units of the truth.
+
+    `score` (half the gradient of the squared innovations) and `information` belong to the whole vector at the truth,
+    weighted by the true innovation covariance: the score has mean zero whatever the estimator does.
+    """
+
+    estimate: np.ndarray
+    sd: np.ndarray
+    white: float
+    uncorrelated: float
+    converged: bool
+    delay_right: bool
+    score: np.ndarray
+    information: np.ndarray
+    unit: np.ndarray
+
+
+def one_run(seed: int, *, n: int, auto: bool) -> Outcome:
+    """Simulate and identify once; only the noise differs between seeds (and through the loop the voltage)."""
+    bench = run("bearing", n, 1000 + seed, delay=1.0 if auto else 0.0, excitation_seed=EXCITATION_SEED)
+    start = None if auto else bench.truth
+    wanted = parameters(bench, fixed=("c",), start=start)
+    fit = greybox(bench.model, bench.signals, wanted, delay="auto" if auto else 0, noise="levels")
+    known, e = uncertainty(fit), innovations(fit.problem, fit.vector)
+    theta = fit.problem.parameters(fit.vector)
+    truth = np.array([bench.truth[k] for k in NAMES])
+    problem, vector = problem_of(bench, estimated=NAMES)
+    # the problem's unit of output is 1.5 times the sensor noise
+    covariance = assemble(problem, vector, with_derivatives=False).innovations.S / 1.5**2
+    at = linearise(problem, vector, weight_of(covariance))
+    found = fit.problem.delay_samples(fit.vector)
+    return Outcome(
+        estimate=np.array([theta[k] for k in NAMES]) / truth,
+        sd=known.standard_deviations(robust=False) / np.abs(truth),
+        white=residuals_white(fit, e).p,
+        uncorrelated=residuals_uncorrelated(fit, e).p,
+        converged=fit.status == "converged",
+        delay_right=abs(found - bench.delay) < (4 * known.delay_sd if known.delay_sd else 1e-9),
+        score=at.J.T @ at.r,
+        information=at.J.T @ at.J,
+        unit=problem.magnitude / truth,
+    )
+
+
+def many(n_runs: int, **settings: object) -> list[Outcome]:
+    """Run on two processes, each with one thread of linear algebra: more would get into each other's way."""
+    one = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with mock.patch.dict(os.environ, one), ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(partial(one_run, **settings), range(n_runs), chunksize=5))
