@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ambid.rig import load_rig
+from ambid.units import parse_unit
 from tests.examples.conftest import EXAMPLES
 
 ROOT = EXAMPLES.parents[1]
@@ -48,6 +49,25 @@ def test_the_bench_of_the_rig_page_is_stable_and_keeps_its_limits(tmp_path):
     done = simulate_rig(load_rig(tmp_path / "rig.toml"), voltage, rate_hz=20_000.0, seed=1)
     assert done.largest_pole < 1.0
     assert done.warnings == ()
+
+
+def test_the_readme_shows_what_the_demo_prints():
+    """Numbers may differ in the last digit from machine to machine, by far less than their standard deviations."""
+    from importlib.resources import as_file
+
+    from ambid.cli.demo_record import demo_file
+    from ambid.job import identify
+
+    with as_file(demo_file("demo.csv.gz")) as record, as_file(demo_file("demo.toml")) as rig:
+        estimate = identify(record, rig)
+    rows = re.findall(
+        r"^(\w+) +(-?[\d.]+) ± ([\d.]+) (\S+) .*identified$", blocks(ROOT / "README.md", "")[1], re.MULTILINE
+    )
+    assert [row[0] for row in rows] == ["m", "k_x", "k_i", "R", "L"]
+    for name, value, sd, unit in rows:
+        found, scale = estimate.parameter(name), parse_unit(unit).scale
+        assert abs(float(value) * scale - found.value) < 0.1 * found.sd, name
+        assert float(sd) * scale == pytest.approx(found.sd, rel=0.1), name
 
 
 def slug(heading: str) -> str:
