@@ -20,7 +20,8 @@ def command() -> None:
         of = model(name)
         signals = [f"{role} [{of.units[role]}]" for role in (*of.inputs, *of.outputs)]
         count = len(of.inputs)
-        typer.echo(f"{paint(name, 'strong')}\n  {of.summary}")
+        typer.echo(paint(name, "strong"))
+        typer.echo(textwrap.fill(of.summary, 80, initial_indent="  ", subsequent_indent="  "))
         typer.echo(f"  in: {', '.join(signals[:count])}; out: {', '.join(signals[count:])}")
         rows = [
             (f"  {p.name}", f"[{p.unit}]", p.meaning + ("" if p.default is None else f" ({p.default:g} unless given)"))

@@ -21,7 +21,7 @@ Tick = Callable[[str], None]
 _PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
 _COLOURS = {"good": {"fg": "green"}, "bad": {"fg": "red", "bold": True}, "dim": {"dim": True}, "strong": {"bold": True}}
 _QUIET_S = 1.0  # a job that is done sooner shows no progress
-_EXPECTED = 40  # evaluations of a whole identification, from which the time left is judged
+_EXPECTED = 30  # evaluations of a whole identification, from which the time left is judged
 
 
 def plain_where_needed(stream: TextIO) -> None:
@@ -96,13 +96,18 @@ class _Display:
     """A line of progress, drawn by a thread of its own so that it also lives while loops are compiled."""
 
     def __init__(self, title: str) -> None:
-        self._stage, self._count, self._begin = title, 0, time.monotonic()
+        self._begin = self._stage_begin = time.monotonic()
+        self._stage, self._count, self._fit_s = title, 0, 0.0
         self._done = Event()
         self._thread = Thread(target=self._show, daemon=True)
         self._thread.start()
 
     def tick(self, stage: str) -> None:
-        self._stage, self._count = stage, self._count + 1
+        if stage != self._stage or self._count == 0:
+            now = time.monotonic()
+            self._fit_s = now - self._stage_begin if self._count else 0.0
+            self._stage, self._stage_begin, self._count = stage, now, 0
+        self._count += 1
 
     def stop(self) -> None:
         self._done.set()
@@ -112,22 +117,33 @@ class _Display:
         if self._done.wait(_QUIET_S):
             return
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, Progress, TextColumn
 
-        bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
-            console=Console(stderr=True), transient=True,
-        )  # fmt: skip
-        with bar:
-            task = bar.add_task(self._stage, total=1.0, left="")
+        shown = [
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[elapsed]:.0f} s{task.fields[left]}"),
+        ]
+        with Progress(*shown, console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(self._stage, total=None, elapsed=0.0, left="")
             while not self._done.wait(0.1):
-                part, left = self._part_and_left()
-                bar.update(task, completed=part, description=self._stage, left=left)
+                elapsed, left = time.monotonic() - self._begin, self._left_s()
+                if left is None:
+                    bar.update(task, total=None, description=self._stage, elapsed=elapsed, left="")
+                else:
+                    words = f", about {left:.0f} s left" if left >= 1 else ", nearly done"
+                    part = elapsed / (elapsed + left)
+                    bar.update(task, total=1.0, completed=part, description=self._stage, elapsed=elapsed, left=words)
 
-    def _part_and_left(self) -> tuple[float, str]:
-        """Part that is done and time left: evaluations come at an even pace, and their number is known only roughly."""
-        count, elapsed = self._count, time.monotonic() - self._begin
+    def _left_s(self) -> float | None:
+        """Time left in s, or None where nothing can be said.
+
+        Evaluations come at an even pace, their number is known roughly; the checks refit, which takes about as long.
+        """
+        count, taken = self._count, time.monotonic() - self._stage_begin
+        if self._fit_s:
+            return max(self._fit_s - taken, 0.0)
         if count < 3:
-            return 0.0, "(the first run compiles its loops)" if elapsed > 3 else ""
-        total = max(_EXPECTED, 1.25 * count)
-        return count / total, f"about {elapsed * (total / count - 1):.0f} s left"
+            return None
+        expected = max(_EXPECTED, 1.25 * count)
+        return taken / count * (2 * expected - count)

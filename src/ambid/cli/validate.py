@@ -11,7 +11,7 @@ import typer
 from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
-from ambid.errors import EstimationError
+from ambid.errors import AmbidError, EstimationError
 
 if TYPE_CHECKING:
     from ambid.identify.estimate import Estimate
@@ -79,7 +79,7 @@ def read_estimate(path: Path) -> Estimate:
     EstimationError
         If the file cannot be read, is no JSON or no estimate.
     """
-    from ambid.identify.estimate import estimate_from_json
+    from ambid.identify.estimate_file import estimate_from_json
     from ambid.record.files import file_bytes, utf8_text
 
     text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
@@ -94,16 +94,26 @@ def read_estimate(path: Path) -> Estimate:
 
 def _rig_of(estimate: Estimate, path: Path, rig: Path | None) -> Rig:
     """Load the rig that is given, or the one that the estimate remembers."""
+    import re
     from tempfile import TemporaryDirectory
 
     from ambid.rig import load_rig
+    from ambid.rig.write import toml_text
 
     if rig is not None:
         return load_rig(rig)
     text = estimate.rig.get("text")
     if not isinstance(text, str):
         raise EstimationError(f"estimate {path} does not hold its rig. Give --rig")
+    # Calibration tables are remembered relative to the folder in which identify ran, not to that of the copy.
+    text = re.sub(r'(?m)^table = "(.+)"$', lambda found: f"table = {toml_text(str(Path(found[1]).resolve()))}", text)
     with TemporaryDirectory() as folder:
         kept = Path(folder) / "rig.toml"
         kept.write_text(text, encoding="utf-8")
-        return load_rig(kept)
+        try:
+            return load_rig(kept)
+        except AmbidError as error:
+            said = str(error).replace(f"rig {kept}: ", "")
+            raise EstimationError(
+                f"estimate {path}: the rig that it remembers cannot be used: {said}. Or give --rig"
+            ) from None

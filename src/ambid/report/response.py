@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.estimate import Estimate
-from ambid.physics.models import StateSpace, model
+from ambid.physics.linear_model import StateSpace
+from ambid.physics.models import model
 
 Array = NDArray[np.float64]
 

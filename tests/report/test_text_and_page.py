@@ -1,0 +1,94 @@
+"""The table and the report say what the estimate holds, no more and no less."""
+
+import re
+from dataclasses import replace
+
+from ambid.identify.estimate import Check
+from ambid.report.page import report_html
+from ambid.report.text import check_lines, columns, estimate_text, verdict
+
+
+def line_of(text, name):
+    (line,) = [x for x in text.splitlines() if x.startswith(f"{name} ")]
+    return line
+
+
+def test_a_parameter_that_is_not_shown_is_never_called_identified(unstable):
+    e = unstable.estimate
+    parameters = tuple(replace(p, identifiable=p.name != "k_x") for p in e.parameters)
+    text = estimate_text(replace(e, parameters=parameters))
+    assert line_of(text, "k_x").endswith("NOT SHOWN")
+    assert line_of(text, "R").endswith("identified")
+
+
+def test_priors_say_how_much_came_from_the_data(unstable):
+    p = replace(unstable.estimate.parameter("R"), role="prior", data_share=0.873)
+    assert verdict(p) == "prior, 87 % data"
+    assert verdict(replace(p, identifiable=False)) == "prior, NOT SHOWN, 87 % data"
+
+
+def test_too_wide_a_table_loses_its_si_column_only(unstable):
+    wide, narrow = estimate_text(unstable.estimate, width=80), estimate_text(unstable.estimate, width=60)
+    assert "in SI" in wide
+    assert "in SI" not in narrow
+    assert line_of(narrow, "m").endswith("identified")
+
+
+def test_failed_checks_and_warnings_are_shown_once(unstable):
+    failed = Check(passed=False, detail="the coil gives energy out. Check signs " + "and wires " * 12)
+    e = replace(
+        unstable.estimate,
+        status="stalled",
+        checks={"plausible": failed},
+        warnings=("the search did not converge: treat the numbers as a first guess", failed.detail),
+    )
+    text = estimate_text(e)
+    assert "– stalled" in text.splitlines()[0]
+    assert text.count("the coil gives energy out") == 1
+    assert "warning: the search did not converge" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_colour_changes_no_letter(unstable):
+    plain = estimate_text(unstable.estimate)
+    painted = estimate_text(unstable.estimate, paint=lambda text, style: f"<{style}>{text}</>")
+    assert "<good>" in painted
+    assert re.sub(r"<\w*/?>|</>", "", painted) == plain
+
+
+def test_columns_and_checks_line_up():
+    assert columns([("a", "1"), ("bcd", "22")], right=(1,)) == ["a     1", "bcd  22"]
+    lines = check_lines({"ab": Check(passed=True, detail="fine"), "abcd": Check(passed=False, detail="wrong")})
+    assert lines == ["✓ ab    fine", "✗ abcd  wrong"]
+
+
+def test_the_report_holds_everything_and_needs_nothing_else(unstable):
+    page = report_html(unstable, made="2001-01-01")
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
+    assert "http" not in page
+    assert page.count("data:image/png;base64,") == 4
+    for p in unstable.estimate.parameters:
+        assert f"<b>{p.name}</b>" in page
+    for name in unstable.estimate.checks:
+        assert name in page
+    for words in ("ambid 0.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
+        assert words in page
+
+
+def test_the_second_record_is_shown(unstable):
+    fit = {"one_step": 0.9, "simulation": None, "innovation_rms": 1.0, "k_step": {"1": 0.9, "10": 0.8}}
+    validation = {
+        "fit": {"position": fit, "current": fit},
+        "checks": {"residuals_white": {"passed": False, "detail": "as it is", "p": 0.5}},
+        "passed": False,
+        "samples": 100,
+    }
+    record = {**unstable.estimate.record, "file": "<script>alert(1)</script>.csv"}
+    e = replace(unstable.estimate, validation=validation, record=record)
+    page, text = report_html(replace(unstable, estimate=e)), estimate_text(e)
+    assert "<script>" not in page  # what comes from files is escaped
+    assert "On the second record" in page
+    assert "✗ residuals_white" in page
+    assert "✗ residuals_white  as it is" in text
+    assert "on the second record (100 samples)" in text
+    assert "10 ahead" in text
