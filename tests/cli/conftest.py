@@ -1,6 +1,10 @@
 """A short record and its rig, from the embedded demo, and the command run in this process."""
 
+import os
 from dataclasses import dataclass
+
+# As the command does for itself; it has to stand before NumPy is first imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
