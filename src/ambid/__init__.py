@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     __version__: str
     from ambid.errors import AmbidError
-    from ambid.identify.estimate import Estimate, estimate_from_json
+    from ambid.identify.estimate import Estimate
+    from ambid.identify.estimate_file import estimate_from_json
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.record import Channel, Record, read_record, write_record
@@ -27,7 +28,7 @@ _HOMES = {
     "Record": "ambid.record",
     "Rig": "ambid.rig",
     "default_rig": "ambid.rig",
-    "estimate_from_json": "ambid.identify.estimate",
+    "estimate_from_json": "ambid.identify.estimate_file",
     "excitation": "ambid.signals",
     "load_rig": "ambid.rig",
     "model": "ambid.physics.models",
