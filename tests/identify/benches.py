@@ -9,8 +9,9 @@ import numpy as np
 
 from ambid.identify.greybox import Signals
 from ambid.identify.problem import PredictorProblem, Scales
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Loop, Noise
-from ambid.physics.models import LinearModel, model
+from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.signals import multisine

@@ -6,7 +6,8 @@ from scipy.linalg import expm, expm_frechet
 from scipy.signal import cont2discrete
 
 from ambid.physics.discretise import discretise
-from ambid.physics.models import StateSpace, model
+from ambid.physics.linear_model import StateSpace
+from ambid.physics.models import model
 from tests.identify.benches import BEARING, COIL, SPRUNG, THESIS
 from tests.identify.reference import STEP
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ambid.errors import ModelError
-from ambid.physics.models import model, model_names, nearest
+from ambid.errors import ModelError, nearest
+from ambid.physics.models import model, model_names
 from tests.identify.benches import BEARING, COIL, FALLING, SPRUNG, THESIS
 from tests.identify.reference import STEP, continuous
 

@@ -44,7 +44,9 @@ def case(name, variant, *, fraction=0.4, n=N):
 
 def rows_of(problem, vector, weight):
     """Whole Jacobian (n_used, n_outputs, size) and weighted innovations (n_used, n_outputs)."""
-    blocks = [rows.copy() for _, rows in residual_blocks(problem, vector, weight, Workspace(problem))]
+    blocks = [
+        r.reshape(-1, problem.size + 1).copy() for r in residual_blocks(problem, vector, weight, Workspace(problem))
+    ]
     rows = np.vstack(blocks).reshape(problem.n_used, problem.y.shape[1], problem.size + 1)
     return rows[:, :, :-1], rows[:, :, -1]
 

@@ -10,6 +10,7 @@ from ambid.identify.likelihood import search
 from ambid.identify.uncertainty import WEAK, inverse_information, uncertainty
 from tests.identify.benches import problem_of, run
 from tests.identify.kalman import cramer_rao_sd
+from tests.validate.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 CASES = [("bearing", AXIS, 2500), ("thesis", AXIS, 3000), ("rmit", AXIS, 2500), ("coil", ("R", "L"), 2000),
@@ -143,6 +144,15 @@ def test_an_unseen_column_has_a_huge_variance_and_not_a_wrong_one():
     assert found[1, 1] > 1e100
     kept = np.linalg.inv(a[:, ::2].T @ a[:, ::2])
     np.testing.assert_allclose(found[::2, ::2], kept, rtol=1e-10)
+
+
+def test_standard_deviations_are_numbers_even_of_a_hopeless_fit():
+    problem, vector = problem_of(run("thesis", 4000, 33), estimated=AXIS)
+    known = uncertainty(search(replace(problem, model=WithoutMotionalVoltage()), vector))
+    for robust in (False, True):
+        assert np.all(np.isfinite(known.standard_deviations(robust=robust)))
+        assert np.all(np.diag(known.covariance(robust=robust)) > 0)
+    assert known.inflation > 0
 
 
 def test_robust_covariance_is_the_larger_and_has_its_correlations():
