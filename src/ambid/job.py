@@ -64,7 +64,9 @@ def identify(
     Raises
     ------
     AmbidError
-        If record or rig break a rule, or nothing can be identified.
+        If record or rig break a rule.
+    EstimationError
+        If nothing can be identified from the record.
     """
     from ambid.identify.greybox import greybox
     from ambid.identify.uncertainty import uncertainty
@@ -116,6 +118,11 @@ def judged(
     -------
     Estimate
         Without timings.
+
+    Raises
+    ------
+    EstimationError
+        If the fit has no predictor.
     """
     from ambid.identify.result import estimate_of
     from ambid.identify.sensitivity import innovations

@@ -93,6 +93,9 @@ def _function_complaints(node: Function, name: str, *, method: bool = False) -> 
     if not text:
         yield f"{where} has no docstring"
         return
+    if name == "command":  # a verb of the command line: its docstring is its help, and each option explains itself
+        yield from _verb_complaints(node, where)
+        return
     doc = Docstring.read(text)
     returned = ast.unparse(node.returns) if node.returns else "None"
     if _is_property(node) or (method and _one_sentence(node, doc)):
@@ -105,6 +108,14 @@ def _function_complaints(node: Function, name: str, *, method: bool = False) -> 
         if returned not in ("None", "NoReturn", "Never"):
             yield from _return_complaints(where, returned, doc)
     yield from _raise_complaints(node, where, doc)
+
+
+def _verb_complaints(node: Function, where: str) -> Iterator[str]:
+    for argument in _arguments(node):
+        annotation = ast.unparse(argument.annotation) if argument.annotation else ""
+        shared = re.fullmatch(r"[A-Z]\w+( \| None)?", annotation)  # an option that several verbs share, explained once
+        if "help=" not in annotation and not shared:
+            yield f"{where}: option {argument.arg!r} has no help text"
 
 
 def _one_sentence(node: Function, doc: Docstring) -> bool:

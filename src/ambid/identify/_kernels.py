@@ -15,56 +15,73 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def state_scan(F: Array, x: Array) -> None:
-    """Turn a drive into states in place.
+def state_scan(M: Array, w: Array, x: Array) -> None:
+    """Run the predictor over one block.
 
-    `x` (block + 1, n) holds the first state in x[0] and the drive of sample k in x[k + 1]; on return x[k + 1] = F x[k]
-    + drive. Three states, the one-axis plant, are spelled out: they stay in registers.
+    `w` (block, n + n_z) holds z in its last columns and gets the state before each sample in its first n; `x` (n,) moves along
+    in place. M = [F G] is (n, n + n_z). Three states, the one-axis plant, are spelled out: they stay in registers, and what z
+    drives is summed while the state before is still on its way.
     """
-    n = x.shape[1]
+    n, n_l = M.shape
     if n == 3:
-        f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]
-        f10, f11, f12 = F[1, 0], F[1, 1], F[1, 2]
-        f20, f21, f22 = F[2, 0], F[2, 1], F[2, 2]
-        a, b, c = x[0, 0], x[0, 1], x[0, 2]
-        for k in range(1, x.shape[0]):
-            p = (x[k, 0] + f00 * a) + (f01 * b + f02 * c)
-            q = (x[k, 1] + f10 * a) + (f11 * b + f12 * c)
-            r = (x[k, 2] + f20 * a) + (f21 * b + f22 * c)
-            x[k, 0], x[k, 1], x[k, 2] = p, q, r
+        f00, f01, f02 = M[0, 0], M[0, 1], M[0, 2]
+        f10, f11, f12 = M[1, 0], M[1, 1], M[1, 2]
+        f20, f21, f22 = M[2, 0], M[2, 1], M[2, 2]
+        a, b, c = x[0], x[1], x[2]
+        for k in range(w.shape[0]):
+            d, e, f = 0.0, 0.0, 0.0
+            for j in range(3, n_l):
+                v = w[k, j]
+                d += M[0, j] * v
+                e += M[1, j] * v
+                f += M[2, j] * v
+            w[k, 0], w[k, 1], w[k, 2] = a, b, c
+            p = (d + f00 * a) + (f01 * b + f02 * c)
+            q = (e + f10 * a) + (f11 * b + f12 * c)
+            r = (f + f20 * a) + (f21 * b + f22 * c)
             a, b, c = p, q, r
+        x[0], x[1], x[2] = a, b, c
         return
-    for k in range(1, x.shape[0]):
+    new = np.empty(n)
+    for k in range(w.shape[0]):
         for i in range(n):
-            acc = x[k, i]
-            for j in range(n):
-                acc += F[i, j] * x[k - 1, j]
-            x[k, i] = acc
+            w[k, i] = x[i]
+        for i in range(n):
+            acc = 0.0
+            for j in range(n_l):
+                acc += M[i, j] * w[k, j]
+            new[i] = acc
+        for i in range(n):
+            x[i] = new[i]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def sensitivity_scan(F: Array, s: Array) -> None:
-    """Turn forcings into sensitivities in place, many at once.
+def sensitivity_scan(F: Array, w: Array, y: Array, s: Array) -> None:
+    """Turn forcings into sensitivities in place, many at once, and put the residual beside them.
 
-    `s` (block + 1, n, p) holds the sensitivities at the first sample in s[0] and the forcing of sample k in s[k + 1];
-    on return s[k + 1] = F s[k] + forcing. Estimated numbers run along the last axis, so that vector instructions serve
-    them.
+    `s` (block + 1, n, p + 1) holds the sensitivities at the first sample in s[0, :, :p] and the forcing of sample k in
+    s[k + 1, :, :p]; on return s[k + 1] = F s[k] + forcing, and s[k, o, p] = y[k, o] + w[k, o] for every output o. Estimated
+    numbers run along the last axis, so that vector instructions serve them.
     """
-    n, p = s.shape[1], s.shape[2]
+    n, p, n_y = s.shape[1], s.shape[2] - 1, y.shape[1]
     if n == 3:
         f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]
         f10, f11, f12 = F[1, 0], F[1, 1], F[1, 2]
         f20, f21, f22 = F[2, 0], F[2, 1], F[2, 2]
-        for k in range(1, s.shape[0]):
+        for k in range(y.shape[0]):
             for q in range(p):
-                a, b, c = s[k - 1, 0, q], s[k - 1, 1, q], s[k - 1, 2, q]
-                s[k, 0, q] += f00 * a + f01 * b + f02 * c
-                s[k, 1, q] += f10 * a + f11 * b + f12 * c
-                s[k, 2, q] += f20 * a + f21 * b + f22 * c
+                a, b, c = s[k, 0, q], s[k, 1, q], s[k, 2, q]
+                s[k + 1, 0, q] += f00 * a + f01 * b + f02 * c
+                s[k + 1, 1, q] += f10 * a + f11 * b + f12 * c
+                s[k + 1, 2, q] += f20 * a + f21 * b + f22 * c
+            for o in range(n_y):
+                s[k, o, p] = y[k, o] + w[k, o]
         return
-    for k in range(1, s.shape[0]):
+    for k in range(y.shape[0]):
         for i in range(n):
             for j in range(n):
                 f = F[i, j]
                 for q in range(p):
-                    s[k, i, q] += f * s[k - 1, j, q]
+                    s[k + 1, i, q] += f * s[k, j, q]
+        for o in range(n_y):
+            s[k, o, p] = y[k, o] + w[k, o]

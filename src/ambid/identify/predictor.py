@@ -187,7 +187,11 @@ def _stepped(
                 out[:, at + 1] += power @ late
         return out.reshape(n, -1)
 
-    powers = [np.eye(n)]
+    one = np.eye(n)
+    if problem.stride == 1:
+        first = Step(A=plant.A, inputs=spread(plant.B, plant.B_late, [one]), E=plant.E)
+        return first, [Step(A=d.A, inputs=spread(d.B, d.B_late, [one]), E=d.E) for d in slopes]
+    powers = [one]
     for _ in range(problem.stride):
         powers.insert(0, plant.A @ powers[0])
     whole, steps = powers[0], powers[1:]
@@ -198,8 +202,6 @@ def _stepped(
         for power in reversed(steps):
             slopes_of_powers.insert(0, d.A @ power + plant.A @ slopes_of_powers[0])
         d_whole, d_steps = slopes_of_powers[0], slopes_of_powers[1:]
-        inputs = spread(d.B, d.B_late, steps)
-        if problem.stride > 1:
-            inputs = inputs + spread(plant.B, plant.B_late, d_steps)
+        inputs = spread(d.B, d.B_late, steps) + spread(plant.B, plant.B_late, d_steps)
         result.append(Step(A=d_whole, inputs=inputs, E=sums @ d.E + np.sum(d_steps, axis=0) @ plant.E))
     return Step(A=whole, inputs=spread(plant.B, plant.B_late, steps), E=sums @ plant.E), result

@@ -160,9 +160,27 @@ class PredictorProblem:
         return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
 
     def lag_at(self, vector: Array) -> float:
-        """Return the delay in samples beyond `delay` at `vector`, shape (size,)."""
+        """Return the delay in samples beyond `delay` at a vector.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+
+        Returns
+        -------
+        float
+        """
         return float(vector[self.slices["fraction"]][0]) if self.fractional else self.lag
 
     def delay_samples(self, vector: Array) -> float:
-        """Return the whole delay in samples at `vector`, shape (size,)."""
+        """Return the whole delay in samples at a vector.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+
+        Returns
+        -------
+        float
+        """
         return self.delay + self.lag_at(vector)

@@ -42,6 +42,39 @@ class Workspace:
         lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
         self.z = np.hstack([*lagged, self.y, np.ones((at.size, 1))])
         self.gain: Array | None = None
+        self._weight, self._weighted = np.zeros((0, 0)), self.y
+        self._buffers: tuple[Array, ...] = ()
+
+    def buffers(self, *shapes: tuple[int, ...]) -> tuple[Array, ...]:
+        """Return scratch arrays, the same ones as long as the shapes stay the same: fresh pages cost more than sums.
+
+        Parameters
+        ----------
+        *shapes : tuple of int
+
+        Returns
+        -------
+        tuple of ndarray, one of each shape
+            Not initialised.
+        """
+        if tuple(b.shape for b in self._buffers) != shapes:
+            self._buffers = tuple(np.empty(shape) for shape in shapes)
+        return self._buffers
+
+    def weighted(self, weight: Array) -> Array:
+        """Return the outputs times a weight, kept while the weight stays the same.
+
+        Parameters
+        ----------
+        weight : ndarray, shape (n_outputs, n_outputs)
+
+        Returns
+        -------
+        ndarray, shape (n_used, n_outputs)
+        """
+        if not np.array_equal(weight, self._weight):
+            self._weight, self._weighted = weight.copy(), self.y @ weight.T
+        return self._weighted
 
 
 def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> Array | None:
@@ -84,11 +117,10 @@ def run(M: Array, z: Array, x0: Array) -> Array:
     from ambid.identify._kernels import state_scan
 
     n = x0.size
-    x = np.empty((z.shape[0] + 1, n))
-    x[0] = x0
-    np.matmul(z, M[:, n:].T, out=x[1:])
-    state_scan(np.ascontiguousarray(M[:, :n]), x)
-    return x
+    w, x = np.empty((z.shape[0], n + z.shape[1])), x0.copy()
+    w[:, n:] = z
+    state_scan(M, w, x)
+    return np.vstack([w[:, :n], x])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -130,15 +162,17 @@ def linearise(
     work = work or Workspace(problem)
     p, moment = problem.size, np.zeros_like(weight)
     blocks = []
-    for e, rows in residual_blocks(problem, vector, weight, work):
+    for rows in residual_blocks(problem, vector, weight, work):
+        e = rows[:, :, p]
         moment += e.T @ e
-        blocks.append(reduce_rows(rows))
+        blocks.append(reduce_rows(rows.reshape(-1, p + 1)))
     if not blocks or not np.all(np.isfinite(moment)):
         return None
+    back = np.linalg.inv(weight)
     reduced = reduce_rows(np.vstack(blocks), last=True)
     full = np.zeros((p + 1, p + 1))
     full[: reduced.shape[0]] = reduced
-    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=moment / problem.n_used)
+    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=back @ moment @ back.T / problem.n_used)
 
 
 def reduce_rows(rows: Array, *, last: bool = False) -> Array:
@@ -177,10 +211,8 @@ def reduce_blocks(blocks: Iterable[Array]) -> Array:
     return reduce_rows(np.vstack([reduce_rows(b) for b in blocks]), last=True)
 
 
-def residual_blocks(
-    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace
-) -> Iterator[tuple[Array, Array]]:
-    """Yield innovations and rows [W de/dq, W e] block after block, so that memory does not grow with the record.
+def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, work: Workspace) -> Iterator[Array]:
+    """Yield rows [W de/dq, W e] block after block, so that memory does not grow with the record.
 
     Parameters
     ----------
@@ -191,41 +223,41 @@ def residual_blocks(
 
     Yields
     ------
-    e : ndarray, shape (block, n_outputs)
-        Innovations, scaled, unweighted.
-    rows : ndarray, shape (block * n_outputs, size + 1)
-        Time runs slowest; overwritten by the next block. Nothing is yielded where there is no predictor at `vector`.
+    ndarray, shape (block, n_outputs, size + 1)
+        A view, overwritten by the next block. Nothing is yielded where there is no predictor at `vector`.
     """
-    from ambid.identify._kernels import sensitivity_scan
+    from ambid.identify._kernels import sensitivity_scan, state_scan
 
     predictor = assemble(problem, vector, near=work.gain)
     if predictor is None:
         return
     work.gain = predictor.gain
     n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
-    # a state basis in which the weighted outputs are the first states: sensitivities are then read off, not multiplied;
-    # they are carried with the sign of e = y - C x
+    # a state basis whose first states are the weighted predicted outputs with their sign turned: weighted innovations are
+    # then W y plus a state, and sensitivities of innovations are read off, not multiplied
     whitened = weight @ predictor.C
     basis = -np.vstack([whitened, null_space(whitened)])
-    F = basis @ predictor.M[:, :n] @ np.linalg.inv(basis)
-    forcing = np.zeros((predictor.M.shape[1], n, p + 1))
-    forcing[:, :, :p] = np.tensordot(basis, predictor.dM, axes=1).swapaxes(0, 1)
-    flat = forcing.reshape(-1, n * (p + 1))
-    s = np.zeros((min(_BLOCK, n_used) + 1, n, p + 1))
+    turned = np.linalg.inv(basis)
+    M = basis @ predictor.M
+    M[:, :n] = M[:, :n] @ turned
+    forcing = np.zeros((M.shape[1], n, p + 1))
+    derivative = np.tensordot(basis, predictor.dM, axes=1)  # (n, n + n_z, p)
+    forcing[:n, :, :p] = np.tensordot(turned, derivative[:, :n], axes=(0, 1))
+    forcing[n:, :, :p] = derivative[:, n:].swapaxes(0, 1)
+    flat, outputs = forcing.reshape(-1, n * (p + 1)), work.weighted(weight)
+    F, length = np.ascontiguousarray(M[:, :n]), min(_BLOCK, n_used)
+    s, w = work.buffers((length + 1, n, p + 1), (length, M.shape[1]))
+    s[0], x = 0.0, basis @ predictor.x0
     s[0, :, problem.slices["initial"]] = basis
-    x0, w = predictor.x0, np.empty((s.shape[0] - 1, n + work.z.shape[1]))
-    rows = np.empty((s.shape[0] - 1, n_y, p + 1))
     for a in range(0, n_used, _BLOCK):
-        b = min(a + _BLOCK, n_used)
-        x, block, part = run(predictor.M, work.z[a:b], x0), s[: b - a + 1], w[: b - a]
-        e = work.y[a:b] - x[:-1] @ predictor.C.T
-        part[:, :n], part[:, n:], x0 = x[:-1], work.z[a:b], x[-1]
-        np.matmul(part, flat, out=block[1:].reshape(b - a, -1))
-        sensitivity_scan(F, block)
-        rows[: b - a] = block[:-1, :n_y]
-        rows[: b - a, :, p] = e @ weight.T
-        yield e, rows[: b - a].reshape(-1, p + 1)
-        s[0] = block[-1]
+        m = min(_BLOCK, n_used - a)
+        part = w[:m]
+        part[:, n:] = work.z[a : a + m]
+        state_scan(M, part, x)
+        np.matmul(part, flat, out=s[1 : m + 1].reshape(m, -1))
+        sensitivity_scan(F, part, outputs[a : a + m], s[: m + 1])
+        yield s[:m, :n_y]
+        s[0] = s[m]
 
 
 def null_space(a: Array) -> Array:

@@ -192,16 +192,17 @@ def inverse_information(J: Array) -> Array:
 def _score_spread(fit: Fit) -> Array:
     """Sum over stretches of the record of the outer product of their scores: the middle of the sandwich."""
     problem, work = fit.problem, Workspace(fit.problem)
-    p, n_y, n_used = problem.size, work.y.shape[1], problem.n_used
+    p, n_used = problem.size, problem.n_used
     length = max(1, n_used // _BATCHES)
     scores = np.zeros((-(-n_used // length), p))
     first = 0
-    for e, rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
-        stretch = np.arange(first, first + e.shape[0]) // length
+    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
+        m = rows.shape[0]
+        stretch = np.arange(first, first + m) // length
         for b in range(stretch[0], stretch[-1] + 1):
-            part = rows[np.repeat(stretch == b, n_y)]
+            part = rows[stretch == b].reshape(-1, p + 1)
             scores[b] += part[:, :p].T @ part[:, p]
-        first += e.shape[0]
+        first += m
     scores -= scores.mean(axis=0)
     count = scores.shape[0]
     return np.asarray(scores.T @ scores * (count / max(count - 1, 1)))

@@ -12,6 +12,8 @@ from ambid.identify.hints import experiment_hint
 from ambid.identify.likelihood import Fit
 from ambid.identify.uncertainty import Uncertainty
 from ambid.record import Record
+from ambid.signals.dropouts import find_dropouts
+from ambid.signals.outliers import find_outliers
 from ambid.signals.saturation import find_saturation
 from ambid.validate.agreement import STRIDES, Agreement
 from ambid.validate.plausibility import implausible
@@ -20,6 +22,7 @@ from ambid.validate.residuals import ResidualTest, residuals_uncorrelated, resid
 Array = NDArray[np.float64]
 
 _INFLATION = 2.0  # robust over information standard deviation from which the model, not the noise, sets the error
+_ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
 _SATURATED = 0.005  # part of the samples at a limit that a check lets pass
 
 
@@ -115,7 +118,7 @@ def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: boo
     Returns
     -------
     dict of str to Check
-        ``identifiable``, ``plausible``, ``within_limits``.
+        ``identifiable``, ``plausible``, ``within_limits``, ``signals_sound``.
     """
     theta = fit.problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
@@ -124,6 +127,7 @@ def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: boo
         "identifiable": _identifiable(fit, known, theta, robust=robust),
         "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical and the coil is passive"),
         "within_limits": _within_limits(record),
+        "signals_sound": _signals_sound(record, fit.problem.model.outputs),
     }
 
 
@@ -137,6 +141,12 @@ def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, r
     values = {"condition": float(known.singular_values[0] / known.singular_values[-1])}
     if not unseen:
         return Check(passed=True, values=values, detail="the record shows every estimated parameter")
+    if np.any(known.disagreement):
+        hint = (
+            "Not noise but disagreement of the refits makes it so: repeat the record away from limits, with quieter feedback "
+            "and more excitation"
+        )
+        return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
     hint = experiment_hint(known, theta, lowest_power_hz(fit.problem.u, fit.problem.rate_hz), robust=robust)
     return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
 
@@ -162,9 +172,23 @@ def lowest_power_hz(u: Array, rate_hz: float) -> float:
 def _within_limits(record: Record) -> Check:
     found = {c.name: find_saturation(record, c.name) for c in record.channels}
     bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
-    detail = "; ".join(f"{name}: {s}" for name, s in bad.items())
+    detail = "; ".join(str(s) for s in bad.values())
     return Check(
         passed=not bad,
         values={f"{name}_fraction": s.fraction for name, s in found.items()},
         detail=f"{detail}. Lower the excitation, or cut those parts out" if bad else "no channel dwells at its limits",
+    )
+
+
+def _signals_sound(record: Record, outputs: tuple[str, ...]) -> Check:
+    """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
+    found = [(role, find(record, role)) for role in outputs for find in (find_outliers, find_dropouts)]
+    some = [f"{role}: {f}" for role, f in found if f.count]
+    few = max(f.count for _, f in found) <= _ERRONEOUS * record.n_samples
+    return Check(
+        passed=few,
+        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in found},
+        detail=f"{'; '.join(some)}. They are used as they are; replace them (ambid.signals.replace_samples) or cut them out"
+        if some
+        else "no outliers and no drop-outs in the measured outputs",
     )

@@ -64,6 +64,11 @@ def prediction_error(fit: Fit, steps: int) -> Array:
     -------
     ndarray, shape (n_used - steps + 1, n_outputs)
         Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
+
+    Raises
+    ------
+    ValueError
+        If the fit has failed.
     """
     predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
     if e is None:

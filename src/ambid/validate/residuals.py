@@ -101,11 +101,11 @@ def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -
     lagged = _lagged(signals, lags)
     lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
     blocks, first, work = list[Array](), 0, Workspace(problem)
-    for e, rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
-        m = e.shape[0]
+    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
+        m = rows.shape[0]
         wide = np.zeros((m, n_y, p + n_y * per_output + 1))
-        wide[:, :, :p] = rows[:, :p].reshape(m, n_y, p)
-        wide[:, :, -1] = rows[:, p].reshape(m, n_y)
+        wide[:, :, :p] = rows[:, :, :p]
+        wide[:, :, -1] = rows[:, :, p]
         for o in range(n_y):
             wide[:, o, p + o * per_output : p + (o + 1) * per_output] = lagged[first : first + m]
         blocks.append(wide.reshape(m * n_y, -1))
