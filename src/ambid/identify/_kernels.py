@@ -18,9 +18,9 @@ Array = NDArray[np.float64]
 def state_scan(M: Array, w: Array, x: Array) -> None:
     """Run the predictor over one block.
 
-    `w` (block, n + n_z) holds z in its last columns and gets the state before each sample in its first n; `x` (n,) moves along
-    in place. M = [F G] is (n, n + n_z). Three states, the one-axis plant, are spelled out: they stay in registers, and what z
-    drives is summed while the state before is still on its way.
+    `w` (block, n + n_z) holds z in its last columns and gets the state before each sample in its first n; `x` (n,)
+    moves along in place. M = [F G] is (n, n + n_z). Three states, the one-axis plant, are spelled out: they stay in
+    registers, and what z drives is summed while the state before is still on its way.
     """
     n, n_l = M.shape
     if n == 3:
@@ -60,8 +60,8 @@ def sensitivity_scan(F: Array, w: Array, y: Array, s: Array) -> None:
     """Turn forcings into sensitivities in place, many at once, and put the residual beside them.
 
     `s` (block + 1, n, p + 1) holds the sensitivities at the first sample in s[0, :, :p] and the forcing of sample k in
-    s[k + 1, :, :p]; on return s[k + 1] = F s[k] + forcing, and s[k, o, p] = y[k, o] + w[k, o] for every output o. Estimated
-    numbers run along the last axis, so that vector instructions serve them.
+    s[k + 1, :, :p]; on return s[k + 1] = F s[k] + forcing, and s[k, o, p] = y[k, o] + w[k, o] for every output o.
+    Estimated numbers run along the last axis, so that vector instructions serve them.
     """
     n, p, n_y = s.shape[1], s.shape[2] - 1, y.shape[1]
     if n == 3:

@@ -18,7 +18,9 @@ _ADVICE = {
 }
 
 
-def experiment_hint(u: Uncertainty, values: Mapping[str, float], lowest_hz: float, *, robust: bool) -> str | None:
+def experiment_hint(
+    u: Uncertainty, values: Mapping[str, float], band_hz: tuple[float, float, float], *, robust: bool
+) -> str | None:
     """Say which experiment would show the weakest direction.
 
     Parameters
@@ -26,8 +28,9 @@ def experiment_hint(u: Uncertainty, values: Mapping[str, float], lowest_hz: floa
     u : Uncertainty
     values : Mapping[str, float]
         All parameters, SI.
-    lowest_hz : float
-        Lowest frequency at which the input now has power.
+    band_hz : (float, float, float)
+        Lowest frequency that fits into the record, lowest at which the input now has power, and the highest that the
+        sampling rate allows.
     robust : bool
         Which standard deviations count.
 
@@ -47,7 +50,7 @@ def experiment_hint(u: Uncertainty, values: Mapping[str, float], lowest_hz: floa
             "m, k_x and k_i can only be told up to a common factor: the motional voltage k_i x' is lost in the noise. "
             "Weigh the rotor and fix m (or give a prior), or excite faster and larger motion"
         )
-    frequencies = _frequencies(values, lowest_hz)
+    frequencies = _frequencies(values, band_hz)
     advice = [_ADVICE[name].format(**frequencies) for name in unseen if name in _ADVICE]
     worst = float(max(u.relative_sd(robust=robust)))
     factor = worst / WEAK
@@ -59,17 +62,13 @@ def experiment_hint(u: Uncertainty, values: Mapping[str, float], lowest_hz: floa
     return "; ".join([*advice, *([more] if more else [])])
 
 
-def _frequencies(values: Mapping[str, float], lowest_hz: float) -> dict[str, float]:
-    """Frequencies at which the parameters show, Hz, and the coil's settling time, s."""
-    v = {k: abs(x) for k, x in values.items()}
-    low = np.sqrt(v.get("k_x", 0.0) / v["m"]) / (2 * np.pi) if v.get("m") else lowest_hz
-    coupled = (
-        np.sqrt(v["k_i"] ** 2 / (v["m"] * v["L"])) / (2 * np.pi) if v.get("m") and v.get("L") and "k_i" in v else low
-    )
-    corner = v["R"] / v["L"] / (2 * np.pi) if v.get("L") and "R" in v else low
-    return {
-        "low": float(min(low, lowest_hz) / 3 if lowest_hz > 0 else low / 3),
-        "mid": float(max(coupled, low)),
-        "corner": float(max(corner, 1e-9)),
-        "settle": float(5 / (2 * np.pi * max(corner, 1e-9))),
-    }
+def _frequencies(values: Mapping[str, float], band_hz: tuple[float, float, float]) -> dict[str, float]:
+    """Frequencies at which the parameters show, Hz, within what a record can hold, and the coil's settling time, s."""
+    first, lowest, last = band_hz
+    v = {k: max(abs(x), 1e-300) for k, x in values.items()}
+    stiff = np.sqrt(v["k_x"] / v["m"]) / (2 * np.pi) if {"k_x", "m"} <= v.keys() else lowest
+    coupled = np.sqrt(v["k_i"] ** 2 / (v["m"] * v["L"])) / (2 * np.pi) if {"k_i", "m", "L"} <= v.keys() else stiff
+    corner = v["R"] / v["L"] / (2 * np.pi) if {"R", "L"} <= v.keys() else stiff
+    held = {"low": min(stiff, lowest) / 3, "mid": max(coupled, stiff), "corner": corner}
+    within = {name: float(np.clip(f, first, last)) for name, f in held.items()}
+    return {**within, "settle": 5 / (2 * np.pi * within["corner"])}

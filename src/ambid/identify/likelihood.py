@@ -244,6 +244,8 @@ def search(
     count = 1
     for _ in range(rounds):
         target.weight = weight_of(covariance)
+        if not np.all(np.isfinite(target.residual(vector))):  # innovations exist, their sensitivities overflow
+            return _failed(problem, start)
         # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
         small = 4e-3 / (problem.n_used * problem.y.shape[1])
         found = least_squares(

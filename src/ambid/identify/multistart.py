@@ -143,9 +143,9 @@ def _scored(model: LinearModel, signals: Signals, parameters: Sequence[Parameter
     coarse: list[tuple[float, PredictorProblem, dict[str, float]]] = []
     work: Workspace | None = None
     floor, spread = noise_floor(centred.y), np.std(centred.u, axis=0)
-    for d, values in _values(model, centred, parameters, delays, floor):
+    for d, values, sizes in _values(model, centred, parameters, delays, floor):
         scales = scales_for(model, values, spread, floor, signals.rate_hz)
-        problem = _problem(model, centred, parameters, values, scales, d, int(max(delays)) + 2)
+        problem = _problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
         part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
         # the scaled data are the same for all candidates of a delay
         if work is None or coarse[-1][1].delay != problem.delay:
@@ -165,23 +165,22 @@ def _scored(model: LinearModel, signals: Signals, parameters: Sequence[Parameter
 
 def _values(
     model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float], floor: Array
-) -> Iterator[tuple[float, dict[str, float]]]:
-    """Yield delay and start values: from the data, and with the values that were given."""
+) -> Iterator[tuple[float, dict[str, float], dict[str, float]]]:
+    """Yield delay, start values and sizes: from the data, and with the values that were given (which may be zero)."""
     given = {p.name: p.value for p in parameters if p.value is not None}
-    anchored = {p.name: p.value for p in parameters if p.value is not None and p.role != "free"}
+    fixed = {p.name: p.value for p in parameters if p.value is not None and p.role == "fixed"}
     columns = dict(zip((*model.inputs, *model.outputs), np.hstack([signals.u, signals.y]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
     noise = dict(zip(model.outputs, floor.tolist(), strict=True))
     for d in delays:
-        from_data = list(weak_form.candidates(model.name, moments, noise, d, signals.rate_hz, anchored))
-        if given != anchored:
-            from_data += [{**values, **given} for values in (from_data or [given])[:1]]
-        for values in from_data:
+        from_data = list(weak_form.candidates(model.name, moments, noise, d, signals.rate_hz, fixed))
+        with_given = [{**values, **given} for values in (from_data or [given])[:3]] if given != fixed else []
+        for values, sizes in zip([*from_data, *with_given], [*from_data, *(from_data or [given])[:3]], strict=False):
             possible = (
                 all(np.isfinite(v) for v in values.values()) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0
             )
             if possible and len(values) == len(model.parameters):
-                yield d, values
+                yield d, values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
 
 
 def _busiest(u: Array, length: int) -> slice:
@@ -198,14 +197,14 @@ def _problem(
     model: LinearModel,
     signals: Signals,
     parameters: Sequence[Parameter],
-    values: Mapping[str, float],
+    sizes: Mapping[str, float],
     scales: Scales,
     delay: float,
     skip: int,
 ) -> PredictorProblem:
     """Set up the problem of one candidate."""
     estimated = [p for p in parameters if p.role != "fixed"]
-    reference = model.references(values)
+    reference = model.references(sizes)
     return PredictorProblem(
         model=model,
         rate_hz=signals.rate_hz,
@@ -213,7 +212,7 @@ def _problem(
         y=signals.y,
         estimated=tuple(p.name for p in estimated),
         known={p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None},
-        magnitude=np.array([max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0), 1e-300) for p in estimated]),
+        magnitude=np.array([max(sizes[p.name], 1e-3 * reference.get(p.name, 0.0)) or 1.0 for p in estimated]),
         prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in estimated]),
         prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in estimated]),
         scales=scales,

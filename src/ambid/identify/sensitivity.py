@@ -233,8 +233,8 @@ def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, wor
         return
     work.gain = predictor.gain
     n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
-    # a state basis whose first states are the weighted predicted outputs with their sign turned: weighted innovations are
-    # then W y plus a state, and sensitivities of innovations are read off, not multiplied
+    # a state basis whose first states are the weighted predicted outputs with their sign turned: weighted innovations
+    # are then W y plus a state, and sensitivities of innovations are read off, not multiplied
     whitened = weight @ predictor.C
     basis = -np.vstack([whitened, null_space(whitened)])
     turned = np.linalg.inv(basis)

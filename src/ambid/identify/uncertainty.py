@@ -63,7 +63,7 @@ class Uncertainty:
     @property
     def inflation(self) -> float:
         """Largest ratio of robust to information standard deviation."""
-        return float(np.max(np.sqrt(np.diag(self.robust) / np.diag(self.information))))
+        return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.information), 1e-300))))
 
     def covariance(self, *, robust: bool) -> Array:
         """Return the covariance that goes with `standard_deviations`.
@@ -81,7 +81,7 @@ class Uncertainty:
         if not robust:
             return self.information
         plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
-        larger = np.maximum(1.0, plain / own)
+        larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
         return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
 
     def standard_deviations(self, *, robust: bool) -> Array:
@@ -158,7 +158,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=(whole @ _score_spread(fit) @ whole)[:n, :n] * unit,
+        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
@@ -182,15 +182,20 @@ def inverse_information(J: Array) -> Array:
     ndarray, shape (p, p)
     """
     norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1e-150
+    norm = np.maximum(norm, 1e-100)
     _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
     s = np.maximum(s, 1e-15 * s[0])
     half = vt.T / s / norm[:, None]
     return np.asarray(half @ half.T)
 
 
-def _score_spread(fit: Fit) -> Array:
-    """Sum over stretches of the record of the outer product of their scores: the middle of the sandwich."""
+def _gram(a: Array) -> Array:
+    """Positive semidefinite product a a^T."""
+    return np.asarray(a @ a.T)
+
+
+def _scores(fit: Fit) -> Array:
+    """Scores of the stretches of the record, (n_stretches, size); their scatter is the middle of the sandwich."""
     problem, work = fit.problem, Workspace(fit.problem)
     p, n_used = problem.size, problem.n_used
     length = max(1, n_used // _BATCHES)
@@ -205,4 +210,4 @@ def _score_spread(fit: Fit) -> Array:
         first += m
     scores -= scores.mean(axis=0)
     count = scores.shape[0]
-    return np.asarray(scores.T @ scores * (count / max(count - 1, 1)))
+    return np.asarray(scores * np.sqrt(count / max(count - 1, 1)))

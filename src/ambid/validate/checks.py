@@ -59,15 +59,15 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) ->
 
 def _agreement_check(moved: Agreement) -> Check:
     n_refits = moved.shift.shape[0]
-    every = " and ".join(str(s) for s in STRIDES[:n_refits])
+    every = " and ".join(f"{s}{'nd' if s == 2 else 'th'}" for s in STRIDES[:n_refits])
     if not n_refits:
         detail = "the record could not be fitted with fewer outputs; nothing is known of agreement"
     elif moved.passed:
-        detail = f"refits with every {every}th output give the same parameters (largest shift {moved.largest:.1f} sd)"
+        detail = f"refits with every {every} output give the same parameters (largest shift {moved.largest:.1f} sd)"
     else:
         far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
         detail = (
-            f"refits with every {every}th output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): "
+            f"refits with every {every} output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): "
             "the model does not fit this record; excite more, work in a smaller range, or look for what is missing"
         )
     return Check(
@@ -142,12 +142,11 @@ def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, r
     if not unseen:
         return Check(passed=True, values=values, detail="the record shows every estimated parameter")
     if np.any(known.disagreement):
-        hint = (
-            "Not noise but disagreement of the refits makes it so: repeat the record away from limits, with quieter feedback "
-            "and more excitation"
-        )
+        hint = "Not noise but disagreement of the refits makes it so: repeat it away from limits, with more excitation"
         return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
-    hint = experiment_hint(known, theta, lowest_power_hz(fit.problem.u, fit.problem.rate_hz), robust=robust)
+    rate, length = fit.problem.rate_hz, fit.problem.u.shape[0]
+    band = (rate / length, lowest_power_hz(fit.problem.u, rate), rate / 2)
+    hint = experiment_hint(known, theta, band, robust=robust) or ""
     return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
 
 
@@ -188,7 +187,7 @@ def _signals_sound(record: Record, outputs: tuple[str, ...]) -> Check:
     return Check(
         passed=few,
         values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in found},
-        detail=f"{'; '.join(some)}. They are used as they are; replace them (ambid.signals.replace_samples) or cut them out"
+        detail=f"{'; '.join(some)}. They are used as they are; replace them (signals.replace_samples) or cut them out"
         if some
         else "no outliers and no drop-outs in the measured outputs",
     )

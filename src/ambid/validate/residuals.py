@@ -85,7 +85,7 @@ def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
     ResidualTest
     """
     problem = fit.problem
-    u = problem.u[problem.skip :] / problem.scales.input
+    u = problem.u[problem.skip :: problem.stride] / problem.scales.input
     longest = max(2, len(e) // 20)
     lags = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 12)}))
     white = e @ weight_of(fit.covariance).T
