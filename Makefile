@@ -8,6 +8,8 @@ PYTEST_ARGS ?=
 
 # Without byte code every start of the command compiles its imports again: 3 to 6 times slower.
 unexport PYTHONDONTWRITEBYTECODE
+# Small matrices: threads of the linear algebra library wait for each other, most of all on a busy machine.
+export OPENBLAS_NUM_THREADS ?= 1
 # Neither may decide what a fresh environment imports or where it is installed.
 unexport PYTHONPATH
 unexport PYTHONHOME

@@ -48,7 +48,7 @@ def identify(
     validate : Record, str or Path, optional
         A second record of the same bench to judge the estimate on.
     from_s, to_s : float, optional
-        Part of the record to use, in s; overrides the rig's.
+        Part of the record (and of the second) to use, in s; overrides the rig's.
     rate_hz : float, optional
         Sampling rate for a file without a time column.
     gaps : {"error", "interpolate", "cut"}, optional
@@ -92,7 +92,7 @@ def identify(
         from ambid.validate.second_record import validation
 
         say("validate")
-        other = load(validate, rig, from_s=None, to_s=None, rate_hz=rate_hz, gaps=gaps)
+        other = load(validate, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
         estimate = replace(estimate, validation=validation(estimate, signals_of(other, plant)))
         clock.lap("validate")
     return replace(estimate, timing_s=clock.laps)
@@ -158,8 +158,14 @@ def judged(
             "file": bench.provenance.get("file"),
             "history": [str(step) for step in bench.history],
         },
-        rig={"name": rig.name, "text": rig_text(rig, Path.cwd())},
+        rig=_remembered(rig),
     )
+
+
+def _remembered(rig: Rig) -> dict[str, object]:
+    """What an estimate keeps of its rig, so that other records can be judged alike."""
+    folder = Path.cwd() if rig.source is None else rig.source.resolve().parent
+    return {"name": rig.name, "text": rig_text(rig, folder), "folder": str(folder)}
 
 
 def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:

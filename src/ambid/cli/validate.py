@@ -94,26 +94,16 @@ def read_estimate(path: Path) -> Estimate:
 
 def _rig_of(estimate: Estimate, path: Path, rig: Path | None) -> Rig:
     """Load the rig that is given, or the one that the estimate remembers."""
-    import re
-    from tempfile import TemporaryDirectory
-
-    from ambid.rig import load_rig
-    from ambid.rig.write import toml_text
+    from ambid.rig import load_rig, rig_from_text
 
     if rig is not None:
         return load_rig(rig)
-    text = estimate.rig.get("text")
-    if not isinstance(text, str):
+    text, folder = estimate.rig.get("text"), estimate.rig.get("folder")
+    if not isinstance(text, str) or not isinstance(folder, str):
         raise EstimationError(f"estimate {path} does not hold its rig. Give --rig")
-    # Calibration tables are remembered relative to the folder in which identify ran, not to that of the copy.
-    text = re.sub(r'(?m)^table = "(.+)"$', lambda found: f"table = {toml_text(str(Path(found[1]).resolve()))}", text)
-    with TemporaryDirectory() as folder:
-        kept = Path(folder) / "rig.toml"
-        kept.write_text(text, encoding="utf-8")
-        try:
-            return load_rig(kept)
-        except AmbidError as error:
-            said = str(error).replace(f"rig {kept}: ", "")
-            raise EstimationError(
-                f"estimate {path}: the rig that it remembers cannot be used: {said}. Or give --rig"
-            ) from None
+    try:
+        return rig_from_text(text, Path(folder) / "rig.toml")
+    except AmbidError as error:
+        raise EstimationError(
+            f"estimate {path}: the rig that it remembers cannot be used: {error}. Or give --rig"
+        ) from None

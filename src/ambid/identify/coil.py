@@ -19,7 +19,7 @@ from ambid.identify.sensitivity import run
 Array = NDArray[np.float64]
 
 _ITERATIONS = 20
-_SETTLED = 1e-10  # relative change at which the instruments have settled
+_SETTLED = 1e-10  # change, relative to the current, at which the instruments have settled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +99,8 @@ def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEst
         size = np.linalg.norm(smooth[0], axis=0)
         gram = (smooth[0] / size).T @ (smooth[1] / size)
         before, found = found, np.linalg.solve(gram, (smooth[0] / size).T @ smooth[2][:, 0]) / size
-        if np.max(np.abs(found - before) / np.maximum(np.abs(found), 1e-12)) < _SETTLED:
+        # what the change does to the current, not to a number that may be zero
+        if np.linalg.norm((found - before) * np.linalg.norm(rows, axis=0)) < _SETTLED * np.linalg.norm(target):
             return _coil(found, rate_hz, "instrumental variable")
     raise EstimationError(
         "the instrumental variable for the coil does not settle; voltage and current are not those of a coil at rest, "

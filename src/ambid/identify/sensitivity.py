@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,20 +195,6 @@ def reduce_rows(rows: Array, *, last: bool = False) -> Array:
         return rows.copy()
     factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, _QR_ROWS, rows.shape[1]), mode="r"))
     return np.vstack([factors.reshape(-1, rows.shape[1]), rows[whole:]])
-
-
-def reduce_blocks(blocks: Iterable[Array]) -> Array:
-    """Reduce all rows of several blocks to at most as many as they have columns.
-
-    Parameters
-    ----------
-    blocks : iterable of ndarray, each of shape (n_rows, n_columns)
-
-    Returns
-    -------
-    ndarray, shape (at most n_columns, n_columns)
-    """
-    return reduce_rows(np.vstack([reduce_rows(b) for b in blocks]), last=True)
 
 
 def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, work: Workspace) -> Iterator[Array]:

@@ -2,7 +2,7 @@
 
 from ambid.rig.bench import bench_record, mat_variables, read_bench
 from ambid.rig.draft import draft_rig
-from ambid.rig.load import default_rig, load_rig
+from ambid.rig.load import default_rig, load_rig, rig_from_text
 from ambid.rig.rig import RecordSettings, Rig, RigChannel
 from ambid.rig.write import rig_text, write_rig
 
@@ -16,6 +16,7 @@ __all__ = [
     "load_rig",
     "mat_variables",
     "read_bench",
+    "rig_from_text",
     "rig_text",
     "write_rig",
 ]

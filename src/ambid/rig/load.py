@@ -48,6 +48,32 @@ def load_rig(path: str | Path) -> Rig:
     return _build(read_rig_file(path), path)
 
 
+def rig_from_text(text: str, path: str | Path) -> Rig:
+    """Read a rig from its text.
+
+    Parameters
+    ----------
+    text : str
+        TOML of schema ``ambid.rig/1``.
+    path : str or Path
+        Where it stood: paths inside it are relative to that folder, and messages name it.
+
+    Returns
+    -------
+    Rig
+        As `load_rig`.
+
+    Raises
+    ------
+    RigError
+        As `load_rig`.
+    """
+    from ambid.rig.schema import parse_rig
+
+    path = Path(path)
+    return _build(parse_rig(text, path), path)
+
+
 def default_rig(model_name: str = "one-axis") -> Rig:
     """Return the rig that is taken when none is given: columns named like the roles, every parameter free.
 

@@ -165,7 +165,29 @@ def read_rig_file(path: Path) -> RigFile:
     RigError
         If the file cannot be read, is no TOML, or has an unknown key, a wrong type or a number that is not finite.
     """
-    text = utf8_text(file_bytes(path, RigError, "rig"), path, RigError, "rig")
+    return parse_rig(utf8_text(file_bytes(path, RigError, "rig"), path, RigError, "rig"), path)
+
+
+def parse_rig(text: str, path: Path) -> RigFile:
+    """Check the shape of a rig's text.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    path : Path
+        Where it stands or stood, for messages.
+
+    Returns
+    -------
+    RigFile
+        As written: units are not yet converted.
+
+    Raises
+    ------
+    RigError
+        As `read_rig_file`.
+    """
     if not text.strip():
         raise RigError(
             f"rig {path} is empty. Write at least schema and model, or make one with: ambid init RECORD -o RIG"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.likelihood import Fit, weight_of
-from ambid.identify.sensitivity import Workspace, reduce_blocks, residual_blocks
+from ambid.identify.sensitivity import Workspace, reduce_rows, residual_blocks
 
 Array = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -
     p, per_output = problem.size, len(lags) * signals.shape[1]
     lagged = _lagged(signals, lags)
     lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
-    blocks, first, work = list[Array](), 0, Workspace(problem)
+    first, work, blocks = 0, Workspace(problem), list[Array]()
     for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
         m = rows.shape[0]
         wide = np.zeros((m, n_y, p + n_y * per_output + 1))
@@ -108,9 +108,9 @@ def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -
         wide[:, :, -1] = rows[:, :, p]
         for o in range(n_y):
             wide[:, o, p + o * per_output : p + (o + 1) * per_output] = lagged[first : first + m]
-        blocks.append(wide.reshape(m * n_y, -1))
+        blocks.append(reduce_rows(wide.reshape(m * n_y, -1)))
         first += m
-    R = reduce_blocks(blocks)
+    R = reduce_rows(np.vstack(blocks), last=True)
     statistic, degrees = _explained(R, p, fit.J_prior)
     correlation = (white.T @ lagged) / np.linalg.norm(white, axis=0)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)

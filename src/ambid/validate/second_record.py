@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Check, Estimate
-from ambid.identify.likelihood import Fit, search
+from ambid.identify.likelihood import Fit, search, weight_of
 from ambid.identify.multistart import Signals
 from ambid.identify.problem import PredictorProblem
 from ambid.identify.scaling import noise_floor, scales_for
-from ambid.identify.sensitivity import innovations
+from ambid.identify.sensitivity import innovations, linearise
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
 from ambid.validate.prediction import fit_of, prediction_error, simulation_error
@@ -32,7 +32,8 @@ class Replay:
     Attributes
     ----------
     fit : Fit
-        Offsets and initial state on this record; its problem holds data and model.
+        Offsets and initial state on this record; the parameters stay as they were, with their covariance as a prior, so
+        that tests on it allow for what was not known of them.
     first : int
         Sample of the record at which row 0 of the arrays stands.
     measured, predicted : ndarray, shape (n_used, n_outputs)
@@ -108,15 +109,50 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
                 f"channel {role!r} is constant over the whole record; nothing can be judged on it. Check it"
             )
     scales = scales_for(plant, estimate.values, np.std(u, axis=0), noise_floor(y), signals.rate_hz)
-    problem = PredictorProblem(
-        model=plant, rate_hz=signals.rate_hz, u=u, y=y, estimated=(), known=estimate.values, magnitude=np.zeros(0),
-        prior_mean=np.zeros(0), prior_sd=np.zeros(0), scales=scales, delay=delay.samples, lag=delay.fraction, skip=skip,
-        noise="given", gain=estimate.noise.gain * scales.output / scales.state[:, None],
-    )  # fmt: skip
-    fit = search(problem, np.zeros(problem.size))
+    kept = PredictorProblem(
+        model=plant,
+        rate_hz=signals.rate_hz,
+        u=u,
+        y=y,
+        estimated=(),
+        known=estimate.values,
+        magnitude=np.zeros(0),
+        prior_mean=np.zeros(0),
+        prior_sd=np.zeros(0),
+        scales=scales,
+        delay=delay.samples,
+        lag=delay.fraction,
+        skip=skip,
+        noise="given",
+        gain=estimate.noise.gain * scales.output / scales.state[:, None],
+    )
+    fit = search(kept, np.zeros(kept.size))
     if fit.status == "failed":
         raise EstimationError("the estimate makes no predictor for this record. Check that both are of the same bench")
-    return fit
+    return _with_covariance(fit, estimate)
+
+
+def _with_covariance(fit: Fit, estimate: Estimate) -> Fit:
+    """Give the parameters their covariance back: as numbers with a prior, at the values they have."""
+    names = estimate.covariance_names
+    values = np.array([estimate.values[k] for k in names])
+    sd = np.sqrt(np.diag(estimate.covariance))
+    problem = replace(
+        fit.problem,
+        estimated=names,
+        known={k: v for k, v in estimate.values.items() if k not in names},
+        magnitude=sd,
+        prior_mean=values,
+        prior_sd=sd,
+    )
+    vector = np.concatenate([values / sd, fit.vector])
+    at = linearise(problem, vector, weight_of(fit.covariance))
+    if at is None:
+        return fit
+    correlation = estimate.covariance / np.outer(sd, sd)
+    rows = np.zeros((len(names), problem.size))
+    rows[:, : len(names)] = np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(len(names))))
+    return replace(fit, problem=problem, vector=vector, J=at.J, J_prior=rows)
 
 
 def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
