@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -72,16 +73,23 @@ SETTINGS = {
 
 
 def run(
-    name: str, n: int, seed: int, *, delay: float | None = None, excitation_seed: int | None = None, **changes: float
+    name: str,
+    n: int,
+    seed: int,
+    *,
+    delay: float | None = None,
+    excitation_seed: int | None = None,
+    shape: Literal["flat", "pink"] = "flat",
+    **changes: float,
 ) -> Bench:
-    """Simulate a bench of `SETTINGS`; `changes` are noise levels."""
+    """Simulate a bench of `SETTINGS` under a multisine; `changes` are noise levels."""
     s = SETTINGS[name]
     noise, of = {**s.noise, **changes}, model(s.model)
     gains = {k: getattr(s.loop, k) for k in ("kp", "ki", "kd", "kc", "derivative_cutoff_hz")}
     loop = Loop(**gains, delay=s.loop.delay if delay is None else delay)
     u = multisine(
         n, s.rate_hz, amplitude=s.rms, band=(max(s.band[0], s.rate_hz / n), s.band[1]),
-        seed=seed if excitation_seed is None else excitation_seed, amplitude_is="rms",
+        seed=seed if excitation_seed is None else excitation_seed, amplitude_is="rms", shape=shape,
     )  # fmt: skip
     done = simulate(
         LinearPlant(model=of, parameters=s.truth),
