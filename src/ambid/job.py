@@ -69,6 +69,7 @@ def identify(
         If nothing can be identified from the record.
     """
     from ambid.identify.greybox import greybox
+    from ambid.identify.threads import one_thread
     from ambid.identify.uncertainty import uncertainty
 
     say = tick or _silent
@@ -86,7 +87,8 @@ def identify(
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     clock.lap("fit")
     say("check")
-    estimate = judged(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
+    with one_thread():
+        estimate = judged(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
     clock.lap("checks")
     if validate is not None:
         from ambid.validate.second_record import validation

@@ -21,6 +21,7 @@ from ambid.identify.likelihood import Fit, score_statistic, search
 from ambid.identify.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.identify.predictor import assemble
 from ambid.identify.problem import PredictorProblem
+from ambid.identify.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
@@ -65,6 +66,19 @@ def greybox(
         If the record is too short, a channel is constant, or no start value makes a predictor.
     """
     _check(model, signals, parameters)
+    with one_thread():
+        return _greybox(model, signals, parameters, delay, noise, tick)
+
+
+def _greybox(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    delay: Delay,
+    noise: Literal["auto", "levels", "gain"],
+    tick: Callable[[], None] | None,
+) -> Fit:
+    """Starts, then delay as a real number, then a free gain, each only where the data pay for it."""
     fit: Fit | None = None
     for candidate in starts(model, signals, parameters, delay, tick=tick):
         found = _searched(candidate, tick, with_disturbances=noise != "auto")

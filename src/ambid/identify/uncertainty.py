@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.likelihood import Fit, weight_of
+from ambid.identify.predictor import assemble
 from ambid.identify.sensitivity import Workspace, residual_blocks
 
 Array = NDArray[np.float64]
 
 WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
+MEMORIES = 100.0  # lengths of the predictor's memory from which a record is long
 _BATCHES = 30  # stretches of the record for the robust covariance
 
 
@@ -45,6 +47,12 @@ class Uncertainty:
         Direction with the smallest singular value: share of each parameter, largest in magnitude 1.
     delay_sd : float or None
         Standard deviation of an estimated delay in samples.
+    memories : float
+        Length of the record in memories of the predictor; infinite where the gain is not estimated.
+    widening : float
+        Factor on all standard deviations of a short record: noise levels are then known only roughly, and with them the
+        weight of each sample; sqrt(100 / memories), at least 1 (by simulation: 1.4 wanted at 50 memories, 2 to 3 at
+        20).
     disagreement : ndarray, shape (n,), SI
         How far the parameters move when the data are used differently, where that is more than chance allows; else 0.
         Part of the robust standard deviations: a bias of this size cannot be ruled out.
@@ -58,6 +66,8 @@ class Uncertainty:
     singular_values: Array
     weakest: dict[str, float]
     delay_sd: float | None
+    memories: float
+    widening: float
     disagreement: Array
 
     @property
@@ -141,7 +151,9 @@ def uncertainty(fit: Fit) -> Uncertainty:
     """
     problem, sl = fit.problem, fit.problem.slices
     n, size = problem.n_physical, problem.magnitude
-    whole = inverse_information(np.vstack([fit.J, fit.J_prior]))
+    memories = _memories(fit)
+    widening = float(np.sqrt(max(1.0, MEMORIES / memories)))
+    whole = inverse_information(np.vstack([fit.J, fit.J_prior])) * widening**2
     unit = np.outer(size, size)
     information = whole[:n, :n] * unit
     noise_only = fit.J_prior.copy()
@@ -158,12 +170,14 @@ def uncertainty(fit: Fit) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
+        robust=_gram(whole[:n] @ _scores(fit).T / widening) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
         weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
         delay_sd=delay_sd,
+        memories=memories,
+        widening=widening,
         disagreement=np.zeros(n),
     )
 
@@ -187,6 +201,17 @@ def inverse_information(J: Array) -> Array:
     s = np.maximum(s, 1e-15 * s[0])
     half = vt.T / s / norm[:, None]
     return np.asarray(half @ half.T)
+
+
+def _memories(fit: Fit) -> float:
+    """Length of the record over the slowest time constant of an estimated predictor."""
+    if fit.problem.noise == "given":
+        return np.inf
+    predictor = assemble(fit.problem, fit.vector, with_derivatives=False)
+    if predictor is None:
+        return np.inf
+    slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
+    return float(fit.problem.n_used * max(1.0 - slowest, 1e-12))
 
 
 def _gram(a: Array) -> Array:

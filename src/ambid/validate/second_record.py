@@ -14,6 +14,7 @@ from ambid.identify.multistart import Signals
 from ambid.identify.problem import PredictorProblem
 from ambid.identify.scaling import noise_floor, scales_for
 from ambid.identify.sensitivity import innovations, linearise
+from ambid.identify.threads import one_thread
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
 from ambid.validate.prediction import fit_of, prediction_error, simulation_error
@@ -70,7 +71,8 @@ def replay(estimate: Estimate, signals: Signals) -> Replay:
     EstimationError
         If the rates differ, the record is too short, or the estimate makes no predictor.
     """
-    fit = _fit(estimate, signals)
+    with one_thread():
+        fit = _fit(estimate, signals)
     problem = fit.problem
     e = innovations(problem, fit.vector)
     if e is None:
@@ -175,6 +177,11 @@ def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
     EstimationError
         As `replay`.
     """
+    with one_thread():
+        return _judged(estimate, signals)
+
+
+def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
     run = replay(estimate, signals)
     one_step = fit_of(run.innovations, run.measured)
     simulation = None if run.simulated is None else fit_of(run.measured - run.simulated, run.measured)
