@@ -1,15 +1,21 @@
-"""The same job written straight with SciPy: modes of the predictor, `lfilter`, finite differences.
+"""The same job written straight with SciPy: `lfilter` and finite differences.
 
-This is what an engineer would write: discretise with `cont2discrete`, get the Kalman gain from `solve_discrete_are`, split
-the predictor into its modes, filter with `lfilter`, and let forward differences make the Jacobian. (With `ss2tf` and
-third-order filters instead of modes it takes longer, and at 20 kHz rounding in the polynomials spoils the differences.)
+This is what an engineer would write: discretise with `cont2discrete`, get the Kalman gain from `solve_discrete_are`,
+filter with `lfilter`, and let forward differences make the Jacobian. The predictor is filtered in one of two ways:
+
+- `by_modes`: split into its three modes, one complex first-order filter each (the better one: fast and accurate);
+- `by_transfer_functions`: `ss2tf` and third-order filters, the textbook way. It takes longer, and at high sampling
+  rates rounding in the polynomials spoils the differences.
+
+`fit` gives either to `scipy.optimize.least_squares`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
-from scipy.signal import cont2discrete, lfilter
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter, ss2tf
 
 
 def discrete_plant(theta, period):
@@ -21,23 +27,47 @@ def discrete_plant(theta, period):
     return a_d, b_d[:, :1], b_d[:, 1:], c
 
 
-def residual(vector, u, y, period, scale, weight):
-    """Weighted innovations at 13 numbers: 5 physical, 3 log noise ratios, 2 offsets, 3 initial states."""
+def predictor(vector, period, scale):
+    """Return F, the matrix of the drive [u, y, 1], C and the initial state at 13 estimated numbers.
+
+    The numbers are 5 physical ones, 3 log noise ratios, 2 offsets, 3 initial states, each over its scale.
+    """
     theta, noise, offset, x0 = vector[:5] * scale["theta"], vector[5:8], vector[8:10], vector[10:13] * scale["state"]
     a, b, e, c = discrete_plant(theta, period)
     q = (e * np.exp(2 * noise[:2]) * scale["disturbance"] ** 2) @ e.T
     r = np.diag(scale["output"] ** 2 * [1.0, np.exp(2 * noise[2])])
     p = solve_discrete_are(a.T, c.T, q, r)
     gain = np.linalg.solve(c @ p @ c.T + r, c @ p @ a.T).T
-    f = a - gain @ c
+    return a - gain @ c, np.hstack([b, gain, (e @ (offset * scale["disturbance"]))[:, None]]), c, x0
+
+
+def by_modes(f, matrix, c, x0, u, y):
     modes, vectors = np.linalg.eig(f)
     drive = np.column_stack([u, y, np.ones(len(y))])
-    matrix = np.hstack([b, gain, (e @ (offset * scale["disturbance"]))[:, None]])
     forced = drive @ np.linalg.solve(vectors, matrix).T
     forced[1:], forced[0] = forced[:-1].copy(), np.linalg.solve(vectors, x0.astype(complex))
     state = np.column_stack([lfilter([1.0], [1.0, -pole], forced[:, j]) for j, pole in enumerate(modes)])
-    predicted = (state @ (c @ vectors).T).real
-    return ((y - predicted) @ weight.T).ravel()
+    return (state @ (c @ vectors).T).real
+
+
+def by_transfer_functions(f, matrix, c, x0, u, y):
+    impulse = np.zeros(len(y))
+    impulse[0] = 1.0
+    # the initial state is an impulse at the first sample: C x0, then C F (F x0), ...
+    drive = np.column_stack([u, y, np.ones(len(y)), impulse])
+    b, d = np.column_stack([matrix, f @ x0]), np.zeros((2, drive.shape[1]))
+    d[:, -1] = c @ x0
+    predicted = np.zeros_like(y)
+    for j, signal in enumerate(drive.T):
+        numerators, denominator = ss2tf(f, b, c, d, input=j)
+        for o, numerator in enumerate(numerators):
+            predicted[:, o] += lfilter(numerator, denominator, signal)
+    return predicted
+
+
+def residual(vector, filtered, u, y, period, scale, weight):
+    """Weighted innovations at 13 estimated numbers."""
+    return ((y - filtered(*predictor(vector, period, scale), u, y)) @ weight.T).ravel()
 
 
 def jacobian(vector, at, *arguments):
@@ -49,3 +79,10 @@ def jacobian(vector, at, *arguments):
         moved[j] += h
         columns.append((residual(moved, *arguments) - at) / h)
     return np.stack(columns, axis=1)
+
+
+def fit(start, *arguments, evaluations=None):
+    """Least squares by `scipy.optimize.least_squares`, which makes its own forward differences."""
+    return least_squares(
+        residual, start, jac="2-point", method="trf", x_scale="jac", max_nfev=evaluations, args=arguments
+    )
