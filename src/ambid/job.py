@@ -86,6 +86,7 @@ def identify(
     if fit.status == "failed":
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     clock.lap("fit")
+    clock.split("fit", "initial", fit.start_s)
     say("check")
     with one_thread():
         estimate = judged(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
@@ -126,9 +127,12 @@ def judged(
     EstimationError
         If the fit has no predictor.
     """
+    import numpy as np
+
     from ambid.identify.result import estimate_of
     from ambid.identify.sensitivity import innovations
     from ambid.validate.agreement import agreement
+    from ambid.validate.assumptions import assumption_checks
     from ambid.validate.checks import physical_checks, residual_checks
     from ambid.validate.prediction import fit_of, simulation_error
 
@@ -137,9 +141,10 @@ def judged(
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     moved = agreement(fit)
-    known = replace(known, disagreement=moved.disagreement())
     checks = residual_checks(fit, e, known, moved)
-    robust = not all(c.passed for c in checks.values())
+    robust = fit.status != "converged" or not all(c.passed for c in checks.values())
+    known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
+    checks |= assumption_checks(fit, known, delay_how)
     checks |= physical_checks(fit, known, bench, robust=robust)
     y, error = problem.y[problem.skip :], simulation_error(fit)
     return estimate_of(
@@ -192,6 +197,10 @@ class _Clock:
 
     def __init__(self) -> None:
         self._last, self.laps = time.perf_counter(), dict[str, float]()
+
+    def split(self, lap: str, part: str, seconds: float) -> None:
+        self.laps[part] = seconds
+        self.laps[lap] -= seconds
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
@@ -234,19 +234,6 @@ class Estimate:
     def passed(self) -> bool:
         """Whether the search converged and every check passed."""
         return self.status == "converged" and all(c.passed for c in self.checks.values())
-
-    def with_timing(self, **seconds: float) -> Estimate:
-        """Return a copy with further entries in its timings.
-
-        Parameters
-        ----------
-        **seconds : float
-
-        Returns
-        -------
-        Estimate
-        """
-        return replace(self, timing_s={**self.timing_s, **seconds})
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.

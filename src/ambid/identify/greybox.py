@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from time import perf_counter
 from typing import Literal
 
 import numpy as np
@@ -79,8 +80,11 @@ def _greybox(
     tick: Callable[[], None] | None,
 ) -> Fit:
     """Starts, then delay as a real number, then a free gain, each only where the data pay for it."""
+    begun = perf_counter()
+    candidates = starts(model, signals, parameters, delay, tick=tick)
+    start_s = perf_counter() - begun
     fit: Fit | None = None
-    for candidate in starts(model, signals, parameters, delay, tick=tick):
+    for candidate in candidates:
         found = _searched(candidate, tick, with_disturbances=noise != "auto")
         fit = found if fit is None or found.criterion < fit.criterion else fit
         if found.status == "converged":
@@ -88,24 +92,41 @@ def _greybox(
     assert fit is not None
     if delay == "auto":
         fit = _with_fraction(fit, tick)
+        if noise == "auto" and fit.problem.fractional:
+            fit = _without_disturbances(fit, tick)
     if noise != "levels":
         fit = _with_gain(fit, tick, force=noise == "gain")
-    return fit
+    return replace(fit, start_s=start_s)
 
 
 def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
     """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
-    problem = candidate.problem
-    at = assemble(problem, candidate.vector, with_derivatives=False)
-    if not with_disturbances and at is not None and stable(at.A):
-        quiet = replace(problem, noise="given", gain=np.zeros_like(at.gain))
-        start = np.zeros(quiet.size)
-        for group in ("physical", "fraction", "offset", "initial"):
-            start[quiet.slices[group]] = candidate.vector[problem.slices[group]]
-        fit = search(quiet, start, tick=tick)
-        if fit.status == "converged" and _gain_promise(fit) <= 0:
+    if not with_disturbances:
+        fit = _quiet(candidate.problem, candidate.vector, tick)
+        if fit is not None and fit.status == "converged" and _gain_promise(fit) <= 0:
             return fit
-    return search(problem, candidate.vector, tick=tick)
+    return search(candidate.problem, candidate.vector, tick=tick)
+
+
+def _quiet(problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None) -> Fit | None:
+    """Search with sensor noise alone; None for an unstable plant, which wants its states corrected."""
+    at = assemble(problem, vector, with_derivatives=False)
+    if at is None or not stable(at.A):
+        return None
+    quiet = replace(problem, noise="given", gain=np.zeros_like(at.gain))
+    start = np.zeros(quiet.size)
+    for group in ("physical", "fraction", "offset", "initial"):
+        start[quiet.slices[group]] = vector[problem.slices[group]]
+    return search(quiet, start, tick=tick)
+
+
+def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
+    """Drop the disturbances again where a fraction of a sample of delay was all that they stood for."""
+    if fit.problem.noise != "levels":
+        return fit
+    quiet = _quiet(fit.problem, fit.vector, tick)
+    price = (fit.problem.size - (quiet.problem.size if quiet else 0)) * np.log(fit.problem.n_used)
+    return quiet if quiet is not None and quiet.criterion - fit.criterion < price else fit
 
 
 def _gain_promise(fit: Fit) -> float:
@@ -179,7 +200,13 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
         total = free.delay_samples(found.vector)
         if found.status == "failed" or fit.criterion - found.criterion < price:
             return fit
-        whole = int(np.floor(total + 1e-6))
+        nearest = round(total)
+        if abs(total - nearest) < 0.1:  # a whole number of samples after all?
+            exact = replace(free, fractional=False, delay=nearest, skip=max(free.skip, nearest + 2))
+            back = search(exact, carry(found, exact), tick=tick)
+            if back.status == "converged" and back.criterion - found.criterion < price:
+                return back
+        whole = int(np.floor(total))
         if whole == delay:
             return found
         # the neighbour's interval: start again from there, so that delay + fraction is written with 0 <= fraction < 1

@@ -7,7 +7,7 @@ to SciPy's trust-region optimiser with exact Jacobians; the weights are the inno
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -39,11 +39,14 @@ class Fit:
     J : ndarray, shape (size + 1, size)
         Compressed Jacobian of the weighted innovations: J^T J is the information matrix of the data.
     J_prior : ndarray, shape (n_priors, size)
-        Rows of the priors.
+    r_prior : ndarray, shape (n_priors,)
+        Rows and residuals of the priors.
     criterion : float
         Twice the negative log-likelihood but for constants: n log det(covariance) plus squared prior residuals.
     status : {"converged", "stalled", "failed"}
     evaluations : int
+    start_s : float
+        Time that finding start values took before this search, s.
     """
 
     problem: PredictorProblem
@@ -51,9 +54,11 @@ class Fit:
     covariance: Array
     J: Array
     J_prior: Array
+    r_prior: Array
     criterion: float
     status: Status
     evaluations: int
+    start_s: float = 0.0
 
 
 def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
@@ -160,6 +165,51 @@ def score_statistic(problem: PredictorProblem, vector: Array, covariance: Array)
         return 0.0
     r, J = prior_rows(problem, vector)
     return _decrement(np.vstack([at.J, J]), np.concatenate([at.r, r]))
+
+
+def freed(fit: Fit, name: str) -> tuple[float, float]:
+    """Return what the data say of a parameter that was fixed, to second order.
+
+    Parameters
+    ----------
+    fit : Fit
+    name : str
+        One of the problem's known parameters.
+
+    Returns
+    -------
+    statistic : float
+        Fall of the criterion that freeing it promises: chi-squared with one degree of freedom if the fixed value is
+        right.
+    value : float
+        Where one Newton step puts it, SI: right in direction, in size only near the fixed value.
+    """
+    old = fit.problem
+    value = old.known[name]
+    reference = old.model.references(old.parameters(fit.vector)).get(name, 0.0)
+    size = max(abs(value), reference) or 1.0
+    problem = replace(
+        old,
+        estimated=(*old.estimated, name),
+        known={k: v for k, v in old.known.items() if k != name},
+        magnitude=np.append(old.magnitude, size),
+        prior_mean=np.append(old.prior_mean, 0.0),
+        prior_sd=np.append(old.prior_sd, np.inf),
+    )
+    n = old.n_physical
+    vector = np.insert(fit.vector, n, value / size)
+    at = linearise(problem, vector, weight_of(fit.covariance))
+    if at is None:
+        return 0.0, value
+    r, rows = prior_rows(problem, vector)
+    J, residual = np.vstack([at.J, rows]), np.concatenate([at.r, r])
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+    if s[-1] < 1e-10 * s[0]:  # the data cannot tell it from the others
+        return 0.0, value
+    step = -(vt.T @ ((u.T @ residual) / s)) / norm
+    return _decrement(J, residual), value + float(step[n]) * size
 
 
 def _decrement(J: Array, r: Array) -> float:
@@ -270,6 +320,7 @@ def search(
         covariance=covariance,
         J=at.J,
         J_prior=prior_rows(problem, vector)[1],
+        r_prior=prior_rows(problem, vector)[0],
         criterion=value,
         status=status,
         evaluations=count,
@@ -280,7 +331,7 @@ def _failed(problem: PredictorProblem, start: Array) -> Fit:
     n_y = problem.y.shape[1]
     return Fit(
         problem=problem, vector=start, covariance=np.eye(n_y), J=np.zeros((problem.size + 1, problem.size)),
-        J_prior=np.zeros((0, problem.size)), criterion=np.inf, status="failed", evaluations=1,
+        J_prior=np.zeros((0, problem.size)), r_prior=np.zeros(0), criterion=np.inf, status="failed", evaluations=1,
     )  # fmt: skip
 
 

@@ -25,7 +25,8 @@ from ambid.physics.parameters import Parameter
 Array = NDArray[np.float64]
 Delay = float | Literal["auto"]
 
-MAX_DELAY = 6  # samples, searched when the delay is "auto"
+MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
+_FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
@@ -104,7 +105,11 @@ def starts(
     EstimationError
         If no start values make a predictor.
     """
-    scored = sorted(_scored(model, signals, parameters, delay), key=lambda c: c.criterion)
+    delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
+    scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
+    while delay == "auto" and scored and scored[0].problem.delay == delays[-1] < _FARTHEST:
+        delays = [float(d) for d in range(int(delays[-1]) - 1, int(delays[-1]) + MAX_DELAY + 1)]
+        scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
     if not scored:
         raise EstimationError(
             "no start values make a physical plant (positive m and L) with this record: it holds too little "
@@ -135,9 +140,10 @@ def _raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
     return Candidate(criterion=value, problem=problem, vector=vectors[best])
 
 
-def _scored(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> list[Candidate]:
+def _scored(
+    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float]
+) -> list[Candidate]:
     """Return the best candidates of all bands and delays, each at several noise levels."""
-    delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
     stretch = _busiest(centred.u, _STRETCH)
     coarse: list[tuple[float, PredictorProblem, dict[str, float]]] = []

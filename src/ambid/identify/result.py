@@ -62,12 +62,13 @@ def estimate_of(
     problem = fit.problem
     theta = problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
-    seen = dict(zip(known.names, known.identifiable_at(robust=robust), strict=True))
+    settled = fit.status == "converged"  # of a search that has not ended nothing is certain
+    seen = {k: settled and ok for k, ok in zip(known.names, known.identifiable_at(robust=robust), strict=True)}
     alone = dict(zip(known.names, known.data_only_sd.tolist(), strict=True))
     space = problem.model.matrices(theta)
     total = problem.delay_samples(fit.vector)
-    whole = int(np.floor(total + 1e-9))
-    inputs_delay = Delay(samples=whole, fraction=max(total - whole, 0.0), sd=known.delay_sd, how=delay_how)
+    whole = int(np.floor(total))
+    inputs_delay = Delay(samples=whole, fraction=total - whole, sd=known.delay_sd, how=delay_how)
     return Estimate(
         status=fit.status,
         model=problem.model.name,

@@ -100,7 +100,7 @@ def candidates(
         Delay of the input.
     rate_hz : float
     known : Mapping[str, float]
-        Fixed values and prior means, SI; they are used, and returned unchanged.
+        Fixed values, SI; they are used, and returned unchanged.
 
     Yields
     ------

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.likelihood import Fit, weight_of
+from ambid.identify.likelihood import Fit, evaluate, prior_rows, weight_of
 from ambid.identify.predictor import assemble
-from ambid.identify.sensitivity import Workspace, residual_blocks
+from ambid.identify.sensitivity import Workspace, linearise, residual_blocks
 
 Array = NDArray[np.float64]
 
 WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
-MEMORIES = 100.0  # lengths of the predictor's memory from which a record is long
+_LONG = 300.0  # memories of the predictor from which noise levels are known well enough not to ask
+_FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
 _BATCHES = 30  # stretches of the record for the robust covariance
 
 
@@ -32,7 +33,8 @@ class Uncertainty:
     names : tuple of str
         Estimated physical parameters.
     information : ndarray, shape (n, n), SI
-        Covariance from the information matrix, priors included.
+        Covariance from the information matrix, priors included, and from what a short record leaves open of the noise
+        levels.
     robust : ndarray, shape (n, n), SI
         Covariance from the scores of stretches of the record.
     data_only_sd : ndarray, shape (n,), SI
@@ -49,10 +51,8 @@ class Uncertainty:
         Standard deviation of an estimated delay in samples.
     memories : float
         Length of the record in memories of the predictor; infinite where the gain is not estimated.
-    widening : float
-        Factor on all standard deviations of a short record: noise levels are then known only roughly, and with them the
-        weight of each sample; sqrt(100 / memories), at least 1 (by simulation: 1.4 wanted at 50 memories, 2 to 3 at
-        20).
+    fisher : ndarray, shape (n, n), SI
+        Covariance with the noise levels taken as known well: what `information` is for a long record.
     disagreement : ndarray, shape (n,), SI
         How far the parameters move when the data are used differently, where that is more than chance allows; else 0.
         Part of the robust standard deviations: a bias of this size cannot be ruled out.
@@ -66,14 +66,18 @@ class Uncertainty:
     singular_values: Array
     weakest: dict[str, float]
     delay_sd: float | None
-    memories: float
-    widening: float
+    fisher: Array
     disagreement: Array
+
+    @property
+    def widening(self) -> float:
+        """Largest ratio of standard deviations with noise levels known roughly to those with them known well."""
+        return float(np.max(np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.fisher), 1e-300))))
 
     @property
     def inflation(self) -> float:
         """Largest ratio of robust to information standard deviation."""
-        return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.information), 1e-300))))
+        return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.fisher), 1e-300))))
 
     def covariance(self, *, robust: bool) -> Array:
         """Return the covariance that goes with `standard_deviations`.
@@ -151,11 +155,9 @@ def uncertainty(fit: Fit) -> Uncertainty:
     """
     problem, sl = fit.problem, fit.problem.slices
     n, size = problem.n_physical, problem.magnitude
-    memories = _memories(fit)
-    widening = float(np.sqrt(max(1.0, MEMORIES / memories)))
-    whole = inverse_information(np.vstack([fit.J, fit.J_prior])) * widening**2
+    whole = inverse_information(np.vstack([fit.J, fit.J_prior]))
     unit = np.outer(size, size)
-    information = whole[:n, :n] * unit
+    information = (whole[:n, :n] + _left_open(fit)) * unit
     noise_only = fit.J_prior.copy()
     noise_only[:, :n] = 0.0
     data_only = np.sqrt(np.diag(inverse_information(np.vstack([fit.J, noise_only])))[:n]) * size
@@ -170,14 +172,13 @@ def uncertainty(fit: Fit) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=_gram(whole[:n] @ _scores(fit).T / widening) * unit,
+        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
         weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
         delay_sd=delay_sd,
-        memories=memories,
-        widening=widening,
+        fisher=whole[:n, :n] * unit,
         disagreement=np.zeros(n),
     )
 
@@ -203,15 +204,53 @@ def inverse_information(J: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
-def _memories(fit: Fit) -> float:
-    """Length of the record over the slowest time constant of an estimated predictor."""
-    if fit.problem.noise == "given":
-        return np.inf
-    predictor = assemble(fit.problem, fit.vector, with_derivatives=False)
-    if predictor is None:
-        return np.inf
+def _left_open(fit: Fit) -> Array:
+    """Covariance that a short record adds by leaving the noise levels open, (n, n), over the magnitudes.
+
+    For each disturbance, at the upper end of what the likelihood allows for its level: by how much the information
+    shrinks, and how far the parameters move. Nothing for a long record, or where noise levels do not matter.
+    """
+    problem, predictor = fit.problem, assemble(fit.problem, fit.vector, with_derivatives=False)
+    n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
+    if problem.noise != "levels" or predictor is None:
+        return extra
     slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
-    return float(fit.problem.n_used * max(1.0 - slowest, 1e-12))
+    if problem.n_used * (1.0 - slowest) > _LONG:
+        return extra
+    work, here = Workspace(problem), inverse_information(np.vstack([fit.J, fit.J_prior]))[:n, :n]
+    for j in range(len(problem.model.disturbances)):
+        upper = _upper_level(fit, j, work)
+        _, covariance = evaluate(problem, upper, work)
+        at = None if covariance is None else linearise(problem, upper, weight_of(covariance), work)
+        if at is not None:
+            r, rows = prior_rows(problem, upper)
+            J, free = np.vstack([at.J, rows]), np.ones(problem.size, dtype=bool)
+            free[problem.slices["noise"].start + j] = False  # this level stays where it was put
+            there = inverse_information(J[:, free])
+            step = -(there @ (J[:, free].T @ np.concatenate([at.r, r])))[:n]
+            wider = max(0.0, float(np.max(np.diag(there)[:n] / np.diag(here))) - 1.0)
+            extra += wider * here + np.outer(step, step)
+    felt = np.sqrt(np.max(1.0 + np.diag(extra) / np.diag(here))) > _FELT
+    return extra if felt else np.zeros_like(extra)
+
+
+def _upper_level(fit: Fit, j: int, work: Workspace) -> Array:
+    """The fit with one log disturbance level raised to the end of its 95 % interval: the criterion has risen by 4."""
+    place, inside, outside = fit.problem.slices["noise"].start + j, 0.0, 0.1
+
+    def rise(step: float) -> float:
+        moved = fit.vector.copy()
+        moved[place] += step
+        return evaluate(fit.problem, moved, work)[0] - fit.criterion
+
+    while outside < 20.0 and rise(outside) < 4.0:
+        inside, outside = outside, 2 * outside
+    for _ in range(4):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if rise(middle) < 4.0 else (inside, middle)
+    upper = fit.vector.copy()
+    upper[place] += inside
+    return upper
 
 
 def _gram(a: Array) -> Array:

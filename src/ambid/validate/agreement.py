@@ -22,7 +22,7 @@ from ambid.identify.uncertainty import inverse_information
 Array = NDArray[np.float64]
 
 STRIDES = (2, 4)
-MOST = 4.0  # difference in standard deviations of the refit that chance allows
+MOST = 4.0  # shift in its standard deviations that chance allows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,12 +36,16 @@ class Agreement:
     shift : ndarray, shape (n_refits, n), SI
         Refitted value minus estimate.
     sd : ndarray, shape (n_refits, n), SI
-        Standard deviation of the refitted value, from its information matrix.
+        Standard deviation of the shift under the right model: the refit uses less of the data, so that its variance
+        less that of the fit is that of their difference (Hausman 1978).
+    strides : tuple of int
+        Of the refits that converged.
     """
 
     names: tuple[str, ...]
     shift: Array
     sd: Array
+    strides: tuple[int, ...]
 
     @property
     def largest(self) -> float:
@@ -50,18 +54,18 @@ class Agreement:
 
     @property
     def passed(self) -> bool:
-        """Whether every shift is within 4 standard deviations."""
-        return self.largest < MOST
+        """Whether there was a refit, and every shift is within 4 standard deviations."""
+        return bool(self.strides) and self.largest < MOST
 
     def disagreement(self) -> Array:
-        """Return how far each parameter moves beyond what chance allows for any; 0 where the test passed.
+        """Return how far the parameters move in the refit in which they move most.
 
         Returns
         -------
         ndarray, shape (n,), SI
-            Shift of the refit that moved most.
+            Zeros where no refit converged.
         """
-        if self.passed:
+        if not self.strides:
             return np.zeros(len(self.names))
         return np.asarray(self.shift[np.argmax(np.max(np.abs(self.shift / self.sd), axis=1))])
 
@@ -81,7 +85,8 @@ def agreement(fit: Fit) -> Agreement:
     """
     problem = fit.problem
     size, n = problem.magnitude, problem.n_physical
-    shifts, spreads = [], []
+    shifts, spreads, strides = [], [], []
+    own = inverse_information(np.vstack([fit.J, fit.J_prior]))[:n, :n]
     for stride in STRIDES:
         sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
         start = carry(fit, sparse)
@@ -90,9 +95,14 @@ def agreement(fit: Fit) -> Agreement:
             continue
         spread = inverse_information(np.vstack([again.J, again.J_prior]))[:n, :n]
         shifts.append((again.vector[:n] - fit.vector[:n]) * size)
-        spreads.append(np.sqrt(np.diag(spread)) * size)
+        # at least a tenth of its variance: the difference of two nearly equal variances is not known better
+        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.1 * np.diag(spread))) * size)
+        strides.append(stride)
     return Agreement(
-        names=problem.estimated, shift=np.array(shifts).reshape(-1, n), sd=np.array(spreads).reshape(-1, n)
+        names=problem.estimated,
+        shift=np.array(shifts).reshape(-1, n),
+        sd=np.array(spreads).reshape(-1, n),
+        strides=tuple(strides),
     )
 
 

@@ -111,7 +111,7 @@ def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -
         blocks.append(reduce_rows(wide.reshape(m * n_y, -1)))
         first += m
     R = reduce_rows(np.vstack(blocks), last=True)
-    statistic, degrees = _explained(R, p, fit.J_prior)
+    statistic, degrees = _explained(R, p, fit)
     correlation = (white.T @ lagged) / np.linalg.norm(white, axis=0)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     return ResidualTest(
@@ -131,10 +131,10 @@ def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
     return out
 
 
-def _explained(R: Array, p: int, J_prior: Array) -> tuple[float, int]:
+def _explained(R: Array, p: int, fit: Fit) -> tuple[float, int]:
     """Sum of squares that the added columns explain beyond the Jacobian's, and their rank beyond it."""
-    prior = np.zeros((J_prior.shape[0], R.shape[1]))
-    prior[:, :p] = J_prior
+    prior = np.zeros((fit.J_prior.shape[0], R.shape[1]))
+    prior[:, :p], prior[:, -1] = fit.J_prior, fit.r_prior
     a = np.vstack([R, prior])
     norm = np.linalg.norm(a[:, :-1], axis=0)
     norm[norm == 0] = 1.0

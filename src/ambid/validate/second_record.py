@@ -154,7 +154,7 @@ def _with_covariance(fit: Fit, estimate: Estimate) -> Fit:
     correlation = estimate.covariance / np.outer(sd, sd)
     rows = np.zeros((len(names), problem.size))
     rows[:, : len(names)] = np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(len(names))))
-    return replace(fit, problem=problem, vector=vector, J=at.J, J_prior=rows)
+    return replace(fit, problem=problem, vector=vector, J=at.J, J_prior=rows, r_prior=np.zeros(len(names)))
 
 
 def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
