@@ -43,7 +43,7 @@ def all_checks(fit):
 
 @pytest.mark.parametrize("name", ["bearing", "thesis", "rmit", "coil"])
 def test_the_right_model_passes_every_check(name):
-    checks = all_checks(fitted(name=name))
+    checks = all_checks(fitted(name=name, n=12_000))
     assert {"residuals_white", "residuals_uncorrelated", "identifiable", "plausible", "within_limits"} <= set(checks)
     assert not {k: c.detail for k, c in checks.items() if not c.passed}
     assert all("\n" not in c.detail and c.detail for c in checks.values())
