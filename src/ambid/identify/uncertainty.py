@@ -19,7 +19,8 @@ from ambid.identify.sensitivity import Workspace, linearise, residual_blocks
 Array = NDArray[np.float64]
 
 WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
-_LONG = 300.0  # memories of the predictor from which noise levels are known well enough not to ask
+_SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
+_LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask
 _FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
 _BATCHES = 30  # stretches of the record for the robust covariance
 
@@ -215,7 +216,8 @@ def _left_open(fit: Fit) -> Array:
     if problem.noise != "levels" or predictor is None:
         return extra
     slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
-    if problem.n_used * (1.0 - slowest) > _LONG:
+    memories = problem.n_used * (1.0 - slowest)
+    if memories > _LONG:
         return extra
     work, here = Workspace(problem), inverse_information(np.vstack([fit.J, fit.J_prior]))[:n, :n]
     for j in range(len(problem.model.disturbances)):
@@ -230,6 +232,7 @@ def _left_open(fit: Fit) -> Array:
             step = -(there @ (J[:, free].T @ np.concatenate([at.r, r])))[:n]
             wider = max(0.0, float(np.max(np.diag(there)[:n] / np.diag(here))) - 1.0)
             extra += wider * here + np.outer(step, step)
+    extra += max(0.0, _SHORT / max(memories, 1e-3) - 1.0) * (here + extra)
     felt = np.sqrt(np.max(1.0 + np.diag(extra) / np.diag(here))) > _FELT
     return extra if felt else np.zeros_like(extra)
 

@@ -21,7 +21,7 @@ from ambid.validate.residuals import ResidualTest, residuals_uncorrelated, resid
 
 Array = NDArray[np.float64]
 
-_INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
+_INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
 _SATURATED = 0.005  # part of the samples at a limit that a check lets pass
 
