@@ -89,7 +89,6 @@ def test_parameters_are_found_by_name(estimate):
     assert estimate.parameter("k_i").unit == "N/A"
     with pytest.raises(EstimationError, match="no parameter 'Q'"):
         estimate.parameter("Q")
-    assert estimate.with_timing(plot=0.5).timing_s["plot"] == 0.5
 
 
 @pytest.mark.parametrize("document", [{}, {"schema": "ambid.fit/1"}, [], "text", 3, None])

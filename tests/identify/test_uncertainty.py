@@ -25,23 +25,31 @@ def test_standard_deviations_are_the_cramer_rao_bound(name, names, n):
     # at the truth, so that only the formula is compared, not where the noise has taken the estimate
     known = uncertainty(search(problem, vector, rounds=1, evaluations=1))
     bound = cramer_rao_sd(bench, names)
-    got = np.sqrt(np.diag(known.information)) / known.widening
+    got = np.sqrt(np.diag(known.fisher))
     np.testing.assert_allclose(got, bound, rtol=0.05)
     z = (fit.vector[: len(names)] * problem.magnitude - [bench.truth[k] for k in names]) / bound
     assert np.max(np.abs(z)) < 4
 
 
 def test_covariance_is_the_inverse_of_the_information_matrix():
-    fit = search(*problem_of(run("bearing", 2000, 3), estimated=AXIS))
+    fit = search(*problem_of(run("bearing", 8000, 3), estimated=AXIS))
     known = uncertainty(fit)
     whole = np.vstack([fit.J, fit.J_prior])
     info = whole.T @ whole
     size = np.sqrt(np.diag(info))
     plain = np.linalg.inv(info / np.outer(size, size)) / np.outer(size, size)
     unit = np.outer(fit.problem.magnitude, fit.problem.magnitude)
-    np.testing.assert_allclose(known.information, plain[:5, :5] * unit * known.widening**2, rtol=1e-6)
+    np.testing.assert_allclose(known.fisher, plain[:5, :5] * unit, rtol=1e-6)
+    np.testing.assert_allclose(known.information, known.fisher, rtol=1e-6)  # the record is long enough
     np.testing.assert_allclose(known.standard_deviations(robust=False), np.sqrt(np.diag(known.information)))
     np.testing.assert_allclose(known.relative_sd(robust=False), known.standard_deviations(robust=False) / known.scale)
+
+
+@pytest.mark.parametrize(("name", "names", "n"), CASES, ids=[c[0] for c in CASES])
+def test_nothing_is_added_to_the_bound_of_a_long_record(name, names, n):
+    known = uncertainty(search(*problem_of(run(name, 20_000, 9), estimated=names)))
+    ratio = np.sqrt(np.diag(known.information) / np.diag(known.fisher))
+    assert np.all((ratio > 0.999) & (ratio < 1.1)), ratio
 
 
 def test_four_times_the_record_halves_the_standard_deviation():
