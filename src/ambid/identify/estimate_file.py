@@ -159,7 +159,7 @@ def estimate_from_json(document: Mapping[str, Any], where: str) -> Estimate:
         )
     try:
         return _from_json(document)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise EstimationError(
             f"{where} is not a whole estimate ({type(error).__name__}: {error}). "
             "Write it again with 'ambid identify --json'"

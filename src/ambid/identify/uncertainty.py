@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.identify.innovations import stable
 from ambid.identify.likelihood import Fit, evaluate, prior_rows, weight_of
 from ambid.identify.predictor import assemble
 from ambid.identify.sensitivity import Workspace, linearise, residual_blocks
@@ -213,7 +214,7 @@ def _left_open(fit: Fit) -> Array:
     """
     problem, predictor = fit.problem, assemble(fit.problem, fit.vector, with_derivatives=False)
     n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
-    if problem.noise != "levels" or predictor is None:
+    if problem.noise != "levels" or predictor is None or stable(predictor.A):
         return extra
     slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
     memories = problem.n_used * (1.0 - slowest)
