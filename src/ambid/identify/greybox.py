@@ -92,7 +92,7 @@ def _greybox(
     assert fit is not None
     if delay == "auto":
         fit = _with_fraction(fit, tick)
-        if noise == "auto" and fit.problem.fractional:
+        if noise == "auto":
             fit = _without_disturbances(fit, tick)
     if noise != "levels":
         fit = _with_gain(fit, tick, force=noise == "gain")
@@ -121,7 +121,7 @@ def _quiet(problem: PredictorProblem, vector: Array, tick: Callable[[], None] | 
 
 
 def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
-    """Drop the disturbances again where a fraction of a sample of delay was all that they stood for."""
+    """Drop the disturbances again where a wrong delay was all that they stood for."""
     if fit.problem.noise != "levels":
         return fit
     quiet = _quiet(fit.problem, fit.vector, tick)
@@ -185,7 +185,7 @@ def carry(fit: Fit, problem: PredictorProblem) -> Array:
 def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     """Estimate the delay as a real number where the score test says that the data show a fraction of a sample."""
     price = np.log(fit.problem.n_used)  # BIC: one number more
-    for _ in range(3):
+    for _ in range(8):
         delay = fit.problem.delay
         free = replace(fit.problem, fractional=True, lag=0.0, skip=max(fit.problem.skip, delay + 2))
         start = carry(fit, free)
@@ -196,6 +196,10 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
             promise = max(promise, score_statistic(free, before, fit.covariance))
         if promise < price:
             return fit
+        neighbour = _better_neighbour(fit, tick)
+        if neighbour is not None:
+            fit = neighbour
+            continue
         found = search(free, start, tick=tick)
         total = free.delay_samples(found.vector)
         if found.status == "failed" or fit.criterion - found.criterion < price:
@@ -216,6 +220,19 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
             return again
         fit = again
     return fit
+
+
+def _better_neighbour(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
+    """The fit with one sample of delay more or less, if one of them is better: a start may have missed the delay."""
+    best = fit
+    for delay in (fit.problem.delay + 1, fit.problem.delay - 1):
+        if delay >= 0:
+            problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
+            found = search(problem, carry(fit, problem), tick=tick)
+            # compared per sample, because a longer delay may leave one sample less
+            if found.criterion / found.problem.n_used < best.criterion / best.problem.n_used:
+                best = found
+    return best if best is not fit else None
 
 
 def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit:

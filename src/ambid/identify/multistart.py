@@ -145,19 +145,9 @@ def _scored(
 ) -> list[Candidate]:
     """Return the best candidates of all bands and delays, each at several noise levels."""
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
-    stretch = _busiest(centred.u, _STRETCH)
-    coarse: list[tuple[float, PredictorProblem, dict[str, float]]] = []
-    work: Workspace | None = None
-    floor, spread = noise_floor(centred.y), np.std(centred.u, axis=0)
-    for d, values, sizes in _values(model, centred, parameters, delays, floor):
-        scales = scales_for(model, values, spread, floor, signals.rate_hz)
-        problem = _problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
-        part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-        # the scaled data are the same for all candidates of a delay
-        if work is None or coarse[-1][1].delay != problem.delay:
-            work = Workspace(part)
-        coarse.append((evaluate(part, _vector(part, values), work)[0], problem, values))
-    coarse.sort(key=lambda c: c[0])
+    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u, centred.y]).T, strict=True))
+    moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
+    coarse = _coarse(model, centred, parameters, moments, delays)
     found = []
     for _, problem, values in coarse[:_KEPT]:
         work = Workspace(problem)
@@ -169,24 +159,43 @@ def _scored(
     return found
 
 
-def _values(
-    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float], floor: Array
-) -> Iterator[tuple[float, dict[str, float], dict[str, float]]]:
-    """Yield delay, start values and sizes: from the data, and with the values that were given (which may be zero)."""
-    given = {p.name: p.value for p in parameters if p.value is not None}
-    fixed = {p.name: p.value for p in parameters if p.value is not None and p.role == "fixed"}
-    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([signals.u, signals.y]).T, strict=True))
-    moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
+def _coarse(
+    model: LinearModel,
+    centred: Signals,
+    parameters: Sequence[Parameter],
+    moments: weak_form.Moments,
+    delays: Sequence[float],
+) -> list[tuple[float, PredictorProblem, dict[str, float]]]:
+    """Criterion on the busiest stretch, problem and start values of each band and delay, best first."""
+    stretch, floor, spread = _busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
     noise = dict(zip(model.outputs, floor.tolist(), strict=True))
+    found: list[tuple[float, PredictorProblem, dict[str, float]]] = []
     for d in delays:
-        from_data = list(weak_form.candidates(model.name, moments, noise, d, signals.rate_hz, fixed))
-        with_given = [{**values, **given} for values in (from_data or [given])[:3]] if given != fixed else []
-        for values, sizes in zip([*from_data, *with_given], [*from_data, *(from_data or [given])[:3]], strict=False):
-            possible = (
-                all(np.isfinite(v) for v in values.values()) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0
-            )
-            if possible and len(values) == len(model.parameters):
-                yield d, values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
+        work: Workspace | None = None
+        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, _fixed(parameters))
+        for values, sizes in _possible(model, list(from_data), parameters):
+            scales = scales_for(model, values, spread, floor, centred.rate_hz)
+            problem = _problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
+            part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
+            work = work or Workspace(part)  # the scaled data are the same for all candidates of a delay
+            found.append((evaluate(part, _vector(part, values), work)[0], problem, values))
+    return sorted(found, key=lambda c: c[0])
+
+
+def _fixed(parameters: Sequence[Parameter]) -> dict[str, float]:
+    return {p.name: p.value for p in parameters if p.value is not None and p.role == "fixed"}
+
+
+def _possible(
+    model: LinearModel, from_data: list[dict[str, float]], parameters: Sequence[Parameter]
+) -> Iterator[tuple[dict[str, float], dict[str, float]]]:
+    """Yield start values that make a plant, and sizes: from the data, and with the values given (which may be zero)."""
+    given = {p.name: p.value for p in parameters if p.value is not None}
+    bases = (from_data or [given])[:3] if given != _fixed(parameters) else []
+    for values, sizes in [*((v, v) for v in from_data), *(({**v, **given}, v) for v in bases)]:
+        finite = all(np.isfinite(v) for v in values.values())
+        if finite and len(values) == len(model.parameters) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0:
+            yield values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
 
 
 def _busiest(u: Array, length: int) -> slice:

@@ -102,6 +102,7 @@ def candidates(
     known : Mapping[str, float]
         Fixed values, SI; they are used, and returned unchanged.
 
+
     Yields
     ------
     dict of str to float

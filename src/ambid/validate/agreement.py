@@ -95,8 +95,8 @@ def agreement(fit: Fit) -> Agreement:
             continue
         spread = inverse_information(np.vstack([again.J, again.J_prior]))[:n, :n]
         shifts.append((again.vector[:n] - fit.vector[:n]) * size)
-        # at least a tenth of its variance: the difference of two nearly equal variances is not known better
-        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.1 * np.diag(spread))) * size)
+        # at least a quarter of its variance: the difference of two nearly equal variances is not known better
+        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.25 * np.diag(spread))) * size)
         strides.append(stride)
     return Agreement(
         names=problem.estimated,

@@ -20,7 +20,7 @@ from ambid.identify.sensitivity import Workspace, reduce_rows, residual_blocks
 Array = NDArray[np.float64]
 
 P_LEAST = 1e-3  # 99.9 % bounds
-_WHITE_LAGS = (1, 2, 3, 4, 5, 6, 8, 10)
+_WHITE_LAGS = (1, 2, 3, 5, 8, 13)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +87,7 @@ def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
     problem = fit.problem
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input
     longest = max(2, len(e) // 20)
-    lags = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 12)}))
+    lags = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
     white = e @ weight_of(fit.covariance).T
     return _score_test(fit, white, u, lags)
 
