@@ -68,11 +68,11 @@ def test_identify_draws_and_reports(bench, ambid):
 
 def test_a_second_record_is_judged_and_counts_under_strict(bench, ambid, record_text):
     lines = record_text.splitlines()
-    (bench / "first.csv").write_text("\n".join(lines[:1502]) + "\n")
-    (bench / "second.csv").write_text("\n".join(lines[:2] + lines[1502:]) + "\n")
+    (bench / "first.csv").write_text("\n".join(lines[:2402]) + "\n")
+    (bench / "second.csv").write_text("\n".join(lines[:2] + lines[2402:]) + "\n")
     good = ambid("identify", "first.csv", "--validate", "second.csv", "--json", "found.json", "--strict")
     assert good.code == 0
-    assert "on the second record (1500 samples)" in good.out
+    assert "on the second record (600 samples)" in good.out
     judged = ambid("validate", "found.json", "second.csv", "--json", "-", "--strict")
     assert judged.code == 0
     document = json.loads(judged.out)
@@ -82,7 +82,7 @@ def test_a_second_record_is_judged_and_counts_under_strict(bench, ambid, record_
     for role, fit in document["fit"].items():
         assert fit["one_step"] == pytest.approx(stored["fit"][role]["one_step"], abs=1e-9)
     # a bench whose position sensor reads half: the estimate must not pass on it
-    values = np.loadtxt(lines[1502:], delimiter=",")
+    values = np.loadtxt(lines[2402:], delimiter=",")
     values[:, 3] *= 0.5
     rows = [",".join(f"{x:.6g}" for x in row) for row in values]
     (bench / "other.csv").write_text("\n".join([lines[1], *rows]) + "\n")
