@@ -56,32 +56,45 @@ def state_scan(M: Array, w: Array, x: Array) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def sensitivity_scan(F: Array, w: Array, y: Array, s: Array) -> None:
+def sensitivity_scan(F: Array, w: Array, y: Array, s: Array, rows: Array, last: int) -> None:
     """Turn forcings into sensitivities in place, many at once, and put the residual beside them.
 
-    `s` (block + 1, n, p + 1) holds the sensitivities at the first sample in s[0, :, :p] and the forcing of sample k in
-    s[k + 1, :, :p]; on return s[k + 1] = F s[k] + forcing, and s[k, o, p] = y[k, o] + w[k, o] for every output o.
-    Estimated numbers run along the last axis, so that vector instructions serve them.
+    `s` (n, width) holds the sensitivities at the first sample and moves along in place. `rows` (n, block, width) holds
+    the forcing, s[k + 1] = F s[k] + rows[:, k], and gets s[k] of the first states, which are the outputs; its column
+    `last` gets y[k, o] + w[k, o]. Estimated numbers run along the last axis, so that vector instructions serve them.
+    The compiler can use them because results go where their own forcing was: with an array more, or fewer than 16
+    numbers, checking that nothing overlaps would cost more than they gain.
     """
-    n, p, n_y = s.shape[1], s.shape[2] - 1, y.shape[1]
-    if n == 3:
+    (n, width), n_y = s.shape, y.shape[1]
+    if n == 3 and n_y == 2:
         f00, f01, f02 = F[0, 0], F[0, 1], F[0, 2]
         f10, f11, f12 = F[1, 0], F[1, 1], F[1, 2]
         f20, f21, f22 = F[2, 0], F[2, 1], F[2, 2]
+        s0, s1, s2 = s[0], s[1], s[2]
+        r0, r1, r2 = rows[0], rows[1], rows[2]
         for k in range(y.shape[0]):
-            for q in range(p):
-                a, b, c = s[k, 0, q], s[k, 1, q], s[k, 2, q]
-                s[k + 1, 0, q] += f00 * a + f01 * b + f02 * c
-                s[k + 1, 1, q] += f10 * a + f11 * b + f12 * c
-                s[k + 1, 2, q] += f20 * a + f21 * b + f22 * c
-            for o in range(n_y):
-                s[k, o, p] = y[k, o] + w[k, o]
+            for q in range(width):
+                a, b, c = s0[q], s1[q], s2[q]
+                d, e, f = r0[k, q], r1[k, q], r2[k, q]
+                r0[k, q], r1[k, q] = a, b
+                s0[q] = d + f00 * a + f01 * b + f02 * c
+                s1[q] = e + f10 * a + f11 * b + f12 * c
+                s2[q] = f + f20 * a + f21 * b + f22 * c
+            r0[k, last], r1[k, last] = y[k, 0] + w[k, 0], y[k, 1] + w[k, 1]
         return
+    new = np.empty((n, width))
     for k in range(y.shape[0]):
         for i in range(n):
+            for q in range(width):
+                new[i, q] = rows[i, k, q]
             for j in range(n):
                 f = F[i, j]
-                for q in range(p):
-                    s[k + 1, i, q] += f * s[k, j, q]
+                for q in range(width):
+                    new[i, q] += f * s[j, q]
         for o in range(n_y):
-            s[k, o, p] = y[k, o] + w[k, o]
+            for q in range(width):
+                rows[o, k, q] = s[o, q]
+            rows[o, k, last] = y[k, o] + w[k, o]
+        for i in range(n):
+            for q in range(width):
+                s[i, q] = new[i, q]

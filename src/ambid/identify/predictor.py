@@ -175,6 +175,8 @@ def _stepped(
     problem: PredictorProblem, lag: float, plant: DiscreteSpace, slopes: Sequence[DiscreteSpace]
 ) -> tuple[Step, list[Step]]:
     """Put the inputs at their lags and take the plant over `stride` samples, with derivatives by the product rule."""
+    if problem.lags == (0,):
+        return Step(A=plant.A, inputs=plant.B, E=plant.E), [Step(A=d.A, inputs=d.B, E=d.E) for d in slopes]
     n, n_u = plant.B.shape
     place = problem.taps.index(int(np.floor(lag)))
 

@@ -13,8 +13,8 @@ from ambid.identify.problem import PredictorProblem
 
 Array = NDArray[np.float64]
 
-_BLOCK = 2048  # samples: sensitivities of one block stay in the second-level cache
-_QR_ROWS = 512  # rows of one small QR: below the size at which the linear algebra library starts threads
+_BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
+_QR_ROWS = 256  # rows of one small QR: below the size at which the linear algebra library starts threads
 
 
 class Workspace:
@@ -28,8 +28,10 @@ class Workspace:
     ----------
     y : ndarray, shape (n_used, n_outputs)
         Scaled outputs.
+    w : ndarray, shape (n_used, n_states + n_lags n_inputs + n_outputs + 1)
+        Room for the states of the predictor, and what drives it: inputs at the problem's lags, y, 1.
     z : ndarray, shape (n_used, n_lags n_inputs + n_outputs + 1)
-        What drives the predictor: inputs at the problem's lags, y, 1.
+        What drives the predictor, a view of `w`.
     gain : ndarray or None
     """
 
@@ -40,7 +42,9 @@ class Workspace:
         # inputs after the last sample do not exist; they would act only after the last output
         u = problem.u / problem.scales.input
         lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
-        self.z = np.hstack([*lagged, self.y, np.ones((at.size, 1))])
+        n = len(problem.model.states)
+        self.w = np.hstack([np.zeros((at.size, n)), *lagged, self.y, np.ones((at.size, 1))])
+        self.z = self.w[:, n:]
         self.gain: Array | None = None
         self._weight, self._weighted = np.zeros((0, 0)), self.y
         self._buffers: tuple[Array, ...] = ()
@@ -58,7 +62,7 @@ class Workspace:
             Not initialised.
         """
         if tuple(b.shape for b in self._buffers) != shapes:
-            self._buffers = tuple(np.empty(shape) for shape in shapes)
+            self._buffers = tuple(_aligned(shape) for shape in shapes)
         return self._buffers
 
     def weighted(self, weight: Array) -> Array:
@@ -77,6 +81,14 @@ class Workspace:
         return self._weighted
 
 
+def _aligned(shape: tuple[int, ...]) -> Array:
+    """Return an array that begins where a cache line does: vector instructions want that."""
+    size = int(np.prod(shape))
+    raw = np.empty(size + 8)
+    first = -(raw.ctypes.data // 8) % 8
+    return raw[first : first + size].reshape(shape)
+
+
 def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> Array | None:
     """Return the innovations in scaled output units.
 
@@ -91,12 +103,15 @@ def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None
     -------
     ndarray, shape (n_used, n_outputs), or None where there is no predictor at `vector`
     """
+    from ambid.identify._kernels import state_scan
+
     work = work or Workspace(problem)
     predictor = assemble(problem, vector, near=work.gain, with_derivatives=False)
     if predictor is None:
         return None
     work.gain = predictor.gain
-    e = work.y - run(predictor.M, work.z, predictor.x0)[:-1] @ predictor.C.T
+    state_scan(predictor.M, work.w, predictor.x0.copy())
+    e = work.y - work.w[:, : predictor.x0.size] @ predictor.C.T
     return e if np.all(np.isfinite(e[-1])) else None
 
 
@@ -226,24 +241,22 @@ def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, wor
     turned = np.linalg.inv(basis)
     M = basis @ predictor.M
     M[:, :n] = M[:, :n] @ turned
-    forcing = np.zeros((M.shape[1], n, p + 1))
-    derivative = np.tensordot(basis, predictor.dM, axes=1)  # (n, n + n_z, p)
-    forcing[:n, :, :p] = np.tensordot(turned, derivative[:, :n], axes=(0, 1))
-    forcing[n:, :, :p] = derivative[:, n:].swapaxes(0, 1)
-    flat, outputs = forcing.reshape(-1, n * (p + 1)), work.weighted(weight)
-    F, length = np.ascontiguousarray(M[:, :n]), min(_BLOCK, n_used)
-    s, w = work.buffers((length + 1, n, p + 1), (length, M.shape[1]))
-    s[0], x = 0.0, basis @ predictor.x0
-    s[0, :, problem.slices["initial"]] = basis
+    # vector instructions take eight numbers at a time, and pay from sixteen on: columns of zeros fill up to that
+    width, length = max(16, -(-(p + 1) // 8) * 8), min(_BLOCK, n_used)
+    forcing = np.zeros((n, M.shape[1], width))
+    forcing[:, :, :p] = np.tensordot(basis, predictor.dM, axes=1)
+    forcing[:, :n] = turned.T @ forcing[:, :n]
+    rows, s = work.buffers((n, length, width), (n, width))
+    s[:], x = 0.0, basis @ predictor.x0
+    s[:, problem.slices["initial"]] = basis
+    F, outputs = np.ascontiguousarray(M[:, :n]), work.weighted(weight)
     for a in range(0, n_used, _BLOCK):
-        m = min(_BLOCK, n_used - a)
-        part = w[:m]
-        part[:, n:] = work.z[a : a + m]
+        part = work.w[a : a + _BLOCK]
+        block = rows[:, : part.shape[0]]
         state_scan(M, part, x)
-        np.matmul(part, flat, out=s[1 : m + 1].reshape(m, -1))
-        sensitivity_scan(F, part, outputs[a : a + m], s[: m + 1])
-        yield s[:m, :n_y]
-        s[0] = s[m]
+        np.matmul(part, forcing, out=block)
+        sensitivity_scan(F, part, outputs[a : a + _BLOCK], s, block, p)
+        yield block[:n_y, :, : p + 1].swapaxes(0, 1)
 
 
 def null_space(a: Array) -> Array:

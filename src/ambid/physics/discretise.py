@@ -68,12 +68,15 @@ def discretise(
 
     n, nu = space.B.shape
     size = n + nu + space.E.shape[1]
-    whole = np.zeros((size, size), dtype=np.result_type(space.A, space.B, space.E))
-    whole[:n] = np.hstack([space.A, space.B, space.E]) * period_s
-    stack = np.zeros((max(1, len(derivatives)), 2 * size, 2 * size), dtype=whole.dtype)
-    stack[:, :size, :size] = stack[:, size:, size:] = whole
-    for block, d in zip(stack, derivatives, strict=False):
-        block[:n, size:] = np.hstack([d.A, d.B, d.E]) * period_s
+    kind = np.result_type(space.A, space.B, space.E)
+    stack = np.zeros((max(1, len(derivatives)), 2 * size, 2 * size), dtype=kind)
+    edges = (slice(0, n), slice(n, n + nu), slice(n + nu, size))
+    for name, columns in zip("ABE", edges, strict=True):
+        stack[:, :n, columns] = getattr(space, name)
+        if derivatives:
+            stack[:, :n, columns.start + size : columns.stop + size] = [getattr(d, name) for d in derivatives]
+    stack[:, size : size + n, size:] = stack[:, :n, :size]
+    stack *= period_s
     full = expm(stack)
     late = full if fraction is None else expm(stack * (1.0 - fraction))
 
