@@ -7,7 +7,7 @@ removes the bias.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,9 @@ from ambid.identify.sensitivity import run
 Array = NDArray[np.float64]
 
 _ITERATIONS = 20
+_FEEDBACK = (
+    "biased where a controller makes the voltage depend on the current; say open_loop=True, or use the 'coil' model"
+)
 _SETTLED = 1e-10  # change, relative to the current, at which the instruments have settled
 
 
@@ -33,6 +36,9 @@ class CoilEstimate:
     a, b : float
         Pole in rad/s and gain in A/(V s).
     method : {"least squares", "instrumental variable"}
+    warning : str or None
+        What to know before using it: both methods are biased where a controller makes the voltage depend on the
+        current.
     """
 
     R: float
@@ -40,9 +46,10 @@ class CoilEstimate:
     a: float
     b: float
     method: Literal["least squares", "instrumental variable"]
+    warning: str | None = None
 
 
-def coil_least_squares(voltage: Array, current: Array, rate_hz: float) -> CoilEstimate:
+def coil_least_squares(voltage: Array, current: Array, rate_hz: float, *, open_loop: bool = False) -> CoilEstimate:
     """Estimate a coil by least squares (thesis eq. 4.1 to 4.3); biased by noise on the current.
 
     i[k+1] = alpha i[k] + beta V[k] + constant, alpha = exp(-a T), beta = b (1 - alpha)/a under a zero-order hold.
@@ -51,6 +58,8 @@ def coil_least_squares(voltage: Array, current: Array, rate_hz: float) -> CoilEs
     ----------
     voltage, current : ndarray, shape (n_samples,), V and A
     rate_hz : float
+    open_loop : bool
+        The record is known to be taken without feedback; otherwise the result carries a warning.
 
     Returns
     -------
@@ -63,10 +72,10 @@ def coil_least_squares(voltage: Array, current: Array, rate_hz: float) -> CoilEs
     """
     rows, target = _regression(voltage, current)
     found = np.asarray(np.linalg.lstsq(rows, target, rcond=None)[0], dtype=np.float64)
-    return _coil(found, rate_hz, "least squares")
+    return replace(_coil(found, rate_hz, "least squares"), warning=None if open_loop else _FEEDBACK)
 
 
-def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEstimate:
+def coil_instrumental(voltage: Array, current: Array, rate_hz: float, *, open_loop: bool = False) -> CoilEstimate:
     """Estimate a coil by the refined instrumental variable (Young 2011, ch. 7); the bias of least squares is gone.
 
     The instrument is the current of the estimated coil under the same voltage, free of measurement noise; it and the
@@ -77,6 +86,8 @@ def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEst
     ----------
     voltage, current : ndarray, shape (n_samples,), V and A
     rate_hz : float
+    open_loop : bool
+        The record is known to be taken without feedback; otherwise the result carries a warning.
 
     Returns
     -------
@@ -101,7 +112,8 @@ def coil_instrumental(voltage: Array, current: Array, rate_hz: float) -> CoilEst
         before, found = found, np.linalg.solve(gram, (smooth[0] / size).T @ smooth[2][:, 0]) / size
         # what the change does to the current, not to a number that may be zero
         if np.linalg.norm((found - before) * np.linalg.norm(rows, axis=0)) < _SETTLED * np.linalg.norm(target):
-            return _coil(found, rate_hz, "instrumental variable")
+            estimate = _coil(found, rate_hz, "instrumental variable")
+            return replace(estimate, warning=None if open_loop else _FEEDBACK)
     raise EstimationError(
         "the instrumental variable for the coil does not settle; voltage and current are not those of a coil at rest, "
         "or too noisy. Check channels.voltage and channels.current, or use the 'coil' model"
