@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -63,6 +64,10 @@ def run(arguments: Sequence[str]) -> int:
         said = str(error) if isinstance(error, AmbidError) else refusal(error)
         if said is not None:
             return _refused(said, 2, trace=trace)
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+            return _refused(
+                f"the output cannot be written: {error.strerror}. Make room, or write elsewhere", 2, trace=trace
+            )
         where = f"{type(error).__name__}: {' '.join(str(error).split())}"
         advice = "" if trace else ". Run with --traceback, and report it"
         return _refused(f"a defect of ambid: {where}{advice}", 1, trace=trace)

@@ -48,6 +48,8 @@ class Outputs:
         if path is None:
             return
         folder = path.parent
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. Use - for standard output")
         if path.is_dir():
             raise AmbidError(f"{option} {path} is a folder; a file is wanted. Name a file inside it")
         if suffixes and not path.name.lower().endswith(tuple(suffixes)):
@@ -79,6 +81,7 @@ class Outputs:
         AmbidError
             If the system does not let it be written.
         """
+        path = path.resolve()  # through a link, to the file that it stands for
         beside = path.with_name(f".{os.getpid()}-{path.name}")
         self._staged[path] = beside
         try:
@@ -121,4 +124,6 @@ class Outputs:
 
 
 def _same(a: Path, b: Path) -> bool:
+    if a.exists() and b.exists():
+        return a.samefile(b)
     return a.resolve() == b.resolve()

@@ -89,6 +89,11 @@ def read_estimate(path: Path) -> Estimate:
         raise EstimationError(
             f"estimate {path}, row {failure.lineno}: not JSON ({failure.msg}). Give what 'ambid identify --json' wrote"
         ) from None
+    except (RecursionError, ValueError):
+        raise EstimationError(
+            f"estimate {path} is nested too deep, or holds a number that is too long. "
+            "Give what 'ambid identify --json' wrote"
+        ) from None
     return estimate_from_json(document, f"estimate {path}")
 
 

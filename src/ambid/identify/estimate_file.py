@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, ModelError
 from ambid.identify.estimate import (
     Check,
     Continuous,
@@ -19,6 +19,7 @@ from ambid.identify.estimate import (
     NoiseModel,
     OutputFit,
 )
+from ambid.physics.models import model
 
 SCHEMA = "ambid.estimate/1"
 
@@ -158,12 +159,40 @@ def estimate_from_json(document: Mapping[str, Any], where: str) -> Estimate:
             f"{where} has schema {found!r}; an estimate has {SCHEMA!r}. Give a file that 'ambid identify --json' wrote"
         )
     try:
-        return _from_json(document)
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        estimate = _from_json(document)
+        _consistent(estimate)
+        return estimate
+    except (ModelError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
         raise EstimationError(
             f"{where} is not a whole estimate ({type(error).__name__}: {error}). "
             "Write it again with 'ambid identify --json'"
         ) from error
+
+
+def _consistent(estimate: Estimate) -> None:
+    """Raise ValueError where the parts do not belong together: an edited file, or one of another program."""
+    plant = model(estimate.model)
+    specs = {p.name: p for p in plant.parameters}
+    n, n_y = len(plant.states), len(plant.outputs)
+    if [p.name for p in estimate.parameters] != list(specs):
+        raise ValueError(f"the parameters are not those of model {estimate.model!r}")
+    for p in estimate.parameters:
+        if p.unit != specs[p.name].unit:
+            raise ValueError(f"{p.name} is in {p.unit!r} instead of {specs[p.name].unit!r}")
+        if not 1e-15 < abs(p.value) < 1e15 and (p.name in ("m", "L") or p.value != 0):
+            raise ValueError(f"{p.name} = {p.value:g} is no number that a plant can have")
+    if estimate.noise.gain.shape != (n, n_y) or estimate.noise.innovation_covariance.shape != (n_y, n_y):
+        raise ValueError("the noise model is not of the model's size")
+    if (
+        set(estimate.covariance_names) - set(specs)
+        or estimate.covariance.shape != (len(estimate.covariance_names),) * 2
+    ):
+        raise ValueError("the covariance is not of the parameters")
+    if not float(str(estimate.record["rate_hz"])) > 0 or estimate.status not in ("converged", "stalled"):
+        raise ValueError("the record's rate or the status is not that of a finished estimate")
+    for delay in (estimate.delay[role] for role in plant.inputs):
+        if not 0 <= delay.samples < 10**6 or not 0 <= delay.fraction < 1:
+            raise ValueError("the delay is not whole samples and a fraction")
 
 
 def _from_json(d: Mapping[str, Any]) -> Estimate:

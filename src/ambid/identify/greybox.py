@@ -66,7 +66,7 @@ def greybox(
     EstimationError
         If the record is too short, a channel is constant, or no start value makes a predictor.
     """
-    _check(model, signals, parameters)
+    _check(model, signals, parameters, delay)
     with one_thread():
         return _greybox(model, signals, parameters, delay, noise, tick)
 
@@ -136,7 +136,7 @@ def _gain_promise(fit: Fit) -> float:
     return score_statistic(free, carry(fit, free), fit.covariance) - price
 
 
-def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]) -> None:
+def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> None:
     n_estimated = sum(p.role != "fixed" for p in parameters)
     if n_estimated == 0:
         raise EstimationError("every parameter of the rig is fixed; nothing is left to identify. Free at least one")
@@ -145,6 +145,11 @@ def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]
         raise EstimationError(
             f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters wants at least "
             f"{least}. Record longer, or cut less"
+        )
+    if delay != "auto" and not 0 <= delay <= signals.y.shape[0] - least:
+        raise EstimationError(
+            f"the delay is given as {delay:g} samples; in a record of {signals.y.shape[0]} samples at most "
+            f"{signals.y.shape[0] - least} leave enough to identify from. Correct channels.<input>.delay"
         )
     for roles, values in ((model.inputs, signals.u), (model.outputs, signals.y)):
         for role, column in zip(roles, values.T, strict=True):

@@ -88,7 +88,7 @@ def assemble(
     try:
         plant, slopes = _discrete(problem, theta, lag, with_derivatives=with_derivatives)
         K, dK, inner = _gain(problem, vector[sl["noise"]], plant, slopes, near, with_derivatives=with_derivatives)
-    except (np.linalg.LinAlgError, ValueError):
+    except (np.linalg.LinAlgError, ValueError, ArithmeticError):
         return None
     step, step_slopes = _stepped(problem, lag, plant, slopes)
     F, offset = step.A - K @ plant.C, vector[sl["offset"]]

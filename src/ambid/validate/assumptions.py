@@ -9,7 +9,7 @@ import numpy as np
 from ambid.identify.estimate import Check
 from ambid.identify.likelihood import Fit, freed
 from ambid.identify.multistart import MAX_DELAY
-from ambid.identify.uncertainty import Uncertainty
+from ambid.identify.uncertainty import Uncertainty, inverse_information
 
 _P_LEAST = 1e-3
 _FAR = 3.3  # standard deviations between a prior and the record
@@ -31,7 +31,7 @@ def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimate
     """
     return {
         "fixed_agree": _fixed_agree(fit),
-        "priors_agree": _priors_agree(fit, known),
+        "priors_agree": _priors_agree(fit),
         "delay_in_range": _delay_in_range(fit, delay_how),
         "long_enough": _long_enough(known),
     }
@@ -55,20 +55,26 @@ def _fixed_agree(fit: Fit) -> Check:
     return Check(passed=worst >= _P_LEAST, p=worst, detail=detail)
 
 
-def _priors_agree(fit: Fit, known: Uncertainty) -> Check:
-    """Each prior against the estimate: their difference, over what it should scatter by."""
+def _priors_agree(fit: Fit) -> Check:
+    """Each prior against where one Newton step without it would take its parameter."""
     problem = fit.problem
-    values = fit.vector[problem.slices["physical"]] * problem.magnitude
-    after = np.diag(known.fisher)
     worst, name = 0.0, ""
-    for j in np.flatnonzero(np.isfinite(problem.prior_sd)):
-        # what the data pull the prior by has the variance that the data took away; where they say nothing it stays put
-        scatter = np.sqrt(max(problem.prior_sd[j] ** 2 - after[j], 1e-4 * problem.prior_sd[j] ** 2))
-        far = float(abs(values[j] - problem.prior_mean[j]) / scatter)
+    for row, r in zip(fit.J_prior, fit.r_prior, strict=True):
+        j = int(np.argmax(np.abs(row)))
+        if j >= problem.n_physical:
+            continue
+        others = fit.J_prior[fit.J_prior[:, j] == 0.0]
+        # at the optimum the pull of the prior is what the data and the other priors hold against
+        without = inverse_information(np.vstack([fit.J, others]))
+        step, variance = float(without[j] @ row) * float(r), float(without[j, j])
+        size = problem.magnitude[j]
+        # r = (value - mean) / sd, so that the data alone would be at mean + r sd + step
+        far = abs(step * size + float(r) * problem.prior_sd[j])
+        far /= float(np.hypot(np.sqrt(variance) * size, problem.prior_sd[j]))
         if not name or far > worst:
             worst, name = far, problem.estimated[j]
     if worst > _FAR:
-        detail = f"the record pulls {name} {worst:.1f} sd away from its prior: one of them is wrong. Check the prior"
+        detail = f"the record puts {name} {worst:.1f} sd away from its prior: one of them is wrong. Check the prior"
     else:
         detail = "priors and record agree" if name else "there are no priors"
     return Check(passed=worst <= _FAR, values={"largest_sd": worst}, detail=detail)
