@@ -66,8 +66,12 @@ def by_transfer_functions(f, matrix, c, x0, u, y):
 
 
 def residual(vector, filtered, u, y, period, scale, weight):
-    """Weighted innovations at 13 estimated numbers."""
-    return ((y - filtered(*predictor(vector, period, scale), u, y)) @ weight.T).ravel()
+    """Weighted innovations at 13 estimated numbers; infinite where there is no predictor: a step gets shorter."""
+    try:
+        recursion = predictor(vector, period, scale)
+    except np.linalg.LinAlgError:
+        return np.full(y.size, np.inf)
+    return ((y - filtered(*recursion, u, y)) @ weight.T).ravel()
 
 
 def jacobian(vector, at, *arguments):
