@@ -61,6 +61,9 @@ def run(arguments: Sequence[str]) -> int:
         from ambid.cli.app import refusal
         from ambid.errors import AmbidError
 
+        # compiled code turns Ctrl-C into an error of its own
+        if any(isinstance(e, KeyboardInterrupt) for e in (error.__cause__, error.__context__)):
+            return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
         said = str(error) if isinstance(error, AmbidError) else refusal(error)
         if said is not None:
             return _refused(said, 2, trace=trace)

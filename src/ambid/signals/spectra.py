@@ -59,7 +59,7 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
 
 
 def coherence(u: Array, y: Array, rate_hz: float, *, segment: int | None = None) -> tuple[Array, Array]:
-    """Estimate the coherence |S_uy|²/(S_uu S_yy) by Welch's method.
+    """Estimate the coherence ``|S_uy|² / (S_uu S_yy)`` by Welch's method.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 def fit_of(error: Array, y: Array) -> Array:
-    """Return 1 - |e| / |y - mean| of each column: 1 is perfect, 0 as good as the mean.
+    """Return ``1 - |e| / |y - mean|`` of each column: 1 is perfect, 0 as good as the mean.
 
     Parameters
     ----------
