@@ -314,13 +314,14 @@ def search(
     at = linearise(problem, vector, weight_of(covariance), work)
     if at is None:
         return _failed(problem, start)
+    r_prior, J_prior = prior_rows(problem, vector)
     return Fit(
         problem=problem,
         vector=vector,
         covariance=covariance,
         J=at.J,
-        J_prior=prior_rows(problem, vector)[1],
-        r_prior=prior_rows(problem, vector)[0],
+        J_prior=J_prior,
+        r_prior=r_prior,
         criterion=value,
         status=status,
         evaluations=count,
@@ -341,9 +342,6 @@ class _Weighted:
     def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
         self.problem, self.work, self.tick = problem, work, tick
         self.weight = np.eye(problem.y.shape[1])
-        self._forget()
-
-    def _forget(self) -> None:
         self.at = np.full(self.problem.size, np.nan)
         self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
 
