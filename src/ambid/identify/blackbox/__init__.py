@@ -1,0 +1,1 @@
+"""What all black-box estimators share: data in, models, results, files."""

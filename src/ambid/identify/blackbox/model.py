@@ -1,0 +1,144 @@
+"""What a black-box model is: coefficients, frequency response, poles and zeros, each with its derivatives.
+
+Derivatives are by *all* coefficients, fixed ones included: a coefficient that was not estimated has a row and a column
+of zeros in the covariance. So every spread follows by the delta method, and no model has to know what was free.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from ambid.identify.blackbox.state_space import StateSpaceModel
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+class BlackBoxModel(Protocol):
+    """A linear model y = G u + H e, discrete (`dt` in s) or continuous (`dt` None).
+
+    Attributes
+    ----------
+    dt : float or None
+        Sampling interval in s.
+    n_inputs, n_outputs : int
+    names : tuple of str
+        Of all coefficients, in the order of `theta`.
+    theta : ndarray, shape (n_theta,)
+        All coefficients.
+    """
+
+    @property
+    def dt(self) -> float | None: ...  # noqa: D102
+    @property
+    def n_inputs(self) -> int: ...  # noqa: D102
+    @property
+    def n_outputs(self) -> int: ...  # noqa: D102
+    @property
+    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def theta(self) -> Array: ...  # noqa: D102
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G at `omega` (n_frequencies,) in rad/s.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
+        ...
+
+    def frequency_response_derivative(self, omega: Array) -> Complex:
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
+        ...
+
+    def noise_response(self, omega: Array) -> Complex:
+        """Return H.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
+        ...
+
+    def poles(self) -> Complex:
+        """Return the poles of G (of H for a time series) in z, or in rad/s for a continuous model.
+
+        Returns
+        -------
+        ndarray, shape (n_poles,), complex
+        """
+        ...
+
+    def pole_derivative(self) -> Complex:
+        """Return d(pole)/dtheta.
+
+        Returns
+        -------
+        ndarray, shape (n_poles, n_theta), complex
+        """
+        ...
+
+    def zeros(self) -> Complex:
+        """Return the (transmission) zeros of G.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros,), complex
+        """
+        ...
+
+    def zero_derivative(self) -> Complex:
+        """Return d(zero)/dtheta.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros, n_theta), complex
+        """
+        ...
+
+    def state_space(self) -> StateSpaceModel:
+        """Return the model in innovations form."""
+        ...
+
+
+def root_derivative(coefficients: Array, roots: Complex) -> Complex:
+    """Return the derivative of polynomial roots by its coefficients.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (n + 1,)
+        Of z^n ... z^0.
+    roots : ndarray, shape (n_roots,)
+
+    Returns
+    -------
+    ndarray, shape (n_roots, n + 1), complex
+        From P(r) = 0: dr/dp_k = -r^(n-k) / P'(r). Infinite at a multiple root.
+    """
+    n = coefficients.size - 1
+    powers = roots[:, None] ** np.arange(n, -1, -1)[None, :]
+    slope = np.polyval(np.polyder(coefficients), roots) if n else np.ones_like(roots)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(-powers / slope[:, None])

@@ -1,0 +1,119 @@
+"""Prediction and simulation with any model in innovations form, its initial state estimated from the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify._kernels import state_scan
+from ambid.identify.blackbox.state_space import StateSpaceModel
+
+Array = NDArray[np.float64]
+
+_FORGOTTEN = 1e-9  # what is left of an initial state when it no longer counts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Offsets:
+    """What is taken off inputs and outputs before a model is used, SI.
+
+    Attributes
+    ----------
+    u : ndarray, shape (n_inputs,)
+    y : ndarray, shape (n_outputs,)
+    """
+
+    u: Array
+    y: Array
+
+
+def one_step(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
+    """Predict every output from all samples before it (thesis eq. 3.12), the initial state by least squares.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        Discrete.
+    u : ndarray, shape (n_samples, n_inputs), SI
+    y : ndarray, shape (n_samples, n_outputs), SI
+    offsets : Offsets
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n_outputs), SI
+    """
+    F = model.A - model.K @ model.C
+    G = np.hstack([model.B - model.K @ model.D, model.K])
+    return _response(F, G, model, u, y, offsets)
+
+
+def simulation(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array | None:
+    """Simulate the outputs from the inputs alone; the initial state that fits `y` best is the only use of `y`.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        Discrete.
+    u : ndarray, shape (n_samples, n_inputs), SI
+    y : ndarray, shape (n_samples, n_outputs), SI
+    offsets : Offsets
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n_outputs), SI, or None
+        None for an unstable model: its simulation runs away and says nothing. None without inputs.
+    """
+    if not model.n_inputs or not stable(model):
+        return None
+    G = np.hstack([model.B, np.zeros_like(model.K)])
+    return _response(model.A, G, model, u, y, offsets)
+
+
+def stable(model: StateSpaceModel) -> bool:
+    """Return whether all poles are inside the unit circle (or the left half plane).
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+
+    Returns
+    -------
+    bool
+    """
+    if not model.order:
+        return True
+    values = np.linalg.eigvals(model.A)
+    return bool(np.max(np.abs(values)) < 1.0 if model.dt is not None else np.max(values.real) < 0.0)
+
+
+def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
+    """Run x+ = F x + G [u; y] from rest and add the free response that fits y best."""
+    z = np.hstack([u - offsets.u, y - offsets.y])
+    n = model.order
+    work = np.hstack([np.zeros((z.shape[0], n)), z])
+    state_scan(np.ascontiguousarray(np.hstack([F, G])), work, np.zeros(n))
+    out = work[:, :n] @ model.C.T + z[:, : model.n_inputs] @ model.D.T
+    if n:
+        free = _free_responses(F, model.C, z.shape[0])
+        m, n_y = free.shape[0], model.n_outputs
+        scale = np.maximum(np.std(y, axis=0), 1e-300)
+        rows = (free / scale[:, None]).reshape(m * n_y, n)
+        error = ((y - offsets.y - out)[:m] / scale).reshape(-1)
+        size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        x0 = np.linalg.lstsq(rows / size, error, rcond=1e-8)[0] / size
+        out[:m] += free @ x0
+    return np.asarray(out + offsets.y)
+
+
+def _free_responses(F: Array, C: Array, n_samples: int) -> Array:
+    """Return C F^k for as long as it counts, shape (m, n_outputs, n)."""
+    radius = float(np.max(np.abs(np.linalg.eigvals(F))))
+    m = n_samples if radius >= 1 else min(n_samples, 20 + F.shape[0] + int(np.log(_FORGOTTEN) / np.log(radius + 1e-30)))
+    out = np.empty((m, *C.shape))
+    row = C
+    for k in range(m):
+        out[k] = row
+        row = row @ F
+    return out

@@ -1,0 +1,100 @@
+"""The register of black-box structures: what each is called, which orders it takes, whether feedback disturbs it.
+
+An estimator is a function ``estimator(data, orders, **options) -> BlackBoxFit`` that leaves `fit`, `criteria` and
+`checks` to `ambid.validate.blackbox`; it imports only when it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Literal
+
+from ambid.errors import EstimationError, nearest
+from ambid.identify.blackbox.fit import BlackBoxFit
+
+Orders = Mapping[str, int | tuple[int, ...]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Structure:
+    """One black-box structure.
+
+    Attributes
+    ----------
+    name, summary : str
+    orders : tuple of str
+        Orders it takes; all but nk are at least 0 (n: at least 1).
+    home : str
+        ``module:function`` of its estimator.
+    inputs : bool
+        Whether it takes inputs.
+    feedback : {"consistent", "biased", "with noise model"}
+        What feedback does to it: nothing; bias; nothing as long as its noise model holds the true one.
+    kind : {"polynomial", "state space", "transfer function"}
+    """
+
+    name: str
+    summary: str
+    orders: tuple[str, ...]
+    home: str
+    inputs: bool
+    feedback: Literal["consistent", "biased", "with noise model"]
+    kind: Literal["polynomial", "state space", "transfer function"]
+
+    @property
+    def estimator(self) -> Callable[..., BlackBoxFit]:
+        """The function that fits it."""
+        module, function = self.home.split(":")
+        found: Callable[..., BlackBoxFit] = getattr(import_module(module), function)
+        return found
+
+
+def _polynomial(name: str, orders: str, feedback: Literal["biased", "with noise model"], summary: str) -> Structure:
+    return Structure(
+        name=name,
+        summary=summary,
+        orders=tuple(orders.split()),
+        home=f"ambid.identify.polynomial:{name}",
+        inputs="nb" in orders,
+        feedback=feedback,
+        kind="polynomial",
+    )
+
+
+STRUCTURES: Mapping[str, Structure] = {
+    s.name: s
+    for s in (
+        _polynomial("fir", "nb nk", "biased", "y = B u + e"),
+        _polynomial("arx", "na nb nk", "with noise model", "A y = B u + e"),
+        _polynomial("armax", "na nb nc nk", "with noise model", "A y = B u + C e"),
+        _polynomial("arma", "na nc", "with noise model", "A y = C e"),
+        _polynomial("ararx", "na nb nd nk", "with noise model", "A y = B u + 1/D e"),
+        _polynomial("ararmax", "na nb nc nd nk", "with noise model", "A y = B u + C/D e"),
+        _polynomial("oe", "nb nf nk", "biased", "y = B/F u + e"),
+        _polynomial("bj", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
+    )
+}
+
+
+def structure(name: str) -> Structure:
+    """Return a structure by name.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    Structure
+
+    Raises
+    ------
+    EstimationError
+        If there is none; names the nearest.
+    """
+    if name not in STRUCTURES:
+        known = ", ".join(STRUCTURES)
+        raise EstimationError(f"structure {name!r} is not known; known: {known}.{nearest(name, list(STRUCTURES))}")
+    return STRUCTURES[name]

@@ -1,0 +1,223 @@
+"""Matrices of transfer functions num/den, continuous (in s) or discrete (in z), highest power first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import ModelError
+from ambid.identify.blackbox.model import root_derivative
+from ambid.identify.blackbox.state_space import StateSpaceModel
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TransferModel:
+    """G[o][i] = num[o][i] / den[o][i] * exp(-s delay[i]), output noise white (H = I).
+
+    Attributes
+    ----------
+    num, den : tuple of tuple of ndarray, shape (degree + 1,) each
+        By output, then input; highest power first, den monic.
+    dt : float or None
+        Sampling interval in s; None for continuous time.
+    delay : tuple of float, s
+        One for each input (whole samples times dt for a discrete model).
+    """
+
+    num: tuple[tuple[Array, ...], ...]
+    den: tuple[tuple[Array, ...], ...]
+    dt: float | None
+    delay: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("num", "den"):
+            rows = tuple(
+                tuple(np.atleast_1d(np.array(p, dtype=np.float64)) for p in row) for row in getattr(self, name)
+            )
+            object.__setattr__(self, name, rows)
+        if not self.delay:
+            object.__setattr__(self, "delay", (0.0,) * len(self.num[0]))
+        shapes = {len(row) for row in (*self.num, *self.den)}
+        if shapes != {len(self.delay)} or len(self.num) != len(self.den):
+            raise ModelError("num, den and delay of a transfer function do not have the same inputs and outputs")
+        for n, d in ((n, d) for rn, rd in zip(self.num, self.den, strict=True) for n, d in zip(rn, rd, strict=True)):
+            if d[0] != 1.0 or n.size > d.size:
+                raise ModelError(f"a transfer function {n}/{d}; its denominator must be monic and of no lower degree")
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.delay)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.num)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, as in `theta`."""
+        variable = "s" if self.dt is None else "z"
+        return tuple(
+            f"{which}[{o},{i}]{variable}{p.size - 1 - k}" for o, i, which, p, _ in self._parts() for k in range(p.size)
+        )
+
+    @property
+    def theta(self) -> Array:
+        """All coefficients, leading ones included, in the order of `names`, shape (n_theta,)."""
+        return np.concatenate([p for _, _, _, p, _ in self._parts()])
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
+        s, lag = self._points(omega)
+        g = np.empty((omega.size, self.n_outputs, self.n_inputs), dtype=np.complex128)
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
+        return g
+
+    def noise_response(self, omega: Array) -> Complex:
+        """Return the identity.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
+        return np.broadcast_to(np.eye(self.n_outputs, dtype=np.complex128), (omega.size,) + (self.n_outputs,) * 2)
+
+    def frequency_response_derivative(self, omega: Array) -> Complex:
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
+        s, lag = self._points(omega)
+        out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
+        for o, i, which, p, place in self._parts():
+            powers = s[:, None] ** np.arange(p.size - 1, -1, -1)
+            den = np.polyval(self.den[o][i], s)
+            factor = lag[:, i] / den if which == "num" else -lag[:, i] * np.polyval(self.num[o][i], s) / den**2
+            out[:, o, i, place] = powers * factor[:, None]
+        return out
+
+    def poles(self) -> Complex:
+        """Return the roots of every denominator.
+
+        Returns
+        -------
+        ndarray, shape (n_poles,), complex
+        """
+        return self._roots("den")[0]
+
+    def pole_derivative(self) -> Complex:
+        """Return the derivative of `poles` by `theta`.
+
+        Returns
+        -------
+        ndarray, shape (n_poles, n_theta), complex
+        """
+        return self._roots("den")[1]
+
+    def zeros(self) -> Complex:
+        """Return the roots of every numerator.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros,), complex
+        """
+        return self._roots("num")[0]
+
+    def zero_derivative(self) -> Complex:
+        """Return the derivative of `zeros` by `theta`.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros, n_theta), complex
+        """
+        return self._roots("num")[1]
+
+    def state_space(self) -> StateSpaceModel:
+        """Return an innovations form with K = 0; delays of a discrete model become states.
+
+        Returns
+        -------
+        StateSpaceModel
+
+        Raises
+        ------
+        ModelError
+            If a continuous model has a delay, which no finite state holds.
+        """
+        from scipy.linalg import block_diag
+        from scipy.signal import tf2ss
+
+        if self.dt is None and any(self.delay):
+            raise ModelError("a continuous model with a delay has no state space. Set the delay apart, or discretise")
+        blocks, n_u, n_y = [], self.n_inputs, self.n_outputs
+        D = np.zeros((n_y, n_u))
+        for o, i in np.ndindex(n_y, n_u):
+            later = 0 if self.dt is None else round(self.delay[i] / self.dt)
+            num, den = self.num[o][i], np.concatenate([self.den[o][i], np.zeros(later)])
+            if den.size == 1:
+                D[o, i] = num[0]
+                continue
+            used = int(np.nonzero(num)[0][0]) if np.any(num) else num.size - 1
+            a, b, c, d = tf2ss(num[used:], den)
+            D[o, i] = d[0, 0]
+            wide_b, wide_c = np.zeros((a.shape[0], n_u)), np.zeros((n_y, a.shape[0]))
+            wide_b[:, i], wide_c[o] = b[:, 0], c[0]
+            blocks.append((a, wide_b, wide_c))
+        A = block_diag(*[b[0] for b in blocks]) if blocks else np.zeros((0, 0))
+        B = np.vstack([np.zeros((0, n_u)), *[b[1] for b in blocks]])
+        C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
+        return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
+
+    def _parts(self) -> Iterator[tuple[int, int, str, Array, slice]]:
+        first = 0
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            for which, p in (("num", self.num[o][i]), ("den", self.den[o][i])):
+                yield o, i, which, p, slice(first, first + p.size)
+                first += p.size
+
+    def _points(self, omega: Array) -> tuple[Complex, Complex]:
+        s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
+        return np.asarray(s, dtype=np.complex128), np.asarray(np.exp(-1j * np.outer(omega, self.delay)))
+
+    def _roots(self, wanted: str) -> tuple[Complex, Complex]:
+        roots, rows, size = list[Complex](), list[Complex](), self.theta.size
+        for _, _, which, p, place in self._parts():
+            used = np.nonzero(p)[0]
+            if which != wanted or not used.size:
+                continue
+            found = np.roots(p).astype(np.complex128)
+            block = np.zeros((found.size, size), dtype=np.complex128)
+            if found.size:
+                block[:, place.start + int(used[0]) : place.stop] = root_derivative(p[used[0] :], found)
+            roots.append(found)
+            rows.append(block)
+        if not roots:
+            return np.empty(0, dtype=np.complex128), np.zeros((0, size), dtype=np.complex128)
+        return np.concatenate(roots), np.vstack(rows)
