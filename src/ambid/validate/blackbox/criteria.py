@@ -1,0 +1,93 @@
+"""Information criteria of one-step errors, so defined that all structures on the same data compare.
+
+With N samples, n_y outputs, S = (1/N) sum e e' of the one-step errors and d estimated numbers (offsets and initial
+states, which every structure has, not counted), the Gaussian log likelihood at its maximum is
+log L = -(N/2) (log det S + n_y (1 + log 2 pi)), and k = d + n_y (n_y + 1)/2 counts the numbers in S too:
+
+- AIC = -2 log L + 2 k (Akaike 1974);
+- AICc = -2 log L + 2 k N/(N - d/n_y - n_y - 1), exact to second order for regressions (Bedrick and Tsai 1994); for one
+  output it is AIC + 2 k (k + 1)/(N - k - 1) (Hurvich and Tsai 1989);
+- BIC = -2 log L + k log N (Schwarz 1978);
+- MDL = det S (1 + (d/n_y) log N/N)^n_y (Rissanen 1978; Ljung 1999, sec. 16.4);
+- FPE = det S ((N + d/n_y)/(N - d/n_y))^n_y (Akaike 1971; Ljung 1999, sec. 16.4; Luetkepohl 2005, sec. 4.3).
+
+The first samples are left out, equally for every structure, because there the initial states fit the errors away, more
+so the more states there are. AIC, AICc and BIC are in nats times two, MDL and FPE in the outputs' units squared,
+multiplied.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NAMES = ("aic", "aicc", "bic", "mdl", "fpe")
+_SKIP = 100  # samples left out at the start, at most a tenth of the record
+_FLOOR = 1e-13  # least error over the size of the output: below is rounding
+
+
+def skipped(n_samples: int) -> int:
+    """Return how many samples are left out at the start.
+
+    Parameters
+    ----------
+    n_samples : int
+
+    Returns
+    -------
+    int
+    """
+    return min(_SKIP, n_samples // 10)
+
+
+def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
+    """Compute the criteria.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n_samples, n_outputs), SI
+        One-step errors.
+    y : ndarray, shape (n_samples, n_outputs), SI
+        Outputs, to tell an error from rounding.
+    n_estimated : int
+        Numbers estimated, offsets and initial states not counted.
+
+    Returns
+    -------
+    dict of str to float
+        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``; ``aicc`` and ``fpe`` are left out where the samples are too few
+        for them.
+    """
+    used = e[skipped(e.shape[0]) :]
+    N, n_y = used.shape
+    log_det = log_determinant(used, y)
+    per_output = n_estimated / n_y
+    k = n_estimated + n_y * (n_y + 1) / 2
+    deviance = N * (log_det + n_y * (1 + np.log(2 * np.pi)))
+    found = {
+        "aic": deviance + 2 * k,
+        "aicc": deviance + 2 * k * N / (N - per_output - n_y - 1) if per_output + n_y + 1 < N else np.inf,
+        "bic": deviance + k * np.log(N),
+        "mdl": np.exp(log_det + n_y * np.log1p(per_output * np.log(N) / N)),
+        "fpe": np.exp(log_det + n_y * np.log((N + per_output) / (N - per_output))) if per_output < N else np.inf,
+    }
+    return {name: float(x) for name, x in found.items() if np.isfinite(x)}
+
+
+def log_determinant(e: Array, y: Array) -> float:
+    """Return log det of the error covariance, no error counted smaller than rounding.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n_used, n_outputs), SI
+    y : ndarray, shape (n_samples, n_outputs), SI
+
+    Returns
+    -------
+    float
+    """
+    size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
+    s = np.linalg.svd(e / size, compute_uv=False) / np.sqrt(e.shape[0])
+    return float(2 * np.sum(np.log(np.maximum(s, _FLOOR))) + 2 * np.sum(np.log(size)))

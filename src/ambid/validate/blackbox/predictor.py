@@ -1,0 +1,205 @@
+"""Any black-box fit as a discrete predictor of its own sampling interval, and its errors on a record.
+
+A continuous model is discretised under a zero-order hold; a delay that is not a whole number of samples lets the plant
+see first the previous input, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.response import one_step, simulation
+from ambid.identify.blackbox.state_space import StateSpaceModel
+from ambid.identify.blackbox.transfer_model import TransferModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Errors:
+    """A record run through a fit, SI.
+
+    Attributes
+    ----------
+    model : StateSpaceModel
+        Discrete innovations form that was used.
+    one_step : ndarray, shape (n_samples, n_outputs)
+        Output minus its prediction from all samples before.
+    simulation : ndarray, shape (n_samples, n_outputs), or None
+        Output minus its simulation from the inputs alone; None for an unstable model, or without inputs.
+    """
+
+    model: StateSpaceModel
+    one_step: Array
+    simulation: Array | None
+
+    @property
+    def claims_noise(self) -> bool:
+        """Whether the model describes the noise; an output-error model (K = 0) does not."""
+        return bool(np.any(self.model.K)) or not self.model.n_inputs
+
+
+def errors(fit: BlackBoxFit, data: IOData) -> Errors:
+    """Run a record through a fit.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+        Same inputs and outputs, same rate.
+
+    Returns
+    -------
+    Errors
+
+    Raises
+    ------
+    EstimationError
+        If channels or rate differ from those of the fit.
+    """
+    if abs(data.dt / fit.dt - 1) > 1e-6:
+        raise EstimationError(
+            f"the record is sampled at {1 / data.dt:g} Hz, the fit at {1 / fit.dt:g} Hz; they have to agree. "
+            "Resample the record, or fit it"
+        )
+    if (data.n_inputs, data.n_outputs) != (len(fit.inputs), len(fit.outputs)):
+        raise EstimationError(
+            f"the data have {data.n_inputs} inputs and {data.n_outputs} outputs, the fit {len(fit.inputs)} and "
+            f"{len(fit.outputs)}; they have to agree. Name the same channels"
+        )
+    model = innovations_form(fit)
+    with np.errstate(over="ignore", invalid="ignore"):
+        e = data.y - one_step(model, data.u, data.y, fit.offsets)
+    simulated = simulation(model, data.u, data.y, fit.offsets)
+    return Errors(model=model, one_step=e, simulation=None if simulated is None else data.y - simulated)
+
+
+def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
+    """Run a record with an operating point of its own through a fit: a constant in every output is fitted.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+
+    Returns
+    -------
+    Errors
+        Their means are zero.
+
+    Raises
+    ------
+    EstimationError
+        As `errors`.
+    """
+    found = errors(fit, data)
+    m = found.model
+    # a constant c in the output is (I - C (I - F)^-1 K) c in the one-step error, and c itself in the simulation
+    F = m.A - m.K @ m.C
+    through = np.eye(m.n_outputs) - m.C @ np.linalg.lstsq(np.eye(m.order) - F, m.K, rcond=1e-12)[0]
+    e, simulated = found.one_step, found.simulation
+    late = slice(data.n_samples // 2, None)  # the initial state has taken up the constant at the start
+    moved, shifted = np.zeros(m.n_outputs), np.zeros(m.n_outputs)
+    for _ in range(2):
+        moved += np.linalg.lstsq(through, e[late].mean(axis=0), rcond=1e-6)[0]
+        y = data.y - moved
+        e = y - one_step(m, data.u, y, fit.offsets)
+        if simulated is not None:
+            shifted += simulated[late].mean(axis=0)
+            y = data.y - shifted
+            again = simulation(m, data.u, y, fit.offsets)
+            simulated = None if again is None else y - again
+    return Errors(
+        model=m,
+        one_step=e - e.mean(axis=0),
+        simulation=None if simulated is None else simulated - simulated.mean(axis=0),
+    )
+
+
+def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
+    """Return the model of a fit as a discrete innovations form.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+
+    Returns
+    -------
+    StateSpaceModel
+        At the sampling interval of the fit.
+    """
+    model = fit.model
+    if model.dt is not None:
+        return model.state_space()
+    if isinstance(model, TransferModel):
+        return _held_transfer(model, fit.dt)
+    return held(model.state_space(), fit.dt)
+
+
+def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
+    """Discretise a continuous state space, inputs and innovations held over a sample.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        Continuous.
+    dt : float, s
+
+    Returns
+    -------
+    StateSpaceModel
+    """
+    A, B = _held(model.A, np.hstack([model.B, model.K]), dt)
+    n_u = model.n_inputs
+    return StateSpaceModel(A=A, B=B[:, :n_u], C=model.C, D=model.D, K=B[:, n_u:], dt=dt)
+
+
+def _held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+    """Return exp(A dt) and its integral times B."""
+    from scipy.linalg import expm
+
+    n, m = B.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = A, B
+    full = expm(block * dt)
+    return np.asarray(full[:n, :n]), np.asarray(full[:n, n:])
+
+
+def _held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
+    """Discretise every transfer function; the delay of each input is a chain of states in front of it."""
+    plain = TransferModel(num=model.num, den=model.den, dt=None).state_space()
+    n, n_u = plain.order, model.n_inputs
+    lags = np.asarray(model.delay) / dt
+    whole = np.floor(lags + 1e-9).astype(int)
+    part = np.maximum(lags - whole, 0.0)
+    part[part < 1e-9] = 0.0
+    length = whole + (part > 0)
+    first = n + np.concatenate([[0], np.cumsum(length)]).astype(int)
+    size = int(first[-1])
+    A, B, C, D = np.zeros((size, size)), np.zeros((size, n_u)), np.zeros((model.n_outputs, size)), plain.D.copy()
+    A[:n, :n] = _held(plain.A, plain.B, dt)[0]
+    C[:, :n] = plain.C
+    for i in range(n_u):
+        column = plain.B[:, i : i + 1]
+        now = _held(plain.A, column, (1 - part[i]) * dt)
+        late = now[0] @ _held(plain.A, column, part[i] * dt)[1]
+        # chain: place 0 holds u[k-1], place j holds u[k-1-j]
+        chain = slice(int(first[i]), int(first[i + 1]))
+        if length[i]:
+            B[chain.start, i] = 1.0
+            A[chain, chain] = np.eye(int(length[i]), k=-1)
+        for gain, lag in ((now[1], int(whole[i])), (late, int(whole[i]) + 1)):
+            if lag == 0:
+                B[:n, i : i + 1] += gain
+            elif np.any(gain):
+                A[:n, chain.start + lag - 1 : chain.start + lag] += gain
+        if length[i]:
+            C[:, chain.stop - 1] += D[:, i]
+            D[:, i] = 0.0
+    return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((size, model.n_outputs)), dt=dt)
