@@ -5,7 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from ambid.report.figures import autocorrelation, figures, overview, save
+from ambid.report._drawing import autocorrelation
+from ambid.report.figures import figures, overview, save
 
 
 def test_the_overview_has_all_parts(unstable):

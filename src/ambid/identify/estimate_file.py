@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 
 from ambid.errors import EstimationError, ModelError
 from ambid.identify.estimate import (
-    Check,
     Continuous,
     Delay,
     Estimate,
@@ -19,6 +17,7 @@ from ambid.identify.estimate import (
     NoiseModel,
     OutputFit,
 )
+from ambid.identify.json_values import check_from_json, check_json, plain_json
 from ambid.physics.models import model
 
 SCHEMA = "ambid.estimate/1"
@@ -90,14 +89,14 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
             role: {"one_step": f.one_step, "simulation": f.simulation, "innovation_sd": f.innovation_sd}
             for role, f in estimate.fit.items()
         },
-        "checks": {name: _check_json(c) for name, c in estimate.checks.items()},
+        "checks": {name: check_json(c) for name, c in estimate.checks.items()},
         "information": dict(estimate.information),
         "validation": None if estimate.validation is None else dict(estimate.validation),
         "warnings": list(estimate.warnings),
         "timing_s": dict(estimate.timing_s),
         "rig": dict(estimate.rig),
     }
-    return {name: _finite(value) for name, value in document.items()}
+    return {name: plain_json(value) for name, value in document.items()}
 
 
 def _parameter_json(p: EstimatedParameter) -> dict[str, Any]:
@@ -111,27 +110,6 @@ def _parameter_json(p: EstimatedParameter) -> dict[str, Any]:
         "identifiable": p.identifiable,
         **share,
     }
-
-
-def _check_json(c: Check) -> dict[str, Any]:
-    p = {} if c.p is None else {"p": c.p}
-    return {"passed": c.passed, **p, **dict(c.values), "detail": c.detail}
-
-
-def _finite(value: Any) -> Any:
-    """Turn mappings and arrays into plain JSON, numbers that are not finite into null."""
-    if isinstance(value, Mapping):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
-    if isinstance(value, (bool, str)) or value is None:
-        return value
-    if isinstance(value, np.ndarray):
-        return _finite(value.tolist())
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def estimate_from_json(document: Mapping[str, Any], where: str) -> Estimate:
@@ -238,11 +216,7 @@ def _from_json(d: Mapping[str, Any]) -> Estimate:
         operating_point=d["operating_point"],
         fit={role: OutputFit(**f) for role, f in d["fit"].items()},
         checks={
-            name: Check(
-                passed=bool(c["passed"]), detail=c["detail"], p=c.get("p"),
-                values={k: v for k, v in c.items() if k not in ("passed", "detail", "p")},
-            )
-            for name, c in d["checks"].items()
+            name: check_from_json(c) for name, c in d["checks"].items()
         },
         validation=d["validation"],
         warnings=tuple(d["warnings"]),

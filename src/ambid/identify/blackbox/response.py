@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify._kernels import state_scan
 from ambid.identify.blackbox.state_space import StateSpaceModel
 
 Array = NDArray[np.float64]
@@ -90,6 +89,8 @@ def stable(model: StateSpaceModel) -> bool:
 
 def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
     """Run x+ = F x + G [u; y] from rest and add the free response that fits y best."""
+    from ambid.identify._kernels import state_scan
+
     z = np.hstack([u - offsets.u, y - offsets.y])
     n = model.order
     work = np.hstack([np.zeros((z.shape[0], n)), z])

@@ -63,6 +63,20 @@ def _polynomial(name: str, orders: str, feedback: Literal["biased", "with noise 
     )
 
 
+def _instrumental(
+    name: str, orders: str, feedback: Literal["biased", "consistent"], kind: str, summary: str
+) -> Structure:
+    return Structure(
+        name=name,
+        summary=summary,
+        orders=tuple(orders.split()),
+        home=f"ambid.identify.instrumental:{name.replace('-', '_')}",
+        inputs=True,
+        feedback=feedback,
+        kind="transfer function" if kind == "s" else "polynomial",
+    )
+
+
 STRUCTURES: Mapping[str, Structure] = {
     s.name: s
     for s in (
@@ -74,6 +88,8 @@ STRUCTURES: Mapping[str, Structure] = {
         _polynomial("ararmax", "na nb nc nd nk", "with noise model", "A y = B u + C/D e"),
         _polynomial("oe", "nb nf nk", "biased", "y = B/F u + e"),
         _polynomial("bj", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
+        _instrumental("iv4", "na nb nk", "biased", "q", "A y = B u + noise of any colour"),
+        _instrumental("cliv", "na nb nk", "consistent", "q", "the same in a loop, with its reference"),
     )
 }
 

@@ -65,13 +65,13 @@ class TransferModel:
         """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, as in `theta`."""
         variable = "s" if self.dt is None else "z"
         return tuple(
-            f"{which}[{o},{i}]{variable}{p.size - 1 - k}" for o, i, which, p, _ in self._parts() for k in range(p.size)
+            f"{which}[{o},{i}]{variable}{p.size - 1 - k}" for o, i, which, p, _ in self.parts() for k in range(p.size)
         )
 
     @property
     def theta(self) -> Array:
         """All coefficients, leading ones included, in the order of `names`, shape (n_theta,)."""
-        return np.concatenate([p for _, _, _, p, _ in self._parts()])
+        return np.concatenate([p for _, _, _, p, _ in self.parts()])
 
     def frequency_response(self, omega: Array) -> Complex:
         """Return G.
@@ -116,7 +116,7 @@ class TransferModel:
         """
         s, lag = self._points(omega)
         out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
-        for o, i, which, p, place in self._parts():
+        for o, i, which, p, place in self.parts():
             powers = s[:, None] ** np.arange(p.size - 1, -1, -1)
             den = np.polyval(self.den[o][i], s)
             factor = lag[:, i] / den if which == "num" else -lag[:, i] * np.polyval(self.num[o][i], s) / den**2
@@ -195,7 +195,8 @@ class TransferModel:
         C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
         return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
 
-    def _parts(self) -> Iterator[tuple[int, int, str, Array, slice]]:
+    def parts(self) -> Iterator[tuple[int, int, str, Array, slice]]:
+        """Yield (output, input, "num" or "den", coefficients, place in `theta`)."""
         first = 0
         for o, i in np.ndindex(self.n_outputs, self.n_inputs):
             for which, p in (("num", self.num[o][i]), ("den", self.den[o][i])):
@@ -208,7 +209,7 @@ class TransferModel:
 
     def _roots(self, wanted: str) -> tuple[Complex, Complex]:
         roots, rows, size = list[Complex](), list[Complex](), self.theta.size
-        for _, _, which, p, place in self._parts():
+        for _, _, which, p, place in self.parts():
             used = np.nonzero(p)[0]
             if which != wanted or not used.size:
                 continue

@@ -1,0 +1,252 @@
+"""Black-box fits as JSON, schema ``ambid.fit/1`` (contracts.md), written and read back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError, ModelError
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.model import BlackBoxModel
+from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.identify.blackbox.response import Offsets
+from ambid.identify.blackbox.spread import pole_covariance
+from ambid.identify.blackbox.state_space import StateSpaceModel
+from ambid.identify.blackbox.structures import structure
+from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.identify.estimate import OutputFit
+from ambid.identify.json_values import check_from_json, check_json, plain_json
+
+Array = NDArray[np.float64]
+
+SCHEMA = "ambid.fit/1"
+
+
+def fit_text(fit: BlackBoxFit) -> str:
+    """Return the JSON text of a fit.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+
+    Returns
+    -------
+    str
+    """
+    return json.dumps(fit_to_json(fit), indent=1, allow_nan=False) + "\n"
+
+
+def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
+    """Return a fit in the form of schema ``ambid.fit/1``.
+
+    With one input, B and F are lists of coefficients, with several a list of such lists; with several outputs
+    ``polynomials`` and ``sd`` have one entry for each output. ``fit`` and ``validation`` have an entry for each output,
+    and with one output ``one_step`` and ``simulation`` beside it.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+
+    Returns
+    -------
+    dict
+        SI values; numbers that are not finite are null.
+    """
+    kind, values = _model_json(fit.model, fit.model.theta, fit.outputs)
+    sd = None if fit.sd is None else _model_json(fit.model, fit.sd, fit.outputs)[1]
+    document = {
+        "schema": SCHEMA,
+        "structure": fit.structure,
+        "status": fit.status,
+        "orders": {k: list(v) if isinstance(v, tuple) else v for k, v in fit.orders.items()},
+        kind: values,
+        "sd": sd,
+        "noise_variance": fit.noise_covariance[0, 0] if len(fit.outputs) == 1 else fit.noise_covariance,
+        "fit": _by_output({o: _fit_json(f) for o, f in fit.fit.items()}),
+        "criteria": fit.criteria,
+        "rate_hz": 1.0 / fit.dt,
+        "checks": {name: check_json(c) for name, c in fit.checks.items()},
+        "validation": None if fit.validation is None else _by_output(fit.validation),
+        "warnings": list(fit.warnings),
+        "poles": _poles_json(fit),
+        "inputs": list(fit.inputs),
+        "outputs": list(fit.outputs),
+        "units": fit.units,
+        "offsets": {
+            "inputs": dict(zip(fit.inputs, fit.offsets.u.tolist(), strict=True)),
+            "outputs": dict(zip(fit.outputs, fit.offsets.y.tolist(), strict=True)),
+        },
+        "noise_covariance": fit.noise_covariance,
+        "covariance": None if fit.covariance is None else {"names": fit.model.names, "matrix": fit.covariance},
+        "n_estimated": fit.n_estimated,
+        "continuous_time": fit.model.dt is None,
+        "delay_s": list(fit.model.delay) if isinstance(fit.model, TransferModel) else None,
+        "record": fit.record,
+        "details": fit.details,
+        "timing_s": fit.timing_s,
+    }
+    return {name: plain_json(value) for name, value in document.items()}
+
+
+def _by_output(found: Mapping[str, Any]) -> dict[str, Any]:
+    """With one output its results stand at the top as well."""
+    first = dict(next(iter(found.values()))) if len(found) == 1 else {}
+    return {**first, **{o: v for o, v in found.items() if o not in first}}
+
+
+def _fit_json(f: OutputFit) -> dict[str, Any]:
+    return {"one_step": f.one_step, "simulation": f.simulation, "innovation_sd": f.innovation_sd}
+
+
+def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) -> tuple[str, Any]:
+    """Put numbers in the order of ``model.theta`` into the shape of the model's kind."""
+    if isinstance(model, PolynomialModel):
+        found: list[dict[str, Any]] = [{"A": None, "B": [], "C": None, "D": None, "F": []} for _ in outputs]
+        for o, letter, i, place in model.blocks():
+            p = theta[place].tolist()
+            if i is None:
+                found[o][letter] = p
+            else:
+                found[o][letter].append(p)
+        for p in found if model.n_inputs == 1 else []:
+            p["B"], p["F"] = p["B"][0], p["F"][0]
+        return "polynomials", found[0] if len(outputs) == 1 else dict(zip(outputs, found, strict=True))
+    if isinstance(model, StateSpaceModel):
+        parts, first = {}, 0
+        for letter in "ABCDK":
+            shape = getattr(model, letter).shape
+            parts[letter] = theta[first : first + shape[0] * shape[1]].reshape(shape)
+            first += shape[0] * shape[1]
+        return "state_space", parts
+    if isinstance(model, TransferModel):
+        rows: dict[str, list[list[Array]]] = {"num": [], "den": []}
+        for o, i, which, p, place in model.parts():
+            if not i:
+                rows[which].append([])
+            rows[which][o].append(theta[place.start : place.start + p.size])
+        return "transfer_function", rows
+    raise ModelError(f"a model of type {type(model).__name__} has no place in a file")
+
+
+def _poles_json(fit: BlackBoxFit) -> list[dict[str, Any]]:
+    poles = fit.model.poles()
+    spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = poles if fit.model.dt is None else np.log(poles) / fit.dt
+        return [
+            {
+                "value": complex(p),
+                "sd": None if spread is None else np.sqrt(np.maximum(np.diag(spread[k]), 0.0)),
+                "frequency_hz": abs(s[k]) / (2 * np.pi),
+                "damping": -s[k].real / abs(s[k]),
+            }
+            for k, p in enumerate(poles)
+        ]
+
+
+def fit_from_json(document: Mapping[str, Any], where: str) -> BlackBoxFit:
+    """Read a fit back.
+
+    Parameters
+    ----------
+    document : Mapping
+        Parsed JSON of schema ``ambid.fit/1``.
+    where : str
+        Name of the file, for messages.
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        If the document is not a fit, lacks an entry, or its parts do not belong together.
+    """
+    if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
+        found = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
+        raise EstimationError(
+            f"{where} has schema {found!r}; a fit has {SCHEMA!r}. Give a file that 'ambid fit --json' wrote"
+        )
+    try:
+        return _from_json(document)
+    except (ModelError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise EstimationError(
+            f"{where} is not a whole fit ({type(error).__name__}: {error}). Write it again with 'ambid fit --json'"
+        ) from error
+
+
+def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
+    outputs, inputs = tuple(d["outputs"]), tuple(d["inputs"])
+    model = _model_from_json(d, inputs, outputs)
+    structure(d["structure"])
+    covariance = None if d["covariance"] is None else np.array(d["covariance"]["matrix"], dtype=np.float64)
+    noise = np.array(d["noise_covariance"], dtype=np.float64)
+    if (model.n_inputs, model.n_outputs) != (len(inputs), len(outputs)) or noise.shape != (len(outputs),) * 2:
+        raise ValueError("inputs, outputs, noise and model are not of the same size")
+    if covariance is not None and covariance.shape != (model.theta.size,) * 2:
+        raise ValueError("the covariance is not of the model's coefficients")
+    if not (float(d["rate_hz"]) > 0 and np.all(np.isfinite(model.theta)) and np.all(np.isfinite(noise))):
+        raise ValueError("rate, coefficients or noise are no finite numbers")
+    return BlackBoxFit(
+        structure=d["structure"],
+        orders={k: tuple(v) if isinstance(v, list) else int(v) for k, v in d["orders"].items()},
+        model=model,
+        covariance=covariance,
+        n_estimated=int(d["n_estimated"]),
+        offsets=Offsets(
+            u=np.array([d["offsets"]["inputs"][x] for x in inputs], dtype=np.float64),
+            y=np.array([d["offsets"]["outputs"][x] for x in outputs], dtype=np.float64),
+        ),
+        noise_covariance=noise,
+        inputs=inputs,
+        outputs=outputs,
+        units=d["units"],
+        dt=1.0 / float(d["rate_hz"]),
+        record=d["record"],
+        status=d["status"],
+        fit={o: OutputFit(**_numbers(d["fit"][o])) for o in outputs if o in d["fit"]},
+        criteria=d["criteria"],
+        checks={name: check_from_json(c) for name, c in d["checks"].items()},
+        validation=None if d["validation"] is None else {o: d["validation"][o] for o in outputs},
+        warnings=tuple(d["warnings"]),
+        timing_s=d["timing_s"],
+        details=d["details"],
+    )
+
+
+def _numbers(f: Mapping[str, Any]) -> dict[str, Any]:
+    """Read null as "not a number", but for the simulation, which may be missing."""
+    return {k: float("nan") if v is None and k != "simulation" else v for k, v in f.items()}
+
+
+def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tuple[str, ...]) -> BlackBoxModel:
+    dt = None if d["continuous_time"] else 1.0 / float(d["rate_hz"])
+    if "state_space" in d:
+        n = len(d["state_space"]["A"])
+        shapes = {"A": (n, n), "B": (n, len(inputs)), "C": (len(outputs), n), "D": (len(outputs), len(inputs))}
+        shapes["K"] = (n, len(outputs))
+        parts = {k: np.array(d["state_space"][k], dtype=np.float64).reshape(v) for k, v in shapes.items()}
+        return StateSpaceModel(dt=dt, **parts)
+    if "transfer_function" in d:
+        tf = d["transfer_function"]
+        return TransferModel(num=tf["num"], den=tf["den"], dt=dt, delay=tuple(d["delay_s"]))
+    found = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
+    one = len(inputs) == 1
+    sets = tuple(
+        Polynomials(
+            A=p["A"],
+            B=tuple([p["B"]] if one else p["B"]),
+            C=p["C"],
+            D=p["D"],
+            F=tuple([p["F"]] if one else p["F"]),
+        )
+        for p in found
+    )
+    if dt is None:
+        raise ValueError("a polynomial model is discrete")
+    return PolynomialModel(outputs=sets, dt=dt)

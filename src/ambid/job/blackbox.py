@@ -1,0 +1,242 @@
+"""The black-box job: one record, inputs and outputs by name, one structure in; one judged fit out.
+
+Read -> cut -> fit -> judge -> BlackBoxFit. The second record, if any, is only judged on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData, io_data
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.structures import Structure, structure
+from ambid.record import Record, read_record
+from ambid.signals.samples import cut
+
+if TYPE_CHECKING:
+    from ambid.validate.comparison import Comparison
+
+Tick = Callable[[str], None]
+Orders = Mapping[str, "int | str | tuple[int, ...]"]
+
+
+def fit(
+    record: Record | str | Path,
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    structure_name: str,
+    orders: Orders | None = None,
+    criterion: str = "bic",
+    fixed: Mapping[str, float] | None = None,
+    references: Sequence[str] = (),
+    open_loop: bool = False,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+    validate: Record | str | Path | None = None,
+    validate_from_s: float | None = None,
+    validate_to_s: float | None = None,
+    tick: Tick | None = None,
+) -> BlackBoxFit:
+    """Fit a black-box model to one record, and judge it.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+    inputs, outputs : sequence of str
+        Channel names; no inputs for a time series.
+    structure_name : str
+        As in `ambid.identify.blackbox.structures`.
+    orders : Mapping[str, int, "auto" or tuple of int], optional
+        A tuple has one number for each input. None: all are chosen by `criterion`.
+    criterion : str, optional
+        For the choice of orders, see `ambid.validate.selection`.
+    fixed : Mapping[str, float], optional
+        Coefficients that are known, for polynomial structures, by name (``a1``, ``b2``).
+    references : sequence of str, optional
+        Channels of the loop's outer excitation, for the methods that want it.
+    open_loop : bool, optional
+        Say that no feedback was at work.
+    from_s, to_s : float, optional
+        Part of the record to fit, in s.
+    rate_hz : float, optional
+        Sampling rate for a file without a time column.
+    gaps : {"error", "interpolate", "cut"}, optional
+        What to do about gaps in a file.
+    validate : Record, str or Path, optional
+        A second record to judge on; may be the first, with another part.
+    validate_from_s, validate_to_s : float, optional
+        Part of the second record to use, in s; default all of it.
+    tick : callable, optional
+        Called with the name of the present stage; may raise to interrupt.
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    AmbidError
+        If the record, its channels or the orders break a rule.
+    EstimationError
+        If nothing can be estimated.
+    """
+    from ambid.identify.threads import one_thread
+    from ambid.validate.blackbox import judged
+
+    say = tick or _silent
+    of = structure(structure_name)
+    _check_use(of, inputs, fixed)
+    laps, last = dict[str, float](), time.perf_counter()
+    data = read_data(
+        record, inputs, outputs, references, open_loop=open_loop, part=(from_s, to_s), rate_hz=rate_hz, gaps=gaps
+    )
+    second = None
+    if validate is not None:
+        part = (validate_from_s, validate_to_s)
+        second = read_data(
+            validate, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
+        )
+    laps["read"], last = time.perf_counter() - last, time.perf_counter()
+    with one_thread():
+        chosen: dict[str, object] = {}
+        if orders is None:
+            from ambid.validate.selection import select
+
+            say("orders")
+            choice = select(of.name, data, criterion=criterion)
+            orders, chosen = choice.orders, {"selection": choice.summary()}
+            laps["orders"], last = time.perf_counter() - last, time.perf_counter()
+        say("fit")
+        options = {"fixed": dict(fixed)} if fixed else {}
+        found = of.estimator(data, orders, **options)
+        laps["fit"], last = time.perf_counter() - last, time.perf_counter()
+        say("check")
+        found = judged(found, data, second=second)
+        laps["checks"] = time.perf_counter() - last
+    return replace(found, timing_s=laps, details={**found.details, **chosen})
+
+
+def compare(
+    record: Record | str | Path,
+    candidates: Sequence[tuple[str, Orders | None]],
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str] = (),
+    open_loop: bool = False,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+    validate: Record | str | Path | None = None,
+    holdout: float = 0.3,
+    tick: Tick | None = None,
+) -> Comparison:
+    """Fit several structures to one record and compare them on data that none of them has seen.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+    candidates : sequence of (str, Mapping or None)
+        Structures with their orders; None chooses.
+    inputs, outputs, references : sequence of str
+    open_loop : bool, optional
+    from_s, to_s : float, optional
+        Part of the record to use, in s.
+    rate_hz : float, optional
+    gaps : {"error", "interpolate", "cut"}, optional
+    validate : Record, str or Path, optional
+        A second record to judge on; without one the last part of the record is held out.
+    holdout : float, optional
+        That part, 0 to 1.
+    tick : callable, optional
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    AmbidError
+        If the record, its channels or the orders break a rule.
+    """
+    from ambid.identify.threads import one_thread
+    from ambid.validate.comparison import compare as compared
+
+    for name, _ in candidates:
+        _check_use(structure(name), inputs, None)
+    data = read_data(
+        record, inputs, outputs, references, open_loop=open_loop, part=(from_s, to_s), rate_hz=rate_hz, gaps=gaps
+    )
+    second = None
+    if validate is not None:
+        whole = (None, None)
+        second = read_data(
+            validate, inputs, outputs, references, open_loop=open_loop, part=whole, rate_hz=rate_hz, gaps=gaps
+        )
+    with one_thread():
+        return compared(data, candidates, holdout=holdout, second=second, tick=tick or _silent)
+
+
+def read_data(
+    record: Record | str | Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str] = (),
+    *,
+    open_loop: bool = False,
+    part: tuple[float | None, float | None] = (None, None),
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+) -> IOData:
+    """Read a record, cut it and take inputs and outputs out of it.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+    inputs, outputs, references : sequence of str
+        Channel names.
+    open_loop : bool, optional
+    part : (float or None, float or None), optional
+        From and to, in s.
+    rate_hz : float, optional
+    gaps : {"error", "interpolate", "cut"}, optional
+
+    Returns
+    -------
+    IOData
+
+    Raises
+    ------
+    AmbidError
+        If the file, its columns or the cut break a rule.
+    """
+    if not isinstance(record, Record):
+        record = read_record(record, rate_hz=rate_hz, gaps=gaps or "error")  # type: ignore[arg-type]
+    if part != (None, None):
+        record = cut(record, *part)
+    return io_data(record, inputs, outputs, references=references, open_loop=open_loop)
+
+
+def _check_use(of: Structure, inputs: Sequence[str], fixed: Mapping[str, float] | None) -> None:
+    if inputs and not of.inputs:
+        raise EstimationError(
+            f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Leave --input out"
+        )
+    if not inputs and of.inputs is True and of.kind != "state space":
+        raise EstimationError(f"structure {of.name} needs an input. Give --input COLUMN, or use arma")
+    if fixed and of.kind != "polynomial":
+        raise EstimationError(f"structure {of.name} has no coefficients that can be fixed. Use a polynomial structure")
+
+
+def _silent(stage: str) -> None:
+    """Report no progress."""
+    del stage

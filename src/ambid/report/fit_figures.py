@@ -1,0 +1,196 @@
+"""Figures of a black-box fit: measured and predicted, residuals with bounds, Bode with uncertainty, poles and zeros."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.response import one_step, simulation
+from ambid.identify.blackbox.spread import pole_covariance
+from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.report._drawing import BOUND, MEASURED, PREDICTED, grid, magnitude_axis, phase_axis, pole_region
+from ambid.report._panels import Traces, residuals_panel, signals_panel
+from ambid.report.fit_text import pole_lines
+from ambid.report.response import Pole, Response
+from ambid.validate.blackbox.predictor import innovations_form
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+Array = NDArray[np.float64]
+
+_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
+
+
+def overview(fit: BlackBoxFit, data: IOData) -> Figure:
+    """Draw all figures of a fit on one page.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+        The record that it came from, or another.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from matplotlib.figure import Figure
+
+    n_y, traces = data.n_outputs, traces_of(fit, data)
+    parts: list[tuple[float, Any]] = [
+        (2.3 * n_y, lambda part: signals_panel(part, traces)),
+        (2.2 * n_y, lambda part: residuals_panel(part, traces)),
+    ]
+    if fit.inputs:
+        parts.append((4.6, lambda part: _bode(part, fit)))
+    parts.append((3.6, lambda part: _poles(part, fit)))
+    heights = [h for h, _ in parts]
+    page = Figure(figsize=(11, sum(heights) + 0.5), layout="constrained")
+    page.suptitle(f"{fit.record.get('file') or 'record'}: {fit.structure}", fontsize=13)
+    figures: Any = page.subfigures(len(parts), 1, height_ratios=heights)
+    for figure, (_, draw) in zip(figures, parts, strict=True):
+        draw(figure)
+    return page
+
+
+def traces_of(fit: BlackBoxFit, data: IOData) -> Traces:
+    """Run a record through a fit.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+
+    Returns
+    -------
+    Traces
+    """
+    model = innovations_form(fit)
+    return Traces(
+        time_s=np.arange(data.n_samples, dtype=np.float64) * data.dt,
+        names=data.outputs,
+        units=tuple(fit.units[o] for o in data.outputs),
+        measured=data.y,
+        predicted=one_step(model, data.u, data.y, fit.offsets),
+        simulated=simulation(model, data.u, data.y, fit.offsets),
+        innovation_sd=np.sqrt(np.diag(fit.noise_covariance)),
+    )
+
+
+def responses(fit: BlackBoxFit, n_frequencies: int = 600) -> tuple[Response, ...]:
+    """Compute the frequency response of every pair with its uncertainty, up to half the sampling rate.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    n_frequencies : int
+        Spaced evenly in the logarithm, with more points at lightly damped poles.
+
+    Returns
+    -------
+    tuple of Response
+        Output by output.
+    """
+    frequency = _frequencies(fit, n_frequencies)
+    omega = 2 * np.pi * frequency
+    G = fit.model.frequency_response(omega)
+    log_sd, phase_sd = np.zeros(G.shape), np.zeros(G.shape)
+    if fit.covariance is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.nan_to_num(fit.model.frequency_response_derivative(omega) / G[..., None])
+        log_sd, phase_sd = (
+            np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", J, fit.covariance, J), 0.0))
+            for J in (relative.real, relative.imag)
+        )
+    return tuple(
+        Response(
+            source=source,
+            output=output,
+            frequency_hz=frequency,
+            value=G[:, o, i],
+            log_sd=log_sd[:, o, i],
+            phase_sd=phase_sd[:, o, i],
+        )
+        for o, output in enumerate(fit.outputs)
+        for i, source in enumerate(fit.inputs)
+    )
+
+
+def _frequencies(fit: BlackBoxFit, n_frequencies: int) -> Array:
+    nyquist = 0.5 / fit.dt
+    lowest = max(1 / (int(str(fit.record["samples"])) * fit.dt), 1e-5 * nyquist)
+    poles = fit.model.poles()
+    s = poles if fit.model.dt is None else np.log(poles[np.abs(poles) > 0]) / fit.dt
+    extra = [
+        abs(p) / (2 * np.pi) + abs(p.real) / (2 * np.pi) * np.linspace(-5, 5, 41)
+        for p in s
+        if p.imag > 0 and lowest < abs(p) / (2 * np.pi) < nyquist
+    ]
+    found = np.unique(np.concatenate([np.geomspace(lowest, nyquist, n_frequencies), *extra]))
+    return np.asarray(found[(found >= lowest) & (found <= nyquist)])
+
+
+def _bode(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
+    found = responses(fit)
+    shown = found[:_PAIRS]
+    axes = figure.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
+    for j, r in enumerate(shown):
+        magnitude, phase = axes[:, j]
+        magnitude_axis(magnitude, r)
+        phase_axis(phase, r)
+        if not j:
+            phase.set_ylabel("phase [°]")
+        magnitude.set_ylabel(f"magnitude [{fit.units[r.output]}/{fit.units[r.source]}]")
+        phase.set_xlabel("frequency [Hz]")
+        magnitude.set_title(f"{r.source} → {r.output}", fontsize=10)
+        magnitude.legend(loc="lower left", fontsize=8, framealpha=0.85)
+        grid(magnitude, phase)
+    if len(found) > len(shown):
+        figure.suptitle(f"{len(shown)} of {len(found)} pairs", fontsize=10)
+
+
+def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
+    """Poles with 95 % regions and zeros, and beside them in numbers."""
+    axes, beside = figure.subplots(1, 2, width_ratios=(3, 3))
+    discrete = fit.model.dt is not None
+    poles, zeros = fit.model.poles(), fit.model.zeros()
+    spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
+    for k, p in enumerate(poles):
+        unstable = abs(p) > 1 if discrete else p.real > 0
+        color = BOUND if unstable else PREDICTED
+        axes.plot(p.real, p.imag, "x", color=color, markersize=8, markeredgewidth=1.8)
+        usable = spread is not None and np.all(np.isfinite(spread[k])) and np.max(np.abs(spread[k])) < 1e6
+        pole_region(
+            axes, Pole(value=complex(p), covariance=spread[k] if usable and spread is not None else None), color
+        )
+    seen = zeros[np.abs(zeros) < 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))]
+    axes.plot(seen.real, seen.imag, "o", color=MEASURED, markersize=7, markerfacecolor="none", markeredgewidth=1.4)
+    hidden = f"; {zeros.size - seen.size} zero(s) farther out" if seen.size < zeros.size else ""
+    _stability(axes, discrete)
+    delayed = isinstance(fit.model, TransferModel) and any(fit.model.delay)
+    axes.set_title(f"poles (x, 95 % regions) and zeros (o){hidden}{', delay apart' if delayed else ''}", fontsize=10)
+    grid(axes)
+    beside.axis("off")
+    text = "\n".join(pole_lines(fit))
+    beside.text(0.0, 0.97, text, fontsize=9, va="top", family="monospace", transform=beside.transAxes)
+
+
+def _stability(axes: Axes, discrete: bool) -> None:
+    axes.axhline(0, color=MEASURED, linewidth=0.8)
+    if discrete:
+        angle = np.linspace(0, 2 * np.pi, 361)
+        axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.8)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("real part – outside the circle the plant is unstable")
+        axes.set_ylabel("imaginary part")
+        return
+    axes.margins(0.15)
+    axes.axvline(0, color=MEASURED, linewidth=0.8)
+    axes.set_xlabel("real part [rad/s] – right of zero the plant is unstable")
+    axes.set_ylabel("imaginary part [rad/s]")
