@@ -130,12 +130,12 @@ class FrequencyResponse:
     @property
     def magnitude(self) -> Array:
         """|G|, shape (n_f, n_y, n_u)."""
-        return np.abs(self.G)
+        return np.asarray(np.abs(self.G))
 
     @property
     def magnitude_sd(self) -> Array:
         """Standard deviation of |G|, shape (n_f, n_y, n_u): sd/√2, for errors well under |G|."""
-        return self.sd / np.sqrt(2.0)
+        return np.asarray(self.sd / np.sqrt(2.0))
 
     @property
     def phase_rad(self) -> Array:

@@ -1,13 +1,16 @@
-"""Power spectral density and coherence after Welch, in units per hertz."""
+"""Power and cross-spectral densities and coherence after Welch, in units per hertz, with their variance."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.errors import RecordError
 from ambid.record.record import Array
+
+_CHUNK = 64  # segments transformed at a time: memory does not grow with the record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -22,11 +25,72 @@ class PowerSpectrum:
         Its integral over frequency is the variance.
     n_segments : int
         Half-overlapping segments that were averaged.
+    n_effective : float
+        Independent segments that would give the same variance; fewer, since neighbours share samples.
     """
 
     frequency_hz: Array
     density: Array
     n_segments: int
+    n_effective: float
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviation density/√n_effective, shape (n_frequencies,), in the unit of the density."""
+        return np.asarray(self.density / np.sqrt(self.n_effective))
+
+    def confidence(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Return the bounds of the density: 2 n_effective·estimate/truth is χ² with 2 n_effective degrees of freedom.
+
+        It holds inside the band; at 0 and at half the rate the density has half the degrees of freedom.
+
+        Parameters
+        ----------
+        level : float
+            Probability, 0 to 1.
+
+        Returns
+        -------
+        low, high : ndarray, shape (n_frequencies,), unit of the density
+            Bounds (Welch 1967; Bendat and Piersol 2010, sec. 8.5).
+
+        Raises
+        ------
+        RecordError
+            If the level is not between 0 and 1.
+        """
+        from scipy.special import gammaincinv
+
+        if not 0.0 < level < 1.0:
+            raise RecordError(f"a confidence level of {level}; it must lie between 0 and 1. Give e.g. 0.95")
+        n = self.n_effective
+        low, high = (self.density * n / gammaincinv(n, 0.5 * (1.0 + s * level)) for s in (1.0, -1.0))
+        return low, high
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CrossSpectra:
+    """One-sided spectral density matrix of several signals.
+
+    Attributes
+    ----------
+    frequency_hz : ndarray, shape (n_frequencies,), Hz
+        Frequencies from 0 to half the rate.
+    density : complex ndarray, shape (n_frequencies, n_signals, n_signals), product of units per Hz
+        E[Z Zᴴ], so that entry (i, j) is signal i times the conjugate of signal j. Its integral is the covariance.
+    n_segments : int
+        Segments averaged.
+    n_effective : float
+        Independent segments that would give the same variance (Welch 1967).
+    lines_per_independent : float
+        Neighbouring lines share noise through the window: Σ over lags of the squared correlation.
+    """
+
+    frequency_hz: Array
+    density: NDArray[np.complex128]
+    n_segments: int
+    n_effective: float
+    lines_per_independent: float
 
 
 def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> PowerSpectrum:
@@ -55,7 +119,62 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
 
     length = _segment(x.size, segment)
     frequency, density = welch(x, fs=rate_hz, nperseg=length)
-    return PowerSpectrum(frequency_hz=frequency, density=density, n_segments=_count(x.size, length))
+    count, step = _count(x.size, length), length - length // 2
+    effective = _effective(_window("hann", length), step, count)
+    return PowerSpectrum(frequency_hz=frequency, density=density, n_segments=count, n_effective=effective)
+
+
+def cross_spectra(
+    z: Array, rate_hz: float, *, segment: int | None = None, overlap: float = 0.5, window: str = "hann"
+) -> CrossSpectra:
+    """Estimate the spectral density matrix of several signals by Welch's method (mean of each segment removed).
+
+    Parameters
+    ----------
+    z : ndarray, shape (n_samples, n_signals), any units
+        Signals.
+    rate_hz : float
+        Sampling rate in Hz.
+    segment : int, optional
+        Samples of a segment, as in `power_spectrum`.
+    overlap : float
+        Share of a segment that it has in common with the next, 0 to 0.9.
+    window : str
+        Name of a window that `scipy.signal.get_window` knows.
+
+    Returns
+    -------
+    CrossSpectra
+        Densities, with the number of independent averages that they are worth.
+
+    Raises
+    ------
+    RecordError
+        If the segment does not fit the record, or the overlap is out of range.
+    """
+    if not 0.0 <= overlap <= 0.9:
+        raise RecordError(f"segments that overlap by {overlap:g}; 0 to 0.9 of a segment is possible. Give e.g. 0.5")
+    length = _segment(z.shape[0], segment)
+    step = max(1, length - int(overlap * length))
+    count = (z.shape[0] - length) // step + 1
+    w = _window(window, length)
+    segments = np.lib.stride_tricks.sliding_window_view(z, length, axis=0)[::step]
+    density = np.zeros((length // 2 + 1, z.shape[1], z.shape[1]), dtype=np.complex128)
+    for first in range(0, count, _CHUNK):
+        x = segments[first : first + _CHUNK]
+        Z = np.fft.rfft((x - x.mean(axis=-1, keepdims=True)) * w, axis=-1)
+        density += np.einsum("sif,sjf->fij", Z, Z.conj(), optimize=True)
+    density *= 2.0 / (count * rate_hz * np.sum(w**2))
+    density[0] *= 0.5
+    if length % 2 == 0:
+        density[-1] *= 0.5
+    return CrossSpectra(
+        frequency_hz=np.asarray(np.fft.rfftfreq(length, 1.0 / rate_hz), dtype=np.float64),
+        density=density,
+        n_segments=count,
+        n_effective=_effective(w, step, count),
+        lines_per_independent=_line_overlap(w),
+    )
 
 
 def coherence(u: Array, y: Array, rate_hz: float, *, segment: int | None = None) -> tuple[Array, Array]:
@@ -107,3 +226,25 @@ def _segment(n_samples: int, segment: int | None) -> int:
 
 def _count(n_samples: int, segment: int) -> int:
     return (n_samples - segment // 2) // (segment - segment // 2)
+
+
+def _window(name: str, length: int) -> Array:
+    from scipy.signal import get_window
+
+    return np.asarray(get_window(name, length), dtype=np.float64)
+
+
+def _effective(w: Array, step: int, count: int) -> float:
+    """Return K/(1 + 2 Σ_q (1 - q/K) ρ_q²), ρ_q = Σ w(t) w(t + q step)/Σ w² (Welch 1967)."""
+    power = np.sum(w**2)
+    total = 1.0
+    for q in range(1, min(count, -(-w.size // step))):
+        rho = float(np.sum(w[q * step :] * w[: w.size - q * step]) / power)
+        total += 2.0 * (1.0 - q / count) * rho**2
+    return count / total
+
+
+def _line_overlap(w: Array) -> float:
+    """Return Σ_q |ρ(q)|² over lags of lines, ρ(q) = Σ w² e^{-2πj q t/n}/Σ w²: 1 for a box, 35/18 for Hann."""
+    rho = np.fft.fft(w**2) / np.sum(w**2)
+    return float(np.sum(np.abs(rho) ** 2))
