@@ -1,0 +1,192 @@
+"""Polynomial models A y = (B/F) u + (C/D) e by prediction error (thesis eq. 1.10-1.12, 3.1-3.17, table 3.1).
+
+One engine for the eight structures; every one takes several inputs and outputs (one set of polynomials per output),
+estimates offsets and initial states, and nk where it is left out or "auto".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.polynomial.orders import Orders
+from ambid.identify.polynomial.polynomial import estimate
+
+__all__ = ["ararmax", "ararx", "arma", "armax", "arx", "bj", "fir", "oe"]
+
+
+def fir(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """Finite impulse response y = B u + e, by QR (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        nb, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("fir", data, orders, fixed, tick)
+
+
+def arx(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """A y = B u + e, by QR (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        na, nb, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("arx", data, orders, fixed, tick)
+
+
+def armax(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """A y = B u + C e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        na, nb, nc, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("armax", data, orders, fixed, tick)
+
+
+def arma(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """Time series A y = C e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        na, nc.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("arma", data, orders, fixed, tick)
+
+
+def ararx(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """A y = B u + (1/D) e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        na, nb, nd, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("ararx", data, orders, fixed, tick)
+
+
+def ararmax(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """A y = B u + (C/D) e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        na, nb, nc, nd, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("ararmax", data, orders, fixed, tick)
+
+
+def oe(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """Output error y = (B/F) u + e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        nb, nf, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("oe", data, orders, fixed, tick)
+
+
+def bj(
+    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+) -> BlackBoxFit:
+    """Box-Jenkins y = (B/F) u + (C/D) e (Ljung 1999, sec. 4.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        nb, nc, nd, nf, nk; nb, nf and nk one number, or one for each input.
+    fixed : Mapping[str, float], optional
+        Known coefficients, by name (``a1``), SI.
+    tick : callable, optional
+        Called before each look at the data.
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    return estimate("bj", data, orders, fixed, tick)

@@ -1,0 +1,243 @@
+"""Compiled recursions of the polynomial predictor, and the triangle of its residual and gradients.
+
+All signals of a predictor are rows of one buffer, each made from earlier rows by one filter. What is filtered by what
+is a table of whole numbers, made once for a structure; only the coefficients change from one call to the next. The
+buffer holds one block of samples behind `pad` samples of history, so a long record needs no more memory than a short
+one. Its rows are turned into the triangle of a QR decomposition block by block, by Householder reflections.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Table = NDArray[np.int64]
+
+# columns of the table of filters and of the table of their terms
+_DESTINATION, _DENOMINATOR, _N_DENOMINATOR, _FIRST_TERM, _LAST_TERM, _IMPULSE = range(6)
+_SOURCE, _NUMERATOR, _N_NUMERATOR, _LAG = range(4)
+_FORGOTTEN = 1e-17  # what is left of a unit impulse when it no longer counts
+_LOST = 1e-30
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _add_moving_sum(c: Array, lag: int, x: Array, y: Array, pad: int, m: int) -> None:
+    """Add sum_j c_j x(t - lag - j) to y(t)."""
+    for j in range(c.size):
+        a, first = c[j], pad - lag - j
+        if a != 0:
+            for t in range(m):
+                y[pad + t] += a * x[first + t]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _recurse(c: Array, y: Array, pad: int, m: int) -> None:
+    """Turn y into y / c in place, c = c_1, c_2, ...; one and two coefficients stay in registers."""
+    n = c.size
+    if n == 1:
+        p, a = y[pad - 1], c[0]
+        for t in range(pad, pad + m):
+            p = y[t] - a * p
+            y[t] = p
+    elif n == 2:
+        p, q, a, b = y[pad - 1], y[pad - 2], c[0], c[1]
+        for t in range(pad, pad + m):
+            r = (y[t] - b * q) - a * p
+            q = p
+            p = r
+            y[t] = r
+    elif n == 3:
+        p, q, r, a, b, d = y[pad - 1], y[pad - 2], y[pad - 3], c[0], c[1], c[2]
+        for t in range(pad, pad + m):
+            s = (y[t] - d * r - b * q) - a * p
+            r = q
+            q = p
+            p = s
+            y[t] = s
+    else:
+        for t in range(pad, pad + m):
+            s = y[t]
+            for k in range(n - 1, -1, -1):
+                s = s - c[k] * y[t - 1 - k]
+            y[t] = s
+
+
+@njit(cache=True, nogil=True)
+def _ring(c: Array, y: Array, pad: int, m: int) -> None:
+    """Turn y into y / c in place and end the response where it is lost in rounding: denormal numbers are slow."""
+    for t in range(pad, pad + m):
+        s = y[t]
+        for k in range(c.size - 1, -1, -1):
+            s = s - c[k] * y[t - 1 - k]
+        y[t] = s if np.abs(s) > _LOST else 0
+
+
+@njit(cache=True, nogil=True)
+def _filter_block(filters: Table, terms: Table, coef: Array, s: Array, pad: int, m: int, impulse: int) -> None:
+    """Run every filter over one block. `impulse`: 0 where nothing of the impulse at the first row is left."""
+    for f in range(filters.shape[0]):
+        if filters[f, _IMPULSE] and not impulse:
+            continue
+        y = s[filters[f, _DESTINATION]]
+        y[pad : pad + m] = 0
+        for k in range(filters[f, _FIRST_TERM], filters[f, _LAST_TERM]):
+            first = terms[k, _NUMERATOR]
+            _add_moving_sum(
+                coef[first : first + terms[k, _N_NUMERATOR]], terms[k, _LAG], s[terms[k, _SOURCE]], y, pad, m
+            )
+        first = filters[f, _DENOMINATOR]
+        last = first + filters[f, _N_DENOMINATOR]
+        if last > first and filters[f, _IMPULSE]:
+            _ring(coef[first:last], y, pad, m)
+        elif last > first:
+            _recurse(coef[first:last], y, pad, m)
+
+
+@njit(cache=True, nogil=True)
+def _next_block(s: Array, y: Array, u: Array, impulse_row: int, t0: int, first: int, pad: int, m: int) -> None:
+    """Keep the end of the last block as history and read the next samples."""
+    for i in range(s.shape[0]):
+        for t in range(pad):
+            s[i, t] = s[i, m + t]
+    last = min(first + m, y.size)
+    for t in range(first, last):
+        s[0, pad + t - first] = y[t]
+    for i in range(u.shape[0]):
+        for t in range(first, last):
+            s[1 + i, pad + t - first] = u[i, t]
+    s[impulse_row - 1, pad : pad + m] = 1
+    s[impulse_row, pad : pad + m] = 0
+    if first <= t0 < last:
+        s[impulse_row, pad + t0 - first] = 1
+
+
+@njit(cache=True, nogil=True)
+def _still_ringing(filters: Table, s: Array, pad: int, m: int) -> int:
+    """Return 1 while the history of any impulse response counts, else flush it to zero."""
+    for f in range(filters.shape[0]):
+        if filters[f, _IMPULSE]:
+            for t in range(m, m + pad):
+                if np.abs(s[filters[f, _DESTINATION], t]) > _FORGOTTEN:
+                    return 1
+    for f in range(filters.shape[0]):
+        if filters[f, _IMPULSE]:
+            s[filters[f, _DESTINATION], :] = 0
+    return 0
+
+
+@njit(cache=True, nogil=True)
+def predictor_rows(
+    y: Array,
+    u: Array,
+    filters: Table,
+    terms: Table,
+    columns: Table,
+    coef: Array,
+    s: Array,
+    pad: int,
+    t0: int,
+    first: int,
+) -> Array:
+    """Return rows [gradients, residual] from row `t0` on, shape (n_columns, n - t0), of a record of one block.
+
+    `columns` holds source row, lag and sign; `s` (n_signals, pad + n) is work space of zeros.
+    """
+    m = y.size
+    _next_block(s, y, u, first, t0, 0, pad, m)
+    _filter_block(filters, terms, coef, s, pad, m, 1)
+    out = np.empty((columns.shape[0], m - t0), s.dtype)
+    for j in range(columns.shape[0]):
+        a = pad + t0 - columns[j, 1]
+        for t in range(m - t0):
+            out[j, t] = columns[j, 2] * s[columns[j, 0], a + t]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def add_rows(R: Array, w: Array, n: int, first: int) -> None:
+    """Take the first `n` samples of rows `w` (n_columns, block) into the triangle R by Householder reflections.
+
+    A reflection for column j mixes R[j] with the new samples only. Columns before `first` are zero in `w`.
+    """
+    p = R.shape[0]
+    for j in range(first, p):
+        v = w[j]
+        s = 0.0
+        for t in range(n):
+            s += v[t] * v[t]
+        if s == 0.0:
+            continue
+        a = R[j, j]
+        b = -np.sqrt(a * a + s) if a > 0 else np.sqrt(a * a + s)
+        d = 1.0 / (a - b)
+        tau = -(a - b) / b
+        for k in range(j + 1, p):
+            x = w[k]
+            g = 0.0
+            for t in range(n):
+                g += v[t] * x[t]
+            g = tau * (R[j, k] + g * d)
+            R[j, k] -= g
+            g *= d
+            for t in range(n):
+                x[t] -= g * v[t]
+        R[j, j] = b
+
+
+@njit(cache=True, nogil=True)
+def predictor_triangle(
+    y: Array,
+    u: Array,
+    filters: Table,
+    terms: Table,
+    columns: Table,
+    coef: Array,
+    n_signals: int,
+    pad: int,
+    t0: int,
+    impulse_row: int,
+    n_ringing: int,
+    block: int,
+) -> Array:
+    """Return the triangle R of the rows [gradients, residual] from row `t0` on, shape (n_columns, n_columns).
+
+    The first `n_ringing` columns are responses to the impulse at `t0`; they are left out once they have died away.
+    """
+    n, p = y.size, columns.shape[0]
+    m = min(block, n)
+    s = np.zeros((n_signals, pad + m))
+    w = np.empty((p, m))
+    R = np.zeros((p, p))
+    impulse = 1
+    for first in range(0, n, m):
+        if first and impulse and first > t0 + pad:
+            impulse = _still_ringing(filters, s, pad, m)
+        _next_block(s, y, u, impulse_row, t0, first, pad, m)
+        _filter_block(filters, terms, coef, s, pad, m, impulse)
+        skip = max(0, t0 - first)
+        rows = min(m, n - first) - skip
+        if rows <= 0:
+            continue
+        start = 0 if impulse else n_ringing
+        for j in range(start, p):
+            a, sign = pad + skip - columns[j, 1], columns[j, 2]
+            x = s[columns[j, 0]]
+            for t in range(rows):
+                w[j, t] = sign * x[a + t]
+        add_rows(R, w, rows, start)
+    return R
+
+
+@njit(cache=True, nogil=True)
+def filtered(num: Array, den: Array, x: Array) -> Array:
+    """Return (num / den) x, from rest, den beginning with 1, shape (n_samples,)."""
+    pad = max(num.size, den.size)
+    padded = np.zeros(pad + x.size)
+    padded[pad:] = x
+    y = np.zeros(pad + x.size)
+    _add_moving_sum(num, 0, padded, y, pad, x.size)
+    if den.size > 1:
+        _recurse(den[1:], y, pad, x.size)
+    return y[pad:]

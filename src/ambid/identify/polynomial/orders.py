@@ -1,0 +1,276 @@
+"""Orders of a polynomial model: what the user wrote, checked, and where each coefficient then stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError, nearest
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.identify.blackbox.structures import structure
+
+Array = NDArray[np.float64]
+Key = tuple[str, int | None]
+Orders = Mapping[str, int | tuple[int, ...]]
+
+_PER_INPUT = ("nb", "nk", "nf")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Orders of one output, and which of its coefficients are free.
+
+    Attributes
+    ----------
+    na, nc, nd : int
+    nb, nk, nf : tuple of int
+        One for each input.
+    fixed : tuple of int
+        Places of coefficients that the user fixed.
+    """
+
+    na: int
+    nb: tuple[int, ...]
+    nc: int
+    nd: int
+    nf: tuple[int, ...]
+    nk: tuple[int, ...]
+    fixed: tuple[int, ...] = ()
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.nb)
+
+    @property
+    def places(self) -> dict[Key, slice]:
+        """Where each polynomial stands among all coefficients, in the order of `PolynomialModel.theta`."""
+        sizes: list[tuple[Key, int]] = [(("A", None), self.na + 1)]
+        sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(self.nb, self.nk, strict=True))]
+        sizes += [(("C", None), self.nc + 1), (("D", None), self.nd + 1)]
+        sizes += [(("F", i), f + 1) for i, f in enumerate(self.nf)]
+        first, out = 0, {}
+        for key, size in sizes:
+            out[key] = slice(first, first + size)
+            first += size
+        return out
+
+    @property
+    def n_theta(self) -> int:
+        """Number of all coefficients, leading ones and zeros included."""
+        return self.na + sum(self.nb) + sum(self.nk) + self.nc + self.nd + sum(self.nf) + 3 + self.n_inputs
+
+    @property
+    def first_row(self) -> int:
+        """First sample whose regressors lie in the record."""
+        return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
+
+    def free_lags(self, key: Key) -> tuple[int, ...]:
+        """Return the lags of the coefficients of polynomial `key` that are estimated.
+
+        Parameters
+        ----------
+        key : tuple of str and (int or None)
+            Letter and input.
+
+        Returns
+        -------
+        tuple of int
+        """
+        place = self.places[key]
+        first = self.nk[key[1]] if key[0] == "B" and key[1] is not None else 1
+        return tuple(k for k in range(first, place.stop - place.start) if place.start + k not in self.fixed)
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """Places of the estimated coefficients, shape (n_free,)."""
+        return np.array([p.start + k for key, p in self.places.items() for k in self.free_lags(key)], dtype=np.int64)
+
+    def start(self) -> Array:
+        """Return coefficients of a model that is zero: leading ones alone, shape (n_theta,)."""
+        theta = np.zeros(self.n_theta)
+        for (letter, _), place in self.places.items():
+            theta[place.start] = float(letter != "B")
+        return theta
+
+    def polynomials(self, theta: Array) -> Polynomials:
+        """Return the polynomials that `theta` holds.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        Polynomials
+        """
+        p = self.places
+        per_input = range(self.n_inputs)
+        return Polynomials(
+            A=theta[p["A", None]],
+            B=tuple(theta[p["B", i]] for i in per_input),
+            C=theta[p["C", None]],
+            D=theta[p["D", None]],
+            F=tuple(theta[p["F", i]] for i in per_input),
+        )
+
+
+def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tuple[int, ...] | None]:
+    """Check orders against structure and data; nk is None where it is to be estimated.
+
+    Parameters
+    ----------
+    name : str
+        Structure.
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+        nb, nf and nk as one number for all inputs or one for each; nk may be missing or "auto".
+
+    Returns
+    -------
+    dict of str to (int, tuple of int or None)
+
+    Raises
+    ------
+    EstimationError
+        If an order is missing, unknown, not a whole number or out of range.
+    """
+    known = structure(name).orders
+    _check_inputs(name, data)
+    for key in orders:
+        if key not in known:
+            raise EstimationError(
+                f"{name}: order {key!r} is not one of {', '.join(known)}.{nearest(key, list(known))} Leave it out"
+            )
+    found: dict[str, int | tuple[int, ...] | None] = {}
+    for key in known:
+        value: object = orders.get(key)
+        if key == "nk" and (value is None or (isinstance(value, str) and value == "auto")):
+            found[key] = None
+        elif value is None:
+            raise EstimationError(f"{name}: order {key} is missing; it needs {', '.join(known)}. Give {key}=1, say")
+        elif key in _PER_INPUT:
+            found[key] = _per_input(name, key, value, data.n_inputs)
+        else:
+            found[key] = _whole(name, key, value, 0)
+    if not any(found[key] for key in known if key != "nk"):
+        raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
+    return found
+
+
+def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int) -> Layout:
+    """Return the layout of checked orders.
+
+    Parameters
+    ----------
+    orders : Mapping[str, int, tuple of int or None]
+        Of `read_orders`, nk a number for each input by now.
+    n_inputs : int
+
+    Returns
+    -------
+    Layout
+    """
+
+    def one(key: str) -> int:
+        value = orders.get(key, 0)
+        return value if isinstance(value, int) else 0
+
+    def each(key: str) -> tuple[int, ...]:
+        value = orders.get(key)
+        return value if isinstance(value, tuple) else (0,) * n_inputs
+
+    return Layout(
+        na=one("na"), nb=each("nb"), nc=one("nc"), nd=one("nd"), nf=each("nf"), nk=each("nk")
+    )  # fixed: see `fixed_places`
+
+
+def shown_orders(name: str, layout: Layout) -> dict[str, int | tuple[int, ...]]:
+    """Return the orders as a result prints them: a number where all inputs agree.
+
+    Parameters
+    ----------
+    name : str
+    layout : Layout
+
+    Returns
+    -------
+    dict of str to (int or tuple of int)
+    """
+    out: dict[str, int | tuple[int, ...]] = {}
+    for key in structure(name).orders:
+        value = getattr(layout, key)
+        out[key] = value[0] if isinstance(value, tuple) and len(set(value)) == 1 else value
+    return out
+
+
+def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, float]) -> list[dict[int, float]]:
+    """Find where the coefficients that the user fixed stand.
+
+    Parameters
+    ----------
+    name : str
+        Structure.
+    layouts : tuple of Layout
+        One for each output.
+    fixed : Mapping[str, float]
+        By the names of `PolynomialModel.names`.
+
+    Returns
+    -------
+    list of dict of int to float
+        Place and value, for each output.
+
+    Raises
+    ------
+    EstimationError
+        If a name is not one of the coefficients that would be estimated, or a value is not a finite number.
+    """
+    outputs = tuple(layout.polynomials(layout.start()) for layout in layouts)
+    names = PolynomialModel(outputs=outputs, dt=1.0).names
+    free = {}
+    first = 0
+    for o, layout in enumerate(layouts):
+        free.update({names[first + p]: (o, int(p)) for p in layout.free})
+        first += layout.n_theta
+    found: list[dict[int, float]] = [{} for _ in layouts]
+    for key, value in fixed.items():
+        if key not in free:
+            raise EstimationError(
+                f"{name}: no coefficient {key!r} can be fixed; there are {', '.join(free)}.{nearest(key, list(free))}"
+            )
+        if not np.isfinite(value):
+            raise EstimationError(f"{name}: coefficient {key} is fixed at {value}; it must be a finite number")
+        o, place = free[key]
+        found[o][place] = float(value)
+    return found
+
+
+def _check_inputs(name: str, data: IOData) -> None:
+    wants = structure(name).inputs
+    if wants and not data.n_inputs:
+        raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
+    if not wants and data.n_inputs:
+        raise EstimationError(
+            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Leave them out, or "
+            "use armax"
+        )
+
+
+def _per_input(name: str, key: str, value: object, n_inputs: int) -> tuple[int, ...]:
+    values = tuple(value) if isinstance(value, tuple | list) else (value,) * n_inputs
+    if len(values) != n_inputs:
+        raise EstimationError(
+            f"{name}: {key} has {len(values)} numbers for {n_inputs} input(s). Give one number, or one for each input"
+        )
+    return tuple(_whole(name, key, v, 1 if key == "nb" else 0) for v in values)
+
+
+def _whole(name: str, key: str, value: object, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise EstimationError(f"{name}: {key} = {value!r} is no whole number of at least {least}. Correct it")
+    return int(value)

@@ -1,0 +1,208 @@
+"""Gauss-Newton and Levenberg-Marquardt search for the coefficients of one output.
+
+It minimises the squared residual over the coefficients, initial states and constant taken out exactly (they enter
+linearly; Golub & Pereyra 1973). Each step works on the triangle of the rows (predictor.py), so its cost does not grow
+with the record: scipy's optimisers would hold and factorise all rows again. Steps that leave the region where the
+predictor is stable are shortened, so the result is stable by construction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.polynomial.predictor import Predictor
+from ambid.identify.polynomial.stability import stable_predictor
+
+Array = NDArray[np.float64]
+
+_ENOUGH = 1e-8  # squared length of the next step in standard deviations
+_NOTHING_LEFT = 1e-24  # squared residual over squared output where the data are matched to rounding
+_MOST = 60
+_UNSEEN = 1e-11  # singular value, of scaled columns, below which no step is taken along a direction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fitted:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (n_theta,)
+        All coefficients of the output, in scaled units.
+    nuisance : ndarray, shape (n_nuisance,)
+        Initial states and constant.
+    triangle : ndarray, shape (n_free, n_free)
+        R of the free coefficients, nuisance taken out.
+    cost : float
+        Squared residual.
+    n_rows : int
+    converged : bool
+    at_border : bool
+        Whether steps had to be shortened to the end to keep the predictor stable.
+    iterations : int
+    """
+
+    theta: Array
+    nuisance: Array
+    triangle: Array
+    cost: float
+    n_rows: int
+    converged: bool
+    at_border: bool
+    iterations: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Point:
+    theta: Array
+    nuisance: Array
+    R: Array
+    n: int  # nuisance numbers
+
+    @property
+    def rest(self) -> float:
+        return float(self.R[-1, -1] ** 2)
+
+    @property
+    def gradient(self) -> Array:
+        return np.asarray(self.R[self.n : -1, -1])
+
+    @property
+    def cost(self) -> float:
+        return float(np.sum(self.R[self.n :, -1] ** 2))
+
+
+def searched(
+    predictor: Predictor,
+    y: Array,
+    u: Array,
+    start: Array,
+    *,
+    most: int = _MOST,
+    tick: Callable[[], None] | None = None,
+) -> Fitted:
+    """Minimise the squared residual from `start`.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    y : ndarray, shape (n_samples,)
+        Scaled, mean taken off.
+    u : ndarray, shape (n_inputs, n_samples)
+    start : ndarray, shape (n_theta,)
+        Its C and F must be stable.
+    most : int, optional
+        Evaluations.
+    tick : callable, optional
+        Called before each evaluation.
+
+    Returns
+    -------
+    Fitted
+    """
+    n, free = predictor.n_nuisance, predictor.layout.free
+
+    def evaluated(theta: Array, nuisance: Array) -> _Point:
+        if tick is not None:
+            tick()
+        return _Point(theta=theta, nuisance=nuisance, R=predictor.triangle(y, u, theta, nuisance), n=n)
+
+    n_rows = y.size - predictor.first_row
+    floor = _NOTHING_LEFT * float(y @ y)
+    at = evaluated(start, np.zeros(n))
+    if predictor.n_initial and not _linear(predictor):
+        at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
+    damping, converged, shortened, count = 0.0, False, False, 1
+    while True:
+        U, s, Vt, scale = _directions(at, n)
+        spread = max(at.rest / max(n_rows - n - free.size, 1), 1e-300)
+        left = float(np.sum((U.T @ at.gradient) ** 2))
+        step = _step(U, s, Vt, scale, at.gradient, 0.0)
+        if left <= _ENOUGH * spread or at.cost <= floor or _linear(predictor):
+            theta = _moved(at.theta, free, step)
+            if _linear(predictor) or stable_predictor(predictor.layout, theta):
+                at = _finished(at, theta, step, linear=_linear(predictor))
+            converged = True
+            break
+        if count >= most or damping > 1e12:
+            # where rounding allows no further descent and less than a hundredth of a standard deviation is left
+            converged = damping > 1e12 and left <= 1e-4 * spread
+            break
+        step = _step(U, s, Vt, scale, at.gradient, damping)
+        step, cut = _kept_stable(predictor, at.theta, free, step)
+        trial = evaluated(_moved(at.theta, free, step), at.nuisance + _nuisance_step(at, step))
+        count += 1
+        if np.isfinite(trial.cost) and trial.cost < at.cost:
+            expected = at.cost - float(np.sum((at.R[n:-1, n:-1] @ step + at.gradient) ** 2)) - at.rest
+            good = at.cost - trial.cost > 0.5 * expected
+            damping = (0.0 if damping < 1e-6 else damping * 0.1) if good else max(damping, 1e-6)
+            at, shortened = trial, cut
+        else:
+            damping = max(damping * 10.0, 1e-3)
+    return Fitted(
+        theta=at.theta,
+        nuisance=at.nuisance,
+        triangle=at.R[n:-1, n:-1],
+        cost=at.cost,
+        n_rows=n_rows,
+        converged=converged,
+        at_border=shortened,
+        iterations=count,
+    )
+
+
+def _linear(predictor: Predictor) -> bool:
+    x = predictor.layout
+    return not (x.nc or x.nd or any(x.nf))
+
+
+def _directions(at: _Point, n: int) -> tuple[Array, Array, Array, Array]:
+    """Singular directions of the scaled triangle; those that the data do not see are left out."""
+    R = at.R[n:-1, n:-1]
+    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-300)
+    U, s, Vt = np.linalg.svd(R / scale)
+    seen = s > _UNSEEN * max(s[0] if s.size else 0.0, 1e-300)
+    return U[:, seen], s[seen], Vt[seen], scale
+
+
+def _step(U: Array, s: Array, Vt: Array, scale: Array, gradient: Array, damping: float) -> Array:
+    return np.asarray(-(Vt.T @ ((s / (s * s + damping)) * (U.T @ gradient))) / scale)
+
+
+def _nuisance_step(at: _Point, step: Array) -> Array:
+    """Nuisance numbers that go with a step; the smallest where the data do not tell them apart."""
+    if not at.n:
+        return np.zeros(0)
+    R = at.R[: at.n, : at.n]
+    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-300)
+    right = at.R[: at.n, at.n : -1] @ step + at.R[: at.n, -1]
+    return np.asarray(-np.linalg.lstsq(R / scale, right, rcond=1e-10)[0] / scale)
+
+
+def _moved(theta: Array, free: NDArray[np.int64], step: Array) -> Array:
+    out = theta.copy()
+    out[free] += step
+    return out
+
+
+def _kept_stable(predictor: Predictor, theta: Array, free: NDArray[np.int64], step: Array) -> tuple[Array, bool]:
+    """Halve a step until the predictor stays stable."""
+    cut = False
+    for _ in range(60):
+        if stable_predictor(predictor.layout, _moved(theta, free, step)):
+            return step, cut
+        step, cut = 0.5 * step, True
+    return 0.0 * step, True
+
+
+def _finished(at: _Point, theta: Array, step: Array, *, linear: bool) -> _Point:
+    """Take the last step, too small (or the problem too linear) to need another look at the data."""
+    R = at.R
+    if linear:
+        R = R.copy()
+        R[at.n : -1, -1] += R[at.n : -1, at.n : -1] @ step
+    return _Point(theta=theta, nuisance=at.nuisance + _nuisance_step(at, step), R=R, n=at.n)
