@@ -77,6 +77,18 @@ def _instrumental(
     )
 
 
+def _subspace(name: str, feedback: Literal["biased", "consistent"], summary: str) -> Structure:
+    return Structure(
+        name=name,
+        summary=summary,
+        orders=("n",),
+        home=f"ambid.identify.subspace:{name}",
+        inputs=True,
+        feedback=feedback,
+        kind="state space",
+    )
+
+
 STRUCTURES: Mapping[str, Structure] = {
     s.name: s
     for s in (
@@ -90,6 +102,13 @@ STRUCTURES: Mapping[str, Structure] = {
         _polynomial("bj", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
         _instrumental("iv4", "na nb nk", "biased", "q", "A y = B u + noise of any colour"),
         _instrumental("cliv", "na nb nk", "consistent", "q", "the same in a loop, with its reference"),
+        _instrumental("srivc", "nb nf nk", "biased", "s", "y = B(s)/F(s) u + noise, continuous time"),
+        _instrumental("clsrivc", "nb nf nk", "consistent", "s", "the same in a loop, with its reference"),
+        _instrumental("two-stage", "nb nf nk", "consistent", "q", "y = B/F u in a loop: reference to input, then oe"),
+        _subspace("n4sid", "biased", "x+ = A x + B u + K e by oblique projection"),
+        _subspace("moesp", "biased", "the same, past without future inputs"),
+        _subspace("cva", "biased", "the same, canonical variates"),
+        _subspace("pbsid", "consistent", "the same from a long autoregression: feedback does not disturb it"),
     )
 }
 

@@ -1,0 +1,94 @@
+"""Covariance of a state-space estimate by leaving out one group of time after another.
+
+Solves: cov(theta) = (G-1)/G sum_g (theta_g - mean)(theta_g - mean)', with theta_g the estimate without group g. States
+have no natural basis: each estimate is first turned into the basis of the full one through the observability matrices,
+which fixes the gauge, so that spreads of poles and responses follow by the delta method (delete-a-group jackknife;
+Shao and Tu 1995, ch. 2). Residuals count as they are: correlated, of changing size, of a model that is too small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.subspace.realisation import Realisation, least_squares, observability
+
+Array = NDArray[np.float64]
+
+
+def aligned(one: Realisation, like: Realisation, length: int) -> Realisation:
+    """Return a realisation in the state basis of another.
+
+    Parameters
+    ----------
+    one, like : Realisation
+        Of equal order.
+    length : int
+        Block rows of the observability matrices that are compared.
+
+    Returns
+    -------
+    Realisation
+    """
+    T = least_squares(observability(one.A, one.C, length), observability(like.A, like.C, length))
+    back = np.linalg.inv(T)
+    return Realisation(
+        A=back @ one.A @ T,
+        B=back @ one.B,
+        C=one.C @ T,
+        D=one.D,
+        K=back @ one.K,
+        innovation=one.innovation,
+        Q=back @ one.Q @ back.T,
+        S=back @ one.S,
+        R=one.R,
+        stable_predictor=one.stable_predictor,
+    )
+
+
+def jackknife(full: Realisation, others: Sequence[Realisation], length: int) -> Array | None:
+    """Return the covariance of vec(A, B, C, D, K), each row by row.
+
+    Parameters
+    ----------
+    full : Realisation
+        From all groups.
+    others : sequence of Realisation
+        Each without one group.
+    length : int
+        Block rows of the observability matrices that are compared.
+
+    Returns
+    -------
+    ndarray, shape (n_theta, n_theta), or None
+        None where a basis cannot be matched.
+    """
+    rows = []
+    for one in others:
+        try:
+            same = aligned(one, full, length)
+        except np.linalg.LinAlgError:
+            return None
+        rows.append(theta(same))
+    values = np.array(rows)
+    if not np.all(np.isfinite(values)):
+        return None
+    deviations = values - values.mean(0)
+    groups = values.shape[0]
+    return np.asarray((groups - 1) / groups * deviations.T @ deviations)
+
+
+def theta(one: Realisation) -> Array:
+    """Return the coefficients in the order of `StateSpaceModel.theta`.
+
+    Parameters
+    ----------
+    one : Realisation
+
+    Returns
+    -------
+    ndarray, shape (n_theta,)
+    """
+    return np.concatenate([getattr(one, m).ravel() for m in "ABCDK"])
