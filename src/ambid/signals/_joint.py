@@ -62,17 +62,26 @@ def labels(names: Sequence[str] | None, letter: str, count: int) -> tuple[str, .
 
 
 def ratio(Z: Complex, covariance: Complex, n_y: int, weight: Complex | None = None) -> tuple[Complex, Complex]:
-    """Return G = Y U⁻¹ and its covariance from the joint responses and their covariance.
+    """Return G and its covariance from joint responses `Z` and the covariance of vec(Z) row by row."""
+    G, T = ratio_map(Z, n_y, weight)
+    return G, transformed(covariance, T)
 
-    dG = [I, -G] dZ U⁻¹ to first order (Pintelon and Schoukens 2012, eq. 2-32 f. for one input), so that vec row by row
-    gives T = [I, -G] ⊗ U⁻ᵀ. With more columns than inputs, U⁻¹ is the right inverse W Uᴴ (U W Uᴴ)⁻¹.
 
-    `Z` (n_f, n_z, m), `covariance` (n_f, n_z*m, n_z*m) of vec(Z) row by row, `weight` W (n_f, m, m).
+def ratio_map(Z: Complex, n_y: int, weight: Complex | None = None) -> tuple[Complex, Complex]:
+    """Return G = Y U⁻¹ and T, the derivative of vec(G) by vec(Z), both row by row.
+
+    dG = [I, -G] dZ U⁻¹ to first order, so T = [I, -G] ⊗ U⁻ᵀ; T C Tᴴ is Pintelon and Schoukens 2012, eq. 2-32 f., for
+    any number of inputs. With more columns than inputs, U⁻¹ is the right inverse W Uᴴ (U W Uᴴ)⁻¹.
+
+    `Z` (n_f, n_z, m), `weight` W (n_f, m, m).
     """
     Y, U = Z[:, :n_y], Z[:, n_y:]
-    inverse = _right_inverse(U, weight)
+    inverse = right_inverse(U, weight)
     G = Y @ inverse
-    return G, transformed(covariance, _error_map(G, inverse))
+    n, _, n_u = G.shape
+    left = np.concatenate([np.broadcast_to(np.eye(n_y), (n, n_y, n_y)), -G], axis=2)
+    T = left[:, :, None, :, None] * np.swapaxes(inverse, 1, 2)[:, None, :, None, :]
+    return G, np.asarray(T.reshape(n, n_y * n_u, -1))
 
 
 def weak_inputs(Z: Complex, covariance: Complex, n_y: int) -> tuple[str, ...]:
@@ -115,7 +124,8 @@ def scatter(values: Complex) -> Complex:
     return np.asarray(C)
 
 
-def _right_inverse(U: Complex, weight: Complex | None) -> Complex:
+def right_inverse(U: Complex, weight: Complex | None = None) -> Complex:
+    """Return W Uᴴ (U W Uᴴ)⁻¹ of `U` (n_f, n_u, m), refused where its rows are dependent."""
     n_u, m = U.shape[1:]
     s = np.linalg.svd(U, compute_uv=False)
     worst = int(np.argmin(s[:, -1] / np.maximum(s[:, 0], np.finfo(float).tiny)))
@@ -128,14 +138,6 @@ def _right_inverse(U: Complex, weight: Complex | None) -> Complex:
         return np.asarray(np.linalg.inv(U))
     WU = _h(U) if weight is None else weight @ _h(U)
     return np.asarray(WU @ np.linalg.inv(U @ WU))
-
-
-def _error_map(G: Complex, inverse: Complex) -> Complex:
-    n, n_y, n_u = G.shape
-    left = np.concatenate([np.broadcast_to(np.eye(n_y), (n, n_y, n_y)), -G], axis=2)
-    right = np.swapaxes(inverse, 1, 2)
-    T = left[:, :, None, :, None] * right[:, None, :, None, :]
-    return np.asarray(T.reshape(n, n_y * n_u, -1))
 
 
 def _h(x: Complex) -> Complex:
