@@ -10,12 +10,20 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.estimate import Check, OutputFit
+from ambid.identify.estimate import OutputFit
+from ambid.validate.blackbox.checks import coloured_warning, feedback_warning, residual_verdicts, stable_predictor
+from ambid.validate.blackbox.colour import coloured_covariance
 from ambid.validate.blackbox.criteria import criteria
+from ambid.validate.blackbox.gradient import gradient
+from ambid.validate.blackbox.order_support import orders_supported
 from ambid.validate.blackbox.predictor import Errors, errors, errors_elsewhere
+from ambid.validate.blackbox.residual_tests import residual_tests
 from ambid.validate.prediction import fit_of
 
 Array = NDArray[np.float64]
+
+_MOST = 4e7  # numbers in the derivatives of one output that are kept at once
+_LEAST = 60  # samples from which residuals can be tested
 
 
 def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> BlackBoxFit:
@@ -34,7 +42,8 @@ def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> B
     -------
     BlackBoxFit
         With `fit`, `criteria`, `checks` and, for a second record, `validation`:
-        ``{output: {"one_step": {"fit", "rmse"}, "simulation": {"fit", "rmse"} or None}}``.
+        ``{output: {"one_step": {"fit", "rmse"}, "simulation": {"fit", "rmse"} or None}}``. An output-error model whose
+        residuals are coloured gets the covariance that holds for coloured noise, and says so in its warnings.
 
     Raises
     ------
@@ -42,12 +51,31 @@ def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> B
         If channels or rate of a record differ from those of the fit.
     """
     found = errors(fit, data)
+    sound = bool(np.all(np.isfinite(found.one_step)))
+    checks = {"stable_predictor": stable_predictor(found)}
+    covariance, more = fit.covariance, list[str]()
+    if sound and checks["stable_predictor"].passed and data.n_samples >= _LEAST:
+        part, tail = _last(data, found)
+        slopes = gradient(fit, part, tail)
+        tests = residual_tests(part, tail, slopes)
+        if any(c.size > 1 for c in tests.colours):
+            whole = slopes if part is data else None
+            again = None if whole is None else coloured_covariance(fit, found.one_step, whole, tests.colours)
+            covariance = fit.covariance if again is None else again
+            more += coloured_warning(fit, adjusted=again is not None)
+        checks |= residual_verdicts(fit, data, found, tests)
+        more += feedback_warning(fit, data, tests)
+    fit = replace(fit, covariance=covariance)
+    supported = orders_supported(fit)
+    if supported is not None:
+        checks["orders_supported"] = supported
     return replace(
         fit,
         fit=_output_fits(fit, data, found),
-        criteria=criteria(found.one_step, data.y, fit.n_estimated),
-        checks=_checks(found),
+        criteria=criteria(found.one_step, data.y, fit.n_estimated) if sound else {},
+        checks=checks,
         validation=None if second is None else validation(fit, second),
+        warnings=(*fit.warnings, *more),
     )
 
 
@@ -106,17 +134,11 @@ def _output_fits(fit: BlackBoxFit, data: IOData, found: Errors) -> dict[str, Out
     }
 
 
-def _checks(found: Errors) -> dict[str, Check]:
-    return {"stable_predictor": _stable_predictor(found)}
-
-
-def _stable_predictor(found: Errors) -> Check:
+def _last(data: IOData, found: Errors) -> tuple[IOData, Errors]:
+    """Return the last part of a long record: as much as the derivatives of a large model leave room for."""
     m = found.model
-    radius = float(np.max(np.abs(np.linalg.eigvals(m.A - m.K @ m.C)), initial=0.0)) if m.order else 0.0
-    ok = radius < 1.0
-    return Check(
-        passed=ok,
-        values={"radius": radius},
-        detail=f"the predictor's poles are within {radius:.4g} of zero"
-        + ("" if ok else ": its errors grow without bound. Take a structure with a noise model, or other orders"),
-    )
+    width = (m.order + 1) * (m.order + m.n_inputs + m.n_outputs)
+    first = data.n_samples - int(_MOST / width)
+    if first <= 0:
+        return data, found
+    return data.part(first, data.n_samples), replace(found, one_step=found.one_step[first:], simulation=None)

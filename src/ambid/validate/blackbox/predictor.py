@@ -138,7 +138,7 @@ def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
     if model.dt is not None:
         return model.state_space()
     if isinstance(model, TransferModel):
-        return _held_transfer(model, fit.dt)
+        return held_transfer(model, fit.dt)
     return held(model.state_space(), fit.dt)
 
 
@@ -171,8 +171,20 @@ def _held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     return np.asarray(full[:n, :n]), np.asarray(full[:n, n:])
 
 
-def _held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
-    """Discretise every transfer function; the delay of each input is a chain of states in front of it."""
+def held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
+    """Discretise a continuous transfer model under a zero-order hold.
+
+    Parameters
+    ----------
+    model : TransferModel
+        Continuous; may have delays.
+    dt : float, s
+
+    Returns
+    -------
+    StateSpaceModel
+        The delay of each input is a chain of states in front of it.
+    """
     plain = TransferModel(num=model.num, den=model.den, dt=None).state_space()
     n, n_u = plain.order, model.n_inputs
     lags = np.asarray(model.delay) / dt

@@ -1,0 +1,136 @@
+"""What the residual tests of a black-box fit mean, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.structures import structure
+from ambid.identify.estimate import Check
+from ambid.validate.blackbox.predictor import Errors
+from ambid.validate.blackbox.residual_tests import ResidualTests
+from ambid.validate.checks import residual_check
+from ambid.validate.residuals import P_LEAST, ResidualTest
+
+
+def stable_predictor(found: Errors) -> Check:
+    """Check that the one-step errors do not grow by themselves.
+
+    Parameters
+    ----------
+    found : Errors
+
+    Returns
+    -------
+    Check
+    """
+    m = found.model
+    radius = float(np.max(np.abs(np.linalg.eigvals(m.A - m.K @ m.C)), initial=0.0)) if m.order else 0.0
+    ok = radius < 1.0
+    return Check(
+        passed=ok,
+        values={"radius": radius},
+        detail=f"the predictor's poles are within {radius:.4g} of zero"
+        + ("" if ok else ": its errors grow without bound. Take a structure with a noise model, or other orders"),
+    )
+
+
+def residual_verdicts(fit: BlackBoxFit, data: IOData, found: Errors, tests: ResidualTests) -> dict[str, Check]:
+    """Put residual tests into words.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+    found : Errors
+    tests : ResidualTests
+
+    Returns
+    -------
+    dict of str to Check
+        ``residuals_white``, and with inputs ``residuals_uncorrelated`` and ``feedback``.
+    """
+    of = f" of {tests.white_output}" if data.n_outputs > 1 else ""
+    white = residual_check(tests.white, f"residuals{of} against past residuals")
+    if not white.passed and not found.claims_noise:
+        white = Check(
+            passed=True,
+            p=white.p,
+            values=white.values,
+            detail=f"residuals{of} are coloured; {fit.structure} does not describe noise, and need not",
+        )
+    checks = {"residuals_white": white}
+    if tests.uncorrelated is not None:
+        of = f" of {tests.uncorrelated_output}" if data.n_outputs > 1 else ""
+        checks["residuals_uncorrelated"] = residual_check(tests.uncorrelated, f"residuals{of} against past inputs")
+    if tests.feedback is not None:
+        checks["feedback"] = _feedback(fit, tests.feedback, tests.feedback_input)
+    return checks
+
+
+def _feedback(fit: BlackBoxFit, test: ResidualTest, name: str) -> Check:
+    seen, biased = test.p < P_LEAST, structure(fit.structure).feedback == "biased"
+    if not seen:
+        detail = "no sign of feedback: inputs do not depend on past residuals"
+    elif biased:
+        detail = f"input {name} depends on past residuals: there is feedback, and {fit.structure} is biased by it"
+    else:
+        detail = f"input {name} depends on past residuals: there is feedback, which {fit.structure} allows for"
+    return Check(
+        passed=not (seen and biased),
+        p=test.p,
+        values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
+        detail=f"{detail} (p = {test.p:.2g})",
+    )
+
+
+def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> list[str]:
+    """Warn where the data show feedback that the user or the structure excludes.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+    tests : ResidualTests
+
+    Returns
+    -------
+    list of str
+    """
+    if tests.feedback is None or tests.feedback.p >= P_LEAST:
+        return []
+    evidence = f"input {tests.feedback_input} depends on past residuals (p = {tests.feedback.p:.2g})"
+    if structure(fit.structure).feedback == "biased":
+        return [
+            f"there is feedback in this record: {evidence}; {fit.structure} is biased by it. Use bj, armax or pbsid"
+        ]
+    if data.open_loop:
+        return [f"the record is said to be open loop, but {evidence}: leave --open-loop out"]
+    return []
+
+
+def coloured_warning(fit: BlackBoxFit, *, adjusted: bool) -> list[str]:
+    """Say how far the standard deviations of an output-error model hold under coloured noise.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    adjusted : bool
+        Whether the covariance accounts for the colour.
+
+    Returns
+    -------
+    list of str
+    """
+    if adjusted:
+        return [
+            f"the noise is coloured, which {fit.structure} does not describe: standard deviations allow for it; "
+            "a noise model (bj) would make them smaller"
+        ]
+    if fit.covariance is None:
+        return []
+    return [
+        f"the noise is coloured, which {fit.structure} does not describe; its standard deviations are those of "
+        "white noise: they may be too small. Use a structure with a noise model"
+    ]

@@ -1,0 +1,197 @@
+"""Score test of further regressors for one residual, the estimated numbers accounted for.
+
+The residuals of a consistent estimate are e0 - J (theta - theta0): with J projected out of the regressors, what
+is left does not see the error of the estimate, whichever estimator made it (Neyman's C(alpha) test; for innovations
+Ljung 1999, sec. 16.6, Soederstrom and Stoica 1989, sec. 11.2). If the model is right, the part of the residual that the
+regressors explain is chi-squared, and each correlation is normal with the variance computed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
+_PREDICTED = 1e-16  # power from which a residual is more than rounding
+_DEPENDENT = 1e-9  # singular value from which a direction of J counts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Score:
+    """Outcome of a score test.
+
+    Attributes
+    ----------
+    p : float
+        Probability of at least this much if the model is right.
+    statistic : float
+    degrees : int
+    correlation : ndarray, shape (n_regressors,)
+        Correlation coefficient of the residual with each regressor.
+    sd : ndarray, shape (n_regressors,)
+        Its standard deviation if the model is right; smaller than 1/sqrt(N) where estimated numbers take part.
+    """
+
+    p: float
+    statistic: float
+    degrees: int
+    correlation: Array
+    sd: Array
+
+
+def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None) -> Score:
+    """Test whether regressors explain a residual.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n_used,)
+    J : ndarray, shape (n_used, n_directions)
+        Derivative of the prediction by what was estimated.
+    regressors : ndarray, shape (n_used, n_regressors)
+        Known before each residual; or, with `colour`, independent of all residuals.
+    colour : ndarray, shape (n + 1,), optional
+        Autoregression [1, a1 ...] of coloured residuals. None: the residuals are white if the model is right.
+
+    Returns
+    -------
+    Score
+    """
+    from scipy.special import chdtrc
+
+    Q = basis(np.hstack([J, np.ones((e.size, 1))]))
+    size = np.linalg.norm(regressors, axis=0)
+    L = regressors / np.where(size > 0, size, 1.0)
+    for _ in range(2):  # twice is enough (Kahan): the first pass loses what cancels
+        L = L - Q @ (Q.T @ L)
+    rest = e - Q @ (Q.T @ e)
+    power = float(rest @ rest)
+    if power <= _PREDICTED * float(e @ e) or not L.shape[1]:
+        nothing = np.zeros(L.shape[1])
+        return Score(p=1.0, statistic=0.0, degrees=0, correlation=nothing, sd=nothing)
+    variance = power / max(e.size - Q.shape[1], 1)
+    inner = rest @ L
+    _, s, right = np.linalg.svd(triangle(L), full_matrices=False)
+    kept = s > _SEEN
+    z = (right[kept] @ inner) / s[kept]
+    if colour is None:
+        spread = np.sqrt(np.sum(L**2, axis=0))
+        statistic = float(z @ z) / variance
+    else:
+        M = coloured(L, colour)
+        gain = variance / power_gain(colour)
+        spread = np.sqrt(np.sum(M**2, axis=0) * gain / variance)
+        W = triangle(M @ (right[kept].T / s[kept]))
+        statistic = float(np.sum(np.linalg.lstsq(W.T, z, rcond=1e-8)[0] ** 2)) / gain
+    degrees = int(np.count_nonzero(kept))
+    return Score(
+        p=float(chdtrc(degrees, statistic)) if degrees else 1.0,
+        statistic=statistic,
+        degrees=degrees,
+        correlation=inner / np.sqrt(power),
+        sd=np.asarray(spread * np.sqrt(variance / power)),
+    )
+
+
+def basis(J: Array) -> Array:
+    """Return an orthonormal basis of the columns of a matrix.
+
+    Parameters
+    ----------
+    J : ndarray, shape (n, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (n, n_independent)
+    """
+    size = np.linalg.norm(J, axis=0)
+    used = J[:, size > 0] / size[size > 0]
+    if not used.shape[1]:
+        return np.zeros((J.shape[0], 0))
+    Q, R = np.linalg.qr(used)
+    u, s, _ = np.linalg.svd(R)
+    return np.asarray(Q @ u[:, s > _DEPENDENT * s[0]])
+
+
+def triangle(a: Array) -> Array:
+    """Return the factor R of a matrix Q R.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (min(n, n_columns), n_columns)
+    """
+    return np.asarray(np.linalg.qr(a, mode="r"), dtype=np.float64)
+
+
+def autoregression(e: Array) -> Array:
+    """Describe the colour of a residual: an autoregression by Yule-Walker, its order by BIC.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n_used,)
+
+    Returns
+    -------
+    ndarray, shape (n + 1,)
+        [1, a1, ..., an], stable; [1] for a white residual.
+    """
+    n = e.size
+    longest = max(1, min(int(10 * np.log10(n)), n // 10))
+    v = e - e.mean()
+    r = np.array([v[k:] @ v[: n - k] for k in range(longest + 1)]) / n
+    best, a, power = np.ones(1), np.ones(1), float(r[0])
+    if power <= 0:
+        return best
+    least = n * np.log(power)
+    for k in range(1, longest + 1):  # Levinson's recursion
+        reflection = -float(a @ r[k:0:-1]) / power
+        a = np.concatenate([a, [0.0]]) + reflection * np.concatenate([[0.0], a[::-1]])
+        power *= 1 - reflection**2
+        if power <= 0:
+            break
+        bic = n * np.log(power) + k * np.log(n)
+        if bic < least:
+            least, best = bic, a
+    return best
+
+
+def coloured(L: Array, a: Array) -> Array:
+    """Return H' L for residuals H w of white w: L filtered by 1/A backwards in time.
+
+    Parameters
+    ----------
+    L : ndarray, shape (n_used, n_columns)
+    a : ndarray, shape (n + 1,)
+
+    Returns
+    -------
+    ndarray, shape (n_used, n_columns)
+    """
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], a, L[::-1], axis=0)[::-1])
+
+
+def power_gain(a: Array) -> float:
+    """Return the variance of a residual over that of the white noise behind it.
+
+    Parameters
+    ----------
+    a : ndarray, shape (n + 1,)
+
+    Returns
+    -------
+    float
+    """
+    from scipy.signal import lfilter
+
+    impulse = np.zeros(20_000)
+    impulse[0] = 1.0
+    return float(np.sum(lfilter([1.0], a, impulse) ** 2))
