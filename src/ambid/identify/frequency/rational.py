@@ -98,7 +98,8 @@ def frf_ml(
     -------
     BlackBoxFit
         Structure ``frf-ml``, a TransferModel with covariance, the check ``cost`` (see `Lines.verdict`), and in
-        `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s``, ``condition`` (of the scaled Jacobian).
+        `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s`` and ``condition`` (of the
+        scaled Jacobian).
 
     Raises
     ------
