@@ -2,7 +2,7 @@
 
 Noise differs between periods; stochastic nonlinear distortion is the same in every period and differs between
 realisations of the random phases (Pintelon and Schoukens 2012, ch. 2 to 4). With one realisation, lines that the
-excitation leaves out show it (`frf_distortion`). Inputs are as noisy as outputs here, and may be fed back.
+excitation leaves out show it (`Distortions`). Inputs are as noisy as outputs here, and may be fed back.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ambid.record.record import Array
 from ambid.signals._joint import checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
 from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
-from ambid.signals.frf_distortion import at_excited, detected, distortions
+from ambid.signals._distortion import at_excited, detected, distortions
 
 _TRANSIENT = 6.0  # standard deviations that the first period may differ from the others
 
