@@ -1,0 +1,229 @@
+"""Lay the frequency response of a physical model through that of a black box.
+
+Starts come from the weak-form regressions of `ambid.identify.start`, on the response instead of spectra; the search is
+SciPy's Levenberg-Marquardt with exact derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.physical_response import physical_response
+from ambid.identify.physical_target import Target
+from ambid.identify.start import candidates
+from ambid.identify.uncertainty import inverse_information
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter
+
+Array = NDArray[np.float64]
+
+_MAX_DELAY = 6  # samples
+_FRACTION = 9.0  # fall of chi-square from which a fraction of a sample is believed
+_TRIED = 4  # starts that are searched
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Match:
+    """A physical model laid through a target.
+
+    Attributes
+    ----------
+    model : LinearModel
+    names : tuple of str
+        Free parameters.
+    theta : Mapping[str, float]
+        All parameters, SI.
+    magnitude : ndarray, shape (n,), SI
+        Sizes by which the free parameters are scaled.
+    prior_mean, prior_sd : ndarray, shape (n,), SI
+        Infinite sd: no prior.
+    delay : float, s
+    delay_free : bool
+        Whether the delay is estimated as a real number.
+    criterion : float
+        Sum of squares, priors included.
+    J : ndarray, shape (n_rows, n or n + 1)
+        Its Jacobian, by parameters over their magnitudes, then by the delay in samples.
+    period_s : float
+    """
+
+    model: LinearModel
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+    magnitude: Array
+    prior_mean: Array
+    prior_sd: Array
+    delay: float
+    delay_free: bool
+    criterion: float
+    J: Array
+    period_s: float
+
+    @property
+    def n_priors(self) -> int:
+        """Number of parameters with a prior."""
+        return int(np.sum(np.isfinite(self.prior_sd)))
+
+    def covariance(self) -> Array:
+        """Return the covariance of the free parameters, the delay in s last where it is free, shape (n, n) or one more.
+
+        Returns
+        -------
+        ndarray, shape (n, n) or (n + 1, n + 1), SI
+        """
+        size = np.append(self.magnitude, self.period_s) if self.delay_free else self.magnitude
+        return np.asarray(inverse_information(self.J) * np.outer(size, size))
+
+
+def matched(
+    target: Target, model: LinearModel, parameters: Sequence[Parameter], delay: float | Literal["auto"]
+) -> Match:
+    """Search from the best starts of all bands and delays; a delay is whole unless the response shows a fraction.
+
+    Parameters
+    ----------
+    target : Target
+    model : LinearModel
+    parameters : sequence of Parameter
+    delay : float or "auto"
+        Samples.
+
+    Returns
+    -------
+    Match
+
+    Raises
+    ------
+    EstimationError
+        If no start makes a physical plant.
+    """
+    free = [p for p in parameters if p.role != "fixed"]
+    fixed = {p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None}
+    given = {p.name: float(p.value) for p in parameters if p.value is not None}
+    delays = [float(delay)] if delay != "auto" else [d / 2 for d in range(2 * _MAX_DELAY + 1)]
+    scored = []
+    for samples in delays:
+        for values in _possible(target, model, fixed, given, samples):
+            g, _ = physical_response(model, values, target.omega, dt=target.dt, delay_s=samples * target.period_s)
+            off = np.abs(g[target.known] / target.response[target.known] - 1.0)
+            scored.append((float(np.mean(np.minimum(off, 1.0) ** 2)), samples, values))
+    if not scored:
+        raise EstimationError(
+            f"no plant of {model.name!r} with positive {', '.join(p.name for p in model.parameters if p.positive)} "
+            "comes near this black box. Check channels and signs, or give start values"
+        )
+    scored.sort(key=lambda s: s[0])
+    found: list[Match] = []
+    for samples, values in _different(scored, [p.name for p in free]):
+        reference = model.references(values)
+        size = [max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0)) or 1.0 for p in free]
+        blank = Match(
+            model=model,
+            names=tuple(p.name for p in free),
+            theta=values,
+            magnitude=np.array(size),
+            prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in free]),
+            prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in free]),
+            delay=samples * target.period_s,
+            delay_free=delay == "auto",
+            criterion=np.inf,
+            J=np.empty((0, 0)),
+            period_s=target.period_s,
+        )
+        found.append(search(target, blank))
+    physical = [m for m in found if all(m.theta[p.name] > 0 for p in model.parameters if p.positive)]
+    if not physical or not np.isfinite(min(m.criterion for m in physical)):
+        raise EstimationError(
+            f"the black box leads to a negative {' or '.join(p.name for p in model.parameters if p.positive)}: it is "
+            f"no {model.name!r} plant. Check channels and signs, and use a structure that stands feedback"
+        )
+    best = min(physical, key=lambda m: m.criterion)
+    if delay != "auto":
+        return best
+    nearest = max(0, round(best.delay / target.period_s)) * target.period_s
+    whole = search(target, replace(best, delay=nearest, delay_free=False))
+    return whole if best.delay < 0 or whole.criterion - best.criterion < _FRACTION else best
+
+
+def search(target: Target, start: Match) -> Match:
+    """Search from a start by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    target : Target
+    start : Match
+        Its `theta`, `delay` and `delay_free` count.
+
+    Returns
+    -------
+    Match
+    """
+    from scipy.optimize import least_squares
+
+    n = len(start.names)
+    wanted = target.numbers(target.response)
+    has = np.isfinite(start.prior_sd)
+    rows = np.eye(n, n + start.delay_free)[has] * (start.magnitude / start.prior_sd)[has, None]
+
+    def at(v: Array) -> tuple[dict[str, float], float]:
+        theta = {**start.theta, **dict(zip(start.names, (v[:n] * start.magnitude).tolist(), strict=True))}
+        return theta, float(v[n] * target.period_s) if start.delay_free else start.delay
+
+    def both(v: Array) -> tuple[Array, Array]:
+        theta, delay = at(v)
+        g, slope = physical_response(
+            start.model, theta, target.omega, dt=target.dt, delay_s=delay, along=start.names,
+            with_delay=start.delay_free,
+        )  # fmt: skip
+        size = np.append(start.magnitude, target.period_s) if start.delay_free else start.magnitude
+        prior = (v[:n] * start.magnitude - start.prior_mean)[has] / start.prior_sd[has]
+        r = np.concatenate([target.numbers(g) - wanted, prior])
+        return r, np.vstack([target.numbers(slope) * size, rows])
+
+    first = np.array([start.theta[k] for k in start.names]) / start.magnitude
+    if start.delay_free:
+        first = np.append(first, start.delay / target.period_s)
+    try:
+        done = least_squares(
+            lambda v: both(v)[0], first, jac=lambda v: both(v)[1], method="lm", xtol=1e-10, ftol=1e-10, max_nfev=200
+        )
+    except (ValueError, np.linalg.LinAlgError, FloatingPointError, OverflowError):  # ran out of all sizes
+        return replace(start, criterion=np.inf)
+    theta, delay = at(done.x)
+    r, J = both(done.x)
+    return replace(start, theta=theta, delay=delay, criterion=float(r @ r), J=J)
+
+
+def _possible(
+    target: Target, model: LinearModel, fixed: Mapping[str, float], given: Mapping[str, float], delay: float
+) -> Iterator[dict[str, float]]:
+    """Start values that make a plant: from the response, and with the values that were given."""
+    for m in target.moments:
+        for values in candidates(model.name, m, {}, delay, 1.0 / target.period_s, fixed):
+            for trial in (values, {**values, **given}) if given != fixed else (values,):
+                finite = all(np.isfinite(v) for v in trial.values())
+                if finite and all(trial[p.name] > 0 for p in model.parameters if p.positive):
+                    yield trial
+
+
+def _different(
+    scored: list[tuple[float, float, dict[str, float]]], names: list[str]
+) -> list[tuple[float, dict[str, float]]]:
+    """The best starts that are not alike."""
+    kept: list[tuple[float, dict[str, float]]] = []
+    for _, delay, values in scored:
+        alike = any(
+            d == delay and all(abs(v[k] - values[k]) <= 0.1 * max(abs(v[k]), abs(values[k])) for k in names)
+            for d, v in kept
+        )
+        if not alike:
+            kept.append((delay, values))
+        if len(kept) == _TRIED:
+            break
+    return kept
