@@ -31,8 +31,6 @@ class Projection:
         Left singular vectors, weights undone: leading columns, divided by their scale, span the observability matrix.
     values : ndarray, shape (n_values,)
         Singular values, of windows of unit weight.
-    state : ndarray, shape (n_values, n_past)
-        Coordinates of the states (past without future inputs), for the order criterion.
     inputs : ndarray, shape (n_future_inputs, n_inputs * future)
         Triangular factor of the future inputs.
     outputs : ndarray, shape (n_all, future * n_outputs)
@@ -45,7 +43,6 @@ class Projection:
 
     U: Array
     values: Array
-    state: Array
     inputs: Array
     outputs: Array
     past: int
@@ -95,23 +92,17 @@ def projected(factor: Array, weighting: Weighting, *, past: int, future: int, li
     k2 = k1 + width
     outputs = r[:, k2:]
     perpendicular = outputs[k1:k2].T  # of the future, on the past, both without the future inputs
-    weight = undo = None
-    target = perpendicular
+    target, undo = perpendicular, None
     if weighting == "n4sid":
         target = least_squares(r[k1:k2, k1:k2], perpendicular.T).T @ r[:k2, k1:k2].T
     elif weighting == "cva":
-        _, size, vectors = np.linalg.svd(outputs[k1:], full_matrices=False)
-        keep = size > 1e-10 * size[0]
-        weight = vectors[keep] / size[keep, None]
-        undo = vectors[keep].T * size[keep]
+        weight, undo = _canonical(outputs[k1:])
         target = weight @ perpendicular
     left, values, _ = np.linalg.svd(target, full_matrices=False)
-    state = left.T @ (perpendicular if weight is None else weight @ perpendicular)
-    unit = 1.0 if weighting == "cva" else np.sqrt(like.n_rows)
+    unit = np.sqrt(like.n_rows)
     return Projection(
-        U=left if undo is None else undo @ left / np.sqrt(like.n_rows),
-        values=values / unit,
-        state=state,
+        U=left if undo is None else undo @ left / unit,
+        values=values if weighting == "cva" else values / unit,
         inputs=r[:k1, :k1],
         outputs=outputs,
         past=width,
@@ -119,6 +110,30 @@ def projected(factor: Array, weighting: Weighting, *, past: int, future: int, li
         n_inputs=n_u,
         n_outputs=n_y,
     )
+
+
+def canonical_states(projection: Projection) -> Array:
+    """Return the states that say most of the future, best first: what orders are compared on, whatever the weighting.
+
+    Parameters
+    ----------
+    projection : Projection
+
+    Returns
+    -------
+    ndarray, shape (n_states, n_past)
+        Coordinates of the past without future inputs (Larimore 1990).
+    """
+    k1 = projection.inputs.shape[0]
+    weight, _ = _canonical(projection.outputs[k1:])
+    return np.asarray(np.linalg.svd(weight @ projection.outputs[k1 : k1 + projection.past].T, full_matrices=False)[2])
+
+
+def _canonical(future: Array) -> tuple[Array, Array]:
+    """Return the weight that makes the future white, and its inverse; directions that are not there are left out."""
+    _, size, vectors = np.linalg.svd(future, full_matrices=False)
+    keep = size > 1e-10 * size[0]
+    return vectors[keep] / size[keep, None], vectors[keep].T * size[keep]
 
 
 def realised(projection: Projection, n: int, *, feedthrough: bool) -> Realisation:

@@ -16,7 +16,6 @@ from scipy.linalg.lapack import dtpqrt
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.threads import one_thread
 
 Array = NDArray[np.float64]
 
@@ -158,20 +157,19 @@ def compress(given: Channels, length: int, n_groups: int) -> Factors:
     n_columns = 1 + length * n_z
     edges = np.linspace(0, n_rows, n_groups + 1).astype(int)
     groups = np.zeros((n_groups, n_columns, n_columns))
-    with one_thread():
-        for g in range(n_groups):
-            factor = np.zeros((n_columns, n_columns), order="F")
-            for first in range(edges[g], edges[g + 1], _BLOCK_ROWS):
-                last = min(first + _BLOCK_ROWS, int(edges[g + 1]))
-                part = slice(first, last + length - 1)
-                z = np.asfortranarray((np.hstack([given.u[part], given.y[part]]) - mean) / scale)
-                block = np.empty((last - first, n_columns), order="F")
-                block[:, 0] = 1.0
-                for k in range(length):
-                    block[:, 1 + k * n_z : 1 + (k + 1) * n_z] = z[k : k + last - first]
-                panel = min(_PANEL, n_columns)
-                factor, _, _, _ = dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
-            groups[g] = np.triu(factor)
+    for g in range(n_groups):
+        factor = np.zeros((n_columns, n_columns), order="F")
+        for first in range(edges[g], edges[g + 1], _BLOCK_ROWS):
+            last = min(first + _BLOCK_ROWS, int(edges[g + 1]))
+            part = slice(first, last + length - 1)
+            z = np.asfortranarray((np.hstack([given.u[part], given.y[part]]) - mean) / scale)
+            block = np.empty((last - first, n_columns), order="F")
+            block[:, 0] = 1.0
+            for k in range(length):
+                block[:, 1 + k * n_z : 1 + (k + 1) * n_z] = z[k : k + last - first]
+            panel = min(_PANEL, n_columns)
+            factor, _, _, _ = dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
+        groups[g] = np.triu(factor)
     return Factors(groups=groups, length=length, n_rows=n_rows, n_inputs=given.mean_u.size, n_outputs=given.mean_y.size)
 
 

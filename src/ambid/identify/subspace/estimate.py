@@ -18,12 +18,12 @@ from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.subspace.classical import Projection, classical_columns, projected, realised
+from ambid.identify.subspace.classical import Projection, canonical_states, classical_columns, projected, realised
 from ambid.identify.subspace.compress import each_left_out, merged
 from ambid.identify.subspace.jackknife import jackknife
 from ambid.identify.subspace.order import state_criterion
 from ambid.identify.subspace.plan import Method, Orders, Plan, planned
-from ambid.identify.subspace.predictor_based import Prediction, predicted, predictor_columns, regressed
+from ambid.identify.subspace.predictor_based import Prediction, Prior, predicted, predictor_columns, prior, regressed
 from ambid.identify.subspace.realisation import Realisation
 from ambid.identify.subspace.units import embedded, offsets, with_units
 from ambid.identify.threads import one_thread
@@ -240,11 +240,12 @@ def subspace_models(
     """
     if n_max < 1:
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
-    plan = planned(
-        method, data, {"nk": nk}, horizon=horizon, past=past, feedthrough=feedthrough, n_max=n_max, tick=tick
-    )
     with one_thread():
-        found = _decomposed(plan, merged(plan.factors.arranged(_columns(plan))))
+        plan = planned(
+            method, data, {"nk": nk}, horizon=horizon, past=past, feedthrough=feedthrough, n_max=n_max, tick=tick
+        )
+        total = merged(plan.factors.arranged(_columns(plan)))
+        found = _decomposed(plan, total, _prior(plan, total))
         criterion = _criterion(plan, found)
         out = []
         for n in range(1, min(plan.n_max, found.values.size) + 1):
@@ -275,10 +276,12 @@ def _subspace(
     tick: Tick,
 ) -> BlackBoxFit:
     """Compress, decompose, choose the order, regress; then again without each group of time for the covariance."""
-    plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
     with one_thread():
+        plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
         groups = plan.factors.arranged(_columns(plan))
-        found = _decomposed(plan, merged(groups))
+        total = merged(groups)
+        given = _prior(plan, total)
+        found = _decomposed(plan, total, given)
         criterion = _criterion(plan, found)
         n = plan.n or max(1, int(np.argmin(criterion[: plan.n_max + 1])))
         if n > found.values.size:
@@ -290,7 +293,7 @@ def _subspace(
         for factor in each_left_out(groups):
             if tick is not None:
                 tick()
-            others.append(_model(plan, _decomposed(plan, factor), n))
+            others.append(_model(plan, _decomposed(plan, factor, given), n))
         covariance = jackknife(full, others, plan.future)
     return _result(method, data, plan, found, full, covariance, criterion)
 
@@ -301,9 +304,18 @@ def _columns(plan: Plan) -> list[int]:
     return classical_columns(plan.factors, plan.past, plan.future)
 
 
-def _decomposed(plan: Plan, factor: Array) -> Projection | Prediction:
-    if plan.method == "pbsid":
-        return predicted(factor, past=plan.past, future=plan.future, feedthrough=plan.feedthrough, like=plan.factors)
+def _prior(plan: Plan, total: Array) -> Prior | None:
+    """Return the prior of the autoregression, from all data: it stays when groups are left out."""
+    if plan.method != "pbsid":
+        return None
+    return prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
+
+
+def _decomposed(plan: Plan, factor: Array, given: Prior | None) -> Projection | Prediction:
+    if given is not None:
+        sizes = {"past": plan.past, "future": plan.future}
+        return predicted(factor, **sizes, feedthrough=plan.feedthrough, like=plan.factors, given=given)
+    assert plan.method != "pbsid"
     return projected(factor, plan.method, past=plan.past, future=plan.future, like=plan.factors)
 
 
@@ -320,7 +332,7 @@ def _criterion(plan: Plan, found: Projection | Prediction) -> Array:
     if isinstance(found, Prediction):
         states, y = found.state[:most], found.y
     else:
-        states, y = found.state[:most], found.outputs[found.inputs.shape[0] :, :n_y].T
+        states, y = canonical_states(found)[:most], found.outputs[found.inputs.shape[0] :, :n_y].T
     return state_criterion(states, y, n_u, plan.factors.n_rows)
 
 

@@ -109,7 +109,10 @@ def planned(
     total = merged(factors.groups)
     criterion = autoregression_criterion(factors, total)
     wanted = int(np.argmin(criterion))
-    chosen = past or min(max(wanted, _shortest(data, largest, bool(n or n_max))), longest)
+    least = _shortest(data, largest, bool(n or n_max))
+    if method == "pbsid":  # the prior makes a long past cheap, and a short one is what leaves bias
+        least, wanted = max(least, 20), wanted + wanted // 2
+    chosen = past or min(max(wanted, least), longest)
     future = horizon or (min(chosen, longest) if method != "pbsid" else chosen)
     if method == "pbsid" and future > chosen:
         raise EstimationError(f"{method}: horizon {future} is longer than the past {chosen}. Lower it, or raise past")

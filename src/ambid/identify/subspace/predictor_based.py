@@ -4,6 +4,10 @@ Solves: y(t) = sum_k Phi_k z(t-k) + d + e(t) by least squares: its regressors ar
 inputs. Phi holds the Markov parameters C (A - K C)^(k-1) [B - K D, K] of the predictor, so the shifted blocks of Phi
 times the past are the observability matrix times the state; one singular value decomposition separates them, and
 A, B, C, K follow by regression of states on states (Chiuso and Picci 2005; Chiuso 2007, Automatica 43, 1034).
+
+Band-limited inputs leave directions of Phi unseen, and shifting brings them into view. So Phi has a prior that fades
+with the lag, Phi_k ~ N(0, size decay^k), its two numbers by the marginal likelihood (Pillonetto, Chen, Chiuso,
+De Nicolao and Ljung 2022, ch. 4): where the data speak it does not count.
 """
 
 from __future__ import annotations
@@ -18,6 +22,29 @@ from ambid.identify.subspace.compress import Factors
 from ambid.identify.subspace.realisation import Realisation, kalman_gain, least_squares, radius
 
 Array = NDArray[np.float64]
+
+
+_LEAST_NOISE = 1e-9  # innovations' deviation beside outputs of unit deviation: less is rounding
+_DECAYS = (0.6, 0.75, 0.85, 0.92, 0.96, 0.98, 1.0)  # of the prior's variance, per sample of lag
+_SIZES = 10.0 ** np.arange(-3.0, 21.0, 0.5)  # of the prior's variance, whitened outputs on scaled channels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Prior:
+    """What is believed of an autoregression before the data: coefficients of lag k are N(0, size decay^k).
+
+    Attributes
+    ----------
+    decay : float
+    size : ndarray, shape (n_outputs,)
+        For whitened outputs.
+    whiten : ndarray, shape (n_outputs, n_outputs)
+        y @ whiten has innovations of unit covariance.
+    """
+
+    decay: float
+    size: Array
+    whiten: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,7 +89,45 @@ def predictor_columns(factors: Factors, past: int) -> list[int]:
     )
 
 
-def predicted(factor: Array, *, past: int, future: int, feedthrough: bool, like: Factors) -> Prediction:
+def prior(factor: Array, *, past: int, feedthrough: bool, like: Factors) -> Prior:
+    """Return the prior of the autoregression that makes the data most likely.
+
+    Parameters
+    ----------
+    factor : ndarray, shape (n_columns, n_columns)
+        Of the constant and `predictor_columns`.
+    past : int
+        Samples.
+    feedthrough : bool
+    like : Factors
+        For the sizes.
+
+    Returns
+    -------
+    Prior
+    """
+    rows, y, lags = _regression(factor, past, feedthrough, like)
+    k = rows.shape[1]
+    # upper triangular, error' error is the covariance of the innovations
+    error = np.linalg.qr(y[k:], mode="r") / np.sqrt(max(like.n_rows - k, 1))
+    size = np.maximum(np.abs(np.diag(error)), _LEAST_NOISE)
+    sign = np.where(np.diag(error) < 0, -1.0, 1.0)
+    whiten = np.linalg.inv(np.triu(error, 1) + np.diag(sign * size))
+    y = y[:k] @ whiten
+    best = np.inf
+    for decay in _DECAYS:
+        fade = decay ** (0.5 * lags)
+        left, s, _ = np.linalg.svd(rows * fade)
+        c = left.T @ y
+        grown = 1.0 + _SIZES[:, None] * s**2  # (sizes, k)
+        cost = np.sum(np.log(grown), axis=1)[:, None] + (1.0 / grown) @ c**2  # (sizes, outputs)
+        total = float(np.sum(np.min(cost, axis=0)))
+        if total < best:
+            best, found = total, (decay, _SIZES[np.argmin(cost, axis=0)])
+    return Prior(decay=found[0], size=found[1], whiten=np.asarray(whiten))
+
+
+def predicted(factor: Array, *, past: int, future: int, feedthrough: bool, like: Factors, given: Prior) -> Prediction:
     """Fit the autoregression and decompose what it says of the future.
 
     Parameters
@@ -75,37 +140,34 @@ def predicted(factor: Array, *, past: int, future: int, feedthrough: bool, like:
         Whether u(t) acts on y(t).
     like : Factors
         For the sizes.
+    given : Prior
+        Of the autoregression.
 
     Returns
     -------
     Prediction
     """
     n_u, n_y = like.n_inputs, like.n_outputs
-    n_z = n_u + n_y
+    n_z, width = n_u + n_y, (n_u + n_y) * past
     r = factor[1:, 1:]
-    width = n_z * past
-    k = width + (n_u if feedthrough else 0)
-    y = r[:, width + n_u :]
-    phi = regression(r[:k, :k], y[:k])[:width].T
-    error = np.linalg.qr(y[k:], mode="r") / np.sqrt(like.n_rows)  # triangular: error' error is the covariance
-    size = np.maximum(np.abs(np.diag(error)), 1e-9)
-    whiten = np.linalg.inv(np.triu(error, 1) + np.diag(size)).T
+    rows, y, lags = _regression(factor, past, feedthrough, like)
+    phi = _with_prior(rows, y[: rows.shape[1]] @ given.whiten, lags, given)[:width].T  # in innovations' deviations
     blocks = np.zeros((future, n_y, width))
     for i in range(future):
-        blocks[i, :, i * n_z :] = whiten @ phi[:, : width - i * n_z]
+        blocks[i, :, i * n_z :] = phi[:, : width - i * n_z]
     known = blocks.reshape(future * n_y, width)
     left, values, right = np.linalg.svd(known @ r[:width, :width].T, full_matrices=False)
     n_values = int(np.sum(values > 1e-13 * values[0]))
-    to_state = (left[:, :n_values].T @ known) / values[:n_values, None] * np.sqrt(like.n_rows)
+    unit = np.sqrt(like.n_rows)
     state = np.zeros((n_values, r.shape[0]))
-    state[:, :width] = right[:n_values] * np.sqrt(like.n_rows)
-    later = np.concatenate([np.arange(n_z, width + n_z)])
+    state[:, :width] = right[:n_values] * unit
+    to_state = (left[:, :n_values].T @ known) * (unit / values[:n_values, None])
     return Prediction(
-        values=values / np.sqrt(like.n_rows),
+        values=values / unit,
         state=state,
-        ahead=to_state @ r[:, later].T,
+        ahead=to_state @ r[:, n_z : width + n_z].T,
         u=r[:, width : width + n_u].T,
-        y=y.T,
+        y=r[:, width + n_u :].T,
         n_rows=like.n_rows,
     )
 
@@ -141,20 +203,24 @@ def regressed(prediction: Prediction, n: int, *, feedthrough: bool) -> Realisati
     return Realisation(A=A, B=B, C=C, D=D, K=K, innovation=innovation, Q=Q, S=S, R=R, stable_predictor=stable)
 
 
-def regression(factor: Array, right: Array) -> Array:
-    """Solve a triangular least-squares problem, with the shortest solution where columns depend on each other.
+def _regression(factor: Array, past: int, feedthrough: bool, like: Factors) -> tuple[Array, Array, Array]:
+    """Return the triangular rows of the regressors, the coordinates of y(t), and the lag of every regressor."""
+    n_u, n_z = like.n_inputs, like.n_inputs + like.n_outputs
+    width = n_z * past
+    k = width + (n_u if feedthrough else 0)
+    lags = np.concatenate([np.repeat(np.arange(past, 0, -1.0), n_z), np.zeros(k - width)])
+    return factor[1 : 1 + k, 1 : 1 + k], factor[1:, 1 + width + n_u :], lags
 
-    Parameters
-    ----------
-    factor : ndarray, shape (n, n)
-        Upper triangular.
-    right : ndarray, shape (n, n_right)
 
-    Returns
-    -------
-    ndarray, shape (n, n_right)
-    """
-    size = np.abs(np.diag(factor))
-    if size.size and np.min(size) > 1e-11 * np.max(size):
-        return np.asarray(solve_triangular(factor, right))
-    return least_squares(factor, right)
+def _with_prior(rows: Array, right: Array, lags: Array, given: Prior) -> Array:
+    """Solve for whitened coefficients, the prior as further rows: orthogonal, and once for outputs of one size."""
+    out = np.empty((rows.shape[1], right.shape[1]))
+    for size in np.unique(given.size):
+        chosen = given.size == size
+        deviation = np.sqrt(size) * given.decay ** (0.5 * lags)
+        scaled = np.vstack([rows * deviation, np.eye(lags.size)])
+        target = np.vstack([right[:, chosen], np.zeros((lags.size, int(chosen.sum())))])
+        both = np.linalg.qr(np.hstack([scaled, target]), mode="r")
+        n = lags.size
+        out[:, chosen] = deviation[:, None] * solve_triangular(both[:n, :n], both[:n, n:])
+    return out
