@@ -16,10 +16,10 @@ import numpy as np
 
 from ambid.errors import EstimationError
 from ambid.record.record import Array
+from ambid.signals._distortion import at_excited, detected, distortions
 from ambid.signals._joint import checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
 from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
-from ambid.signals._distortion import at_excited, detected, distortions
 
 _TRANSIENT = 6.0  # standard deviations that the first period may differ from the others
 
