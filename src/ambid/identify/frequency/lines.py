@@ -36,6 +36,8 @@ class Lines:
         Standard deviations of the entries of G (of the complex number: real and imaginary part share the variance).
     freedom : ndarray, shape (n_frequencies,)
         Complex degrees of freedom of the covariance (half the real ones); infinite where it is known.
+    together : int
+        Numbers on a line whose covariance was estimated from the same draws: the size of its Wishart matrix.
     alike : float
         Neighbouring lines that share one independent error.
     dt : float, s
@@ -48,6 +50,7 @@ class Lines:
     root: Complex
     sd: Array
     freedom: Array
+    together: int
     alike: float
     dt: float
     held: bool
@@ -83,7 +86,7 @@ class Lines:
     def widening(self) -> float:
         """Factor on the inverse information, for a covariance that was estimated and for lines that share errors."""
         v = float(np.min(self.freedom))
-        q = v - self.G.shape[1]
+        q = v - self.together
         return self.alike * (1.0 if np.isinf(v) else v**2 / (q**2 - 1.0))
 
     def verdict(self, cost: float, n_estimated: int, n_extra: int = 0) -> Check:
@@ -105,13 +108,12 @@ class Lines:
         """
         from scipy.stats import gamma
 
-        p, columns, v = self.G.shape[1], self.G.shape[2], self.freedom
+        p, columns, v = self.together, self.entries // self.together, self.freedom
         mean, variance = np.full(v.size, float(p * columns)), np.full(v.size, float(p * columns))
         few = np.isfinite(v)
         v, q = v[few], v[few] - p
         mean[few] = p * columns * v / q
-        square, mixed = v**2 * p * (p + 1) / (q * (q - 1)), v**2 * (q * p**2 + p) / (q * (q**2 - 1))
-        variance[few] = columns * square + columns * (columns - 1) * mixed - mean[few] ** 2
+        variance[few] = columns * (v**2 * p * (p + 1) / (q * (q - 1)) - (p * v / q) ** 2)
         share = max(1.0 - (n_estimated - n_extra) / (2.0 * self.n_lines * self.entries), 1e-6)
         expected, sd = share * float(np.sum(mean)), float(np.sqrt(share * np.sum(variance) * self.alike))
         probability = float(gamma.sf(cost, (expected / sd) ** 2, scale=sd**2 / expected))
@@ -172,10 +174,12 @@ def lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
             "give the covariance of the noise"
         )
     freedom = np.broadcast_to(np.asarray(frf.degrees_of_freedom, dtype=np.float64), f.shape) / 2.0
-    if not np.min(freedom) > G.shape[1] + 1:
+    # scatter over realisations takes all numbers of a line together, noise of single experiments one input at a time
+    together = m if frf.details.get("realisations", 1) != 1 else G.shape[1]
+    if not np.min(freedom) > together + 1:
         raise EstimationError(
-            f"the covariance has {2 * np.min(freedom):g} degrees of freedom for {G.shape[1]} output(s); it must have "
-            f"more than {2 * (G.shape[1] + 1)}. Measure more periods, or average more"
+            f"the covariance has {2 * np.min(freedom):g} degrees of freedom for {together} number(s) on a line; "
+            f"it must have more than {2 * (together + 1)}. Measure more periods, or average more"
         )
     try:
         unit = C / (sd[:, :, None] * sd[:, None, :])
@@ -192,6 +196,7 @@ def lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
         root=np.asarray(root, dtype=np.complex128),
         sd=sd.reshape(G.shape),
         freedom=freedom,
+        together=together,
         alike=frf.lines_per_independent,
         dt=1.0 / frf.rate_hz,
         held=frf.hold == "zoh",

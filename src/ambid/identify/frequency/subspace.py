@@ -210,8 +210,8 @@ def _block_rows(ln: Lines, n: int, given: int | None) -> int:
     rows = max(least, min(2 * n + 2, most // 2)) if given is None else given
     if rows < least or rows > most:
         raise EstimationError(
-            f"{rows} block rows for order {n} on {ln.n_lines} lines; it must be {least} to {most}. Give another number, "
-            "lower the order, or measure more lines"
+            f"{rows} block rows for order {n} on {ln.n_lines} lines; it must be {least} to {most}. Give another "
+            "number, lower the order, or measure more lines"
         )
     return rows
 

@@ -1,0 +1,141 @@
+"""What is searched when physical parameters are fitted to a frequency response: residual, priors, exact slope."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.frequency.lines import Lines
+from ambid.identify.frequency.physical import Channels, response
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhysicalProblem:
+    """What is estimated, and how a vector of order one means it: logarithms of what is positive, the rest over sizes.
+
+    Attributes
+    ----------
+    model : LinearModel
+    lines : Lines
+    channels : Channels
+    estimated : tuple of Parameter
+    known : Mapping[str, float]
+        The others, SI.
+    size : ndarray, shape (n_estimated,), SI
+    positive : ndarray, shape (n_estimated,), bool
+        What is searched as a logarithm.
+    delay : float, samples
+        The lower whole one where `fractional` and the input is held.
+    fractional : bool
+        Whether the delay is estimated as a real number, last in the vector.
+    """
+
+    model: LinearModel
+    lines: Lines
+    channels: Channels
+    estimated: tuple[Parameter, ...]
+    known: Mapping[str, float]
+    size: Array  # SI
+    positive: NDArray[np.bool_]
+    delay: float  # samples, or the lower whole one of a fraction that is estimated
+    fractional: bool = False
+
+    def theta(self, v: Array) -> dict[str, float]:
+        """Return all physical parameters in SI.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_vector,)
+
+        Returns
+        -------
+        dict of str to float
+        """
+        values = np.where(self.positive, self.size * np.exp(np.minimum(v[: self.size.size], 50.0)), 0.0)
+        values = np.where(self.positive, values, self.size * v[: self.size.size])
+        return {**self.known, **{p.name: float(x) for p, x in zip(self.estimated, values, strict=True)}}
+
+    def delay_at(self, v: Array) -> float:
+        """Return the delay in samples.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_vector,)
+
+        Returns
+        -------
+        float
+        """
+        if not self.fractional:
+            return self.delay
+        return self.delay + (float(1 / (1 + np.exp(-v[-1]))) if self.lines.held else float(v[-1]))
+
+    def vector(self, values: Mapping[str, float]) -> Array:
+        """Return the vector for given parameters, without a delay.
+
+        Parameters
+        ----------
+        values : Mapping[str, float]
+            SI.
+
+        Returns
+        -------
+        ndarray, shape (n_estimated,)
+        """
+        x = np.array([values[p.name] for p in self.estimated]) / self.size
+        return np.where(self.positive, np.log(np.maximum(x, 1e-300)), x)
+
+    def residual(self, v: Array) -> Array:
+        """Return whitened model - measured, then the priors'.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_vector,)
+
+        Returns
+        -------
+        ndarray, shape (n_rows,)
+        """
+        G, _ = response(
+            self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v), slope=False
+        )  # fmt: skip
+        return np.concatenate([self.lines.whitened(G - self.lines.G), self._prior(v)])
+
+    def slope(self, v: Array, *, by_parameters: bool = False) -> Array:
+        """Return the derivative of `residual`.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_vector,)
+        by_parameters : bool
+            By parameters in SI and the delay in samples instead of the vector.
+
+        Returns
+        -------
+        ndarray, shape (n_rows, n_vector)
+        """
+        theta, names = self.theta(v), [p.name for p in self.estimated]
+        _, d = response(self.model, theta, names, self.lines, self.channels, self.delay_at(v))
+        J = self.lines.whitened(d)
+        rows = np.zeros((sum(p.role == "prior" for p in self.estimated), J.shape[1]))
+        for row, (j, p) in zip(rows, ((j, p) for j, p in enumerate(self.estimated) if p.role == "prior"), strict=True):
+            row[j] = 1.0 / float(p.sd or np.inf)
+        J = np.vstack([J, rows])
+        if not by_parameters:
+            n = self.size.size
+            J[:, :n] *= np.where(self.positive, [theta[k] for k in names], self.size)
+            part = self.delay_at(v) - self.delay
+            J[:, n] *= part * (1 - part) if self.lines.held else 1.0
+        return J if self.fractional else J[:, :-1]
+
+    def _prior(self, v: Array) -> Array:
+        theta = self.theta(v)
+        return np.array([(theta[p.name] - float(p.value or 0.0)) / float(p.sd or np.inf)
+                         for p in self.estimated if p.role == "prior"])  # fmt: skip
