@@ -187,6 +187,41 @@ def add_rows(R: Array, w: Array, n: int, first: int) -> None:
 
 
 @njit(cache=True, nogil=True)
+def block_rows(
+    y: Array,
+    u: Array,
+    filters: Table,
+    terms: Table,
+    columns: Table,
+    coef: Array,
+    s: Array,
+    w: Array,
+    pad: int,
+    t0: int,
+    impulse_row: int,
+    first: int,
+    ringing: int,
+) -> tuple[int, int]:
+    """Put the rows of samples `first`, ... into w (n_columns, block); return how many, and whether impulses still ring.
+
+    Blocks follow each other; `s` (n_signals, pad + block) begins with zeros and carries the history, `ringing` with 1.
+    """
+    n, p, m = y.size, columns.shape[0], w.shape[1]
+    if first and ringing and first > t0 + pad:
+        ringing = _still_ringing(filters, s, pad, m)
+    _next_block(s, y, u, impulse_row, t0, first, pad, m)
+    _filter_block(filters, terms, coef, s, pad, m, ringing)
+    skip = max(0, t0 - first)
+    rows = max(0, min(m, n - first) - skip)
+    for j in range(p):
+        a, sign = pad + skip - columns[j, 1], columns[j, 2]
+        x = s[columns[j, 0]]
+        for t in range(rows):
+            w[j, t] = sign * x[a + t]
+    return rows, ringing
+
+
+@njit(cache=True, nogil=True)
 def predictor_triangle(
     y: Array,
     u: Array,
@@ -198,35 +233,20 @@ def predictor_triangle(
     pad: int,
     t0: int,
     impulse_row: int,
-    n_ringing: int,
+    n_initial: int,
     block: int,
 ) -> Array:
     """Return the triangle R of the rows [gradients, residual] from row `t0` on, shape (n_columns, n_columns).
 
-    The first `n_ringing` columns are responses to the impulse at `t0`; they are left out once they have died away.
+    The first `n_initial` columns are responses to the impulse at `t0`; they are left out once they have died away.
     """
     n, p = y.size, columns.shape[0]
     m = min(block, n)
-    s = np.zeros((n_signals, pad + m))
-    w = np.empty((p, m))
-    R = np.zeros((p, p))
-    impulse = 1
+    s, w, R = np.zeros((n_signals, pad + m)), np.empty((p, m)), np.zeros((p, p))
+    ringing = 1
     for first in range(0, n, m):
-        if first and impulse and first > t0 + pad:
-            impulse = _still_ringing(filters, s, pad, m)
-        _next_block(s, y, u, impulse_row, t0, first, pad, m)
-        _filter_block(filters, terms, coef, s, pad, m, impulse)
-        skip = max(0, t0 - first)
-        rows = min(m, n - first) - skip
-        if rows <= 0:
-            continue
-        start = 0 if impulse else n_ringing
-        for j in range(start, p):
-            a, sign = pad + skip - columns[j, 1], columns[j, 2]
-            x = s[columns[j, 0]]
-            for t in range(rows):
-                w[j, t] = sign * x[a + t]
-        add_rows(R, w, rows, start)
+        rows, ringing = block_rows(y, u, filters, terms, columns, coef, s, w, pad, t0, impulse_row, first, ringing)
+        add_rows(R, w, rows, 0 if ringing else n_initial)
     return R
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,15 +50,7 @@ class Layout:
     @property
     def places(self) -> dict[Key, slice]:
         """Where each polynomial stands among all coefficients, in the order of `PolynomialModel.theta`."""
-        sizes: list[tuple[Key, int]] = [(("A", None), self.na + 1)]
-        sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(self.nb, self.nk, strict=True))]
-        sizes += [(("C", None), self.nc + 1), (("D", None), self.nd + 1)]
-        sizes += [(("F", i), f + 1) for i, f in enumerate(self.nf)]
-        first, out = 0, {}
-        for key, size in sizes:
-            out[key] = slice(first, first + size)
-            first += size
-        return out
+        return _places(self)
 
     @property
     def n_theta(self) -> int:
@@ -88,7 +81,7 @@ class Layout:
     @property
     def free(self) -> NDArray[np.int64]:
         """Places of the estimated coefficients, shape (n_free,)."""
-        return np.array([p.start + k for key, p in self.places.items() for k in self.free_lags(key)], dtype=np.int64)
+        return _free(self)
 
     def start(self) -> Array:
         """Return coefficients of a model that is zero: leading ones alone, shape (n_theta,)."""
@@ -117,6 +110,27 @@ class Layout:
             D=theta[p["D", None]],
             F=tuple(theta[p["F", i]] for i in per_input),
         )
+
+
+@lru_cache(maxsize=256)
+def _places(layout: Layout) -> dict[Key, slice]:
+    sizes: list[tuple[Key, int]] = [(("A", None), layout.na + 1)]
+    sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(layout.nb, layout.nk, strict=True))]
+    sizes += [(("C", None), layout.nc + 1), (("D", None), layout.nd + 1)]
+    sizes += [(("F", i), f + 1) for i, f in enumerate(layout.nf)]
+    first, out = 0, {}
+    for key, size in sizes:
+        out[key] = slice(first, first + size)
+        first += size
+    return out
+
+
+@lru_cache(maxsize=256)
+def _free(layout: Layout) -> NDArray[np.int64]:
+    lags = [p.start + k for key, p in layout.places.items() for k in layout.free_lags(key)]
+    out = np.array(lags, dtype=np.int64)
+    out.flags.writeable = False
+    return out
 
 
 def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tuple[int, ...] | None]:

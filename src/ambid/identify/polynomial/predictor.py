@@ -9,12 +9,14 @@ before is replaced by impulses at that row whose sizes are estimated (as many as
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.polynomial._kernels import predictor_rows, predictor_triangle
+from ambid.identify.polynomial._kernels import block_rows, predictor_rows, predictor_triangle
 from ambid.identify.polynomial.orders import Layout
 
 Array = NDArray[np.float64]
@@ -100,6 +102,42 @@ class Predictor:
         )
         return R
 
+    def blocks(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Iterator[tuple[int, Array]]:
+        """Yield the rows [gradients, residual] block by block.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n_samples,)
+        u : ndarray, shape (n_inputs, n_samples)
+        theta : ndarray, shape (n_theta,)
+        nuisance : ndarray, shape (n_nuisance,)
+
+        Yields
+        ------
+        tuple of int and ndarray, shape (n_columns, n_rows)
+            First sample, and rows, which are good until the next block is asked for.
+        """
+        coef, m = self.coefficients(theta, nuisance), max(_BLOCK, self.pad + 1)
+        s, w = np.zeros((self.n_signals, self.pad + m)), np.empty((self.columns.shape[0], m))
+        ringing = 1
+        for first in range(0, y.size, m):
+            n, ringing = block_rows(
+                y,
+                u,
+                self.filters,
+                self.terms,
+                self.columns,
+                coef,
+                s,
+                w,
+                self.pad,
+                self.first_row,
+                self.impulse_row,
+                first,
+                ringing,
+            )
+            yield max(first, self.first_row), w[:, :n]
+
     def rows(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
         """Return the gradients and, last, the residual; complex where the coefficients are.
 
@@ -167,6 +205,7 @@ class _Plan:
         return row
 
 
+@lru_cache(maxsize=256)
 def predictor(layout: Layout, *, constant: bool = True) -> Predictor:
     """Write down the predictor of one output.
 

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 
 _ENOUGH = 1e-8  # squared length of the next step in standard deviations
 _NOTHING_LEFT = 1e-24  # squared residual over squared output where the data are matched to rounding
-_MOST = 60
+_MOST = 100
+BLIND = 1e8  # condition number, columns of unit length, beyond which a direction counts as not seen
 _UNSEEN = 1e-11  # singular value, of scaled columns, below which no step is taken along a direction
 
 
@@ -33,6 +34,8 @@ class Fitted:
     ----------
     theta : ndarray, shape (n_theta,)
         All coefficients of the output, in scaled units.
+    free : ndarray, shape (n_free,)
+        Places of the estimated ones.
     nuisance : ndarray, shape (n_nuisance,)
         Initial states and constant.
     triangle : ndarray, shape (n_free, n_free)
@@ -47,6 +50,7 @@ class Fitted:
     """
 
     theta: Array
+    free: NDArray[np.int64]
     nuisance: Array
     triangle: Array
     cost: float
@@ -145,6 +149,7 @@ def searched(
             damping = max(damping * 10.0, 1e-3)
     return Fitted(
         theta=at.theta,
+        free=free,
         nuisance=at.nuisance,
         triangle=at.R[n:-1, n:-1],
         cost=at.cost,

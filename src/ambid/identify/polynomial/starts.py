@@ -2,13 +2,14 @@
 
 A long ARX model gives innovations; with them as one more input, A, B and C follow by least squares (Hannan & Rissanen
 1982), and so do C and D of the noise of any plant model. B and F follow from iterated prefiltering (Steiglitz & McBride
-1965), of the data or, with several inputs, of the long model's impulse responses. A root that lies outside the unit
+1965) or from the null space of the long model (Galrinho, Rojas & Hjalmarsson 2019). A root that lies outside the unit
 circle is reflected: this is a start, and the search decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from ambid.identify.polynomial._kernels import filtered
 from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
-from ambid.identify.polynomial.stability import reflected, stable
+from ambid.identify.polynomial.search import searched
+from ambid.identify.polynomial.stability import reflected
 
 Array = NDArray[np.float64]
 
@@ -25,7 +27,27 @@ _CHUNK = 512
 _SM_ITERATIONS = 5
 
 
-def arx_coefficients(layout: Layout, y: Array, u: Array, *, most_rows: int | None = None) -> Array:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LongModel:
+    """A long ARX model P y = sum_i Q_i u_i + e, which holds what the data say of plant and noise together.
+
+    Attributes
+    ----------
+    P : ndarray, shape (n + 1,)
+    Q : tuple of ndarray, shape (nk + n,)
+        One for each input.
+    nk : tuple of int
+    triangle : ndarray, shape (n + n n_inputs, n + n n_inputs)
+        Of its regressors, the constant taken out.
+    """
+
+    P: Array
+    Q: tuple[Array, ...]
+    nk: tuple[int, ...]
+    triangle: Array
+
+
+def arx_coefficients(layout: Layout, y: Array, u: Array) -> Array:
     """Return the least-squares coefficients of an ARX layout with a constant.
 
     Parameters
@@ -34,13 +56,16 @@ def arx_coefficients(layout: Layout, y: Array, u: Array, *, most_rows: int | Non
         nc, nd and nf zero.
     y : ndarray, shape (n_samples,)
     u : ndarray, shape (n_inputs, n_samples)
-    most_rows : int, optional
-        Use at most about so many rows, in pieces spread over the record.
 
     Returns
     -------
     ndarray, shape (n_theta,)
     """
+    return _regression(layout, y, u, None)[0]
+
+
+def _regression(layout: Layout, y: Array, u: Array, most_rows: int | None) -> tuple[Array, Array]:
+    """Coefficients and the triangle of their regressors; of at most about so many rows, spread over the record."""
     p, theta = predictor(layout), layout.start()
     R: Array = np.zeros((p.columns.shape[0],) * 2)
     for part in _pieces(y.size, layout.first_row, most_rows):
@@ -49,7 +74,7 @@ def arx_coefficients(layout: Layout, y: Array, u: Array, *, most_rows: int | Non
     scale = np.maximum(np.linalg.norm(R[:-1, :-1], axis=0), 1e-300)
     step = -np.linalg.lstsq(R[:-1, :-1] / scale, R[:-1, -1], rcond=1e-10)[0] / scale
     theta[layout.free] += step[p.n_nuisance :]
-    return theta
+    return theta, R[p.n_nuisance : -1, p.n_nuisance : -1]
 
 
 def starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
@@ -113,19 +138,78 @@ def _long_order(layout: Layout, n_samples: int) -> int:
     return max(1, min(8 + 2 * most, n_samples // (6 * (1 + layout.n_inputs))))
 
 
-def _long_model(layout: Layout, y: Array, u: Array) -> tuple[Array, list[Array]]:
-    """A and B_i of a long ARX model."""
+def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
     n = _long_order(layout, y.size)
     arx = _arx(n, (n,) * layout.n_inputs, layout.nk)
-    found = arx_coefficients(arx, y, u, most_rows=_ROWS)
-    return found[arx.places["A", None]], [found[arx.places["B", i]] for i in range(layout.n_inputs)]
+    found, R = _regression(arx, y, u, _ROWS)
+    Q = tuple(found[arx.places["B", i]] for i in range(layout.n_inputs))
+    return LongModel(P=found[arx.places["A", None]], Q=Q, nk=layout.nk, triangle=R)
+
+
+def reduced(long: LongModel, inputs: Sequence[int], nb: Sequence[int], nf: int) -> tuple[list[Array], Array]:
+    """Find B_i and the common F with P B_i = Q_i F, weighted by the spread of the long model.
+
+    The null space of the long model is fitted (Galrinho, Rojas & Hjalmarsson 2019): linear, and consistent under
+    feedback and for any noise.
+
+    Parameters
+    ----------
+    long : LongModel
+    inputs : sequence of int
+    nb : sequence of int
+        For each of `inputs`.
+    nf : int
+
+    Returns
+    -------
+    tuple of (list of ndarray, shape (nk + nb,)) and (ndarray, shape (nf + 1,))
+        B for each of `inputs`, and F, stable or not.
+    """
+    n = long.P.size - 1
+    count = [min(b, n) for b in nb]
+    rows, right = np.zeros((n * len(inputs), sum(count) + nf)), np.zeros(n * len(inputs))
+    for k, i in enumerate(inputs):
+        Q, at = long.Q[i][long.nk[i] :], slice(k * n, (k + 1) * n)
+        first = sum(count[:k])
+        rows[at, first : first + count[k]] = _shifts(long.P[:n], count[k], 0)
+        rows[at, sum(count) :] = -_shifts(Q, nf, 1)
+        right[at] = Q
+    x = np.linalg.lstsq(rows, right, rcond=1e-12)[0]
+    scale = np.maximum(np.linalg.norm(long.triangle, axis=0), 1e-300)
+    for _ in range(3):
+        F = np.concatenate([[1.0], x[sum(count) :]])
+        T = np.zeros((n * len(inputs), long.triangle.shape[0]))
+        for k, i in enumerate(inputs):
+            at, first = slice(k * n, (k + 1) * n), sum(count[:k])
+            T[at, :n] = _shifts(np.concatenate([x[first : first + count[k]], np.zeros(n)])[:n], n, 1)
+            T[at, n * (1 + i) : n * (2 + i)] = -_shifts(np.concatenate([F, np.zeros(n)])[:n], n, 0)
+        spread = np.linalg.lstsq((long.triangle / scale).T, (T / scale).T, rcond=1e-9)[0]
+        whiten = np.asarray(np.linalg.qr(spread, mode="r")).T
+        together = np.linalg.lstsq(whiten, np.column_stack([rows, right]), rcond=1e-9)[0]
+        x = np.linalg.lstsq(together[:, :-1], together[:, -1], rcond=1e-12)[0]
+    found = []
+    for k, i in enumerate(inputs):
+        first = sum(count[:k])
+        b = np.zeros(long.nk[i] + nb[k])
+        b[long.nk[i] : long.nk[i] + count[k]] = x[first : first + count[k]]
+        found.append(b)
+    return found, np.concatenate([[1.0], x[sum(count) :]])
+
+
+def _shifts(c: Array, n_columns: int, lag: int) -> Array:
+    """Columns of c moved down by lag, lag + 1, ..."""
+    out = np.zeros((c.size, n_columns))
+    for j in range(n_columns):
+        if j + lag < c.size:
+            out[j + lag :, j] = c[: c.size - j - lag]
+    return out
 
 
 def _long_innovations(layout: Layout, y: Array, u: Array) -> Array:
-    A, B = _long_model(layout, y, u)
-    e = filtered(A, np.ones(1), y)
-    for b, x in zip(B, u, strict=True):
-        e -= filtered(b, np.ones(1), x)
+    long = _long_model(layout, y, u)
+    e = filtered(long.P, np.ones(1), y)
+    for q, x in zip(long.Q, u, strict=True):
+        e -= filtered(q, np.ones(1), x)
     return e
 
 
@@ -149,11 +233,9 @@ def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
     n = max(1, min(10 + 2 * (layout.nc + layout.nd), v.size // 8))
     u = np.empty((0, v.size))
     long = Layout(na=n, nb=(), nc=0, nd=0, nf=(), nk=())
-    e = filtered(arx_coefficients(long, v, u, most_rows=_ROWS)[long.places["A", None]], np.ones(1), v)
+    e = filtered(_regression(long, v, u, _ROWS)[0][long.places["A", None]], np.ones(1), v)
     nb = (layout.nc,) if layout.nc else ()
     arx = Layout(na=layout.nd, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=(1,) * len(nb))
-    if not layout.nc and not layout.nd:
-        return np.ones(1), np.ones(1)
     found = arx_coefficients(arx, v, e[None, :] if nb else u)
     D = found[arx.places["A", None]]
     C = np.concatenate([[1.0], found[arx.places["B", 0]][1:]]) if nb else np.ones(1)
@@ -161,15 +243,27 @@ def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
 
 
 def _generalised(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """ARARX and ARARMAX: the plant by instruments that the noise does not reach, then its residual's model."""
-    for theta in (_instrumental(layout, y, u), _least_squares(layout, y, u)):
-        if theta is None:
-            continue
-        _set_noise(theta, layout, y, u)
-        yield theta
+    """ARARX and ARARMAX: the plant from the long model, as output error or by least squares, then its residual."""
+    theta = layout.start()
+    B, A = reduced(_long_model(layout, y, u), range(layout.n_inputs), layout.nb, layout.na)
+    _set(theta, layout, "A", None, A)
+    for i, b in enumerate(B):
+        _set(theta, layout, "B", i, b)
+    plants = [theta, _least_squares(layout, y, u)]
+    if layout.n_inputs == 1 and layout.na:
+        b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.na, layout.nk[0])
+        theta = layout.start()
+        _set(theta, layout, "A", None, f)
+        _set(theta, layout, "B", 0, b)
+        plants.insert(1, theta)
+    for plant in plants:
+        _set_noise(plant, layout, y, u)
+        yield plant
 
 
 def _set_noise(theta: Array, layout: Layout, y: Array, u: Array) -> None:
+    if not layout.nc and not layout.nd:
+        return
     places = layout.places
     v = filtered(theta[places["A", None]], np.ones(1), y)
     for i, x in enumerate(u):
@@ -179,53 +273,40 @@ def _set_noise(theta: Array, layout: Layout, y: Array, u: Array) -> None:
     _set(theta, layout, "D", None, D)
 
 
-def _instrumental(layout: Layout, y: Array, u: Array) -> Array | None:
-    """A and B with the simulated output as instrument; None where the model at hand is unstable."""
-    arx = _arx(layout.na, layout.nb, layout.nk)
-    theta, p = arx_coefficients(arx, y, u), predictor(arx)
-    for _ in range(3):
-        A = theta[arx.places["A", None]]
-        if not stable(A):
-            return None
-        simulated = np.zeros_like(y)
-        for i, x in enumerate(u):
-            simulated += filtered(theta[arx.places["B", i]], A, x)
-        if not np.all(np.isfinite(simulated)) or not np.any(simulated):
-            return None
-        zero = np.zeros(p.n_nuisance)
-        rows, instruments = p.rows(y, u, arx.start(), zero), p.rows(simulated, u, arx.start(), zero)
-        Q = np.linalg.qr(instruments[:-1].T)[0]
-        step = -np.linalg.lstsq(Q.T @ rows[:-1].T, Q.T @ rows[-1], rcond=1e-12)[0]
-        theta = arx.start()
-        theta[arx.free] += step[p.n_nuisance :]
-    out = layout.start()
-    _set(out, layout, "A", None, theta[arx.places["A", None]])
-    for i in range(layout.n_inputs):
-        _set(out, layout, "B", i, theta[arx.places["B", i]])
-    return out
-
-
 def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """OE and BJ."""
-    if layout.n_inputs == 1:
-        theta = layout.start()
-        b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.nf[0], layout.nk[0])
-        _set(theta, layout, "B", 0, b)
-        _set(theta, layout, "F", 0, f)
+    """OE: the plant from the data, then from the long model. BJ: from the long model, then from the data."""
+    coloured = layout.nc + layout.nd > 0
+    ways = [_from_long_model] if layout.n_inputs > 1 else [_from_data, _from_long_model]
+    for way in ways[::-1] if coloured else ways:
+        theta = way(layout, y, u)
         _set_noise(theta, layout, y, u)
         yield theta
-    A, B = _long_model(layout, y, u)
-    A = reflected(A, 0.995)
+    if coloured:  # the plant searched for with white noise, then the noise
+        white = Layout(na=0, nb=layout.nb, nc=0, nd=0, nf=layout.nf, nk=layout.nk)
+        found = searched(predictor(white), y, u, ways[0](white, y, u), most=15).theta
+        theta = layout.start()
+        for i in range(layout.n_inputs):
+            _set(theta, layout, "B", i, found[white.places["B", i]])
+            _set(theta, layout, "F", i, found[white.places["F", i]])
+        _set_noise(theta, layout, y, u)
+        yield theta
+
+
+def _from_data(layout: Layout, y: Array, u: Array) -> Array:
     theta = layout.start()
+    b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.nf[0], layout.nk[0])
+    _set(theta, layout, "B", 0, b)
+    _set(theta, layout, "F", 0, f)
+    return theta
+
+
+def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
+    long, theta = _long_model(layout, y, u), layout.start()
     for i in range(layout.n_inputs):
-        impulse = np.zeros(min(y.size, 1000))
-        impulse[0] = 1.0
-        g = filtered(B[i], A, impulse)
-        b, f = steiglitz_mcbride(g, impulse, layout.nb[i], layout.nf[i], layout.nk[i])
+        (b,), f = reduced(long, [i], [layout.nb[i]], layout.nf[i])
         _set(theta, layout, "B", i, b)
-        _set(theta, layout, "F", i, f)
-    _set_noise(theta, layout, y, u)
-    yield theta
+        _set(theta, layout, "F", i, reflected(f, 0.999))
+    return theta
 
 
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Array, Array]:

@@ -1,0 +1,86 @@
+"""Data without means, in units of their standard deviations: results do not depend on the user's units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.polynomial.orders import Layout
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scaled:
+    """Data without means, in units of their standard deviations.
+
+    Attributes
+    ----------
+    u, y : ndarray, shape (n_inputs, n_samples), (n_outputs, n_samples)
+    u_mean, u_scale : ndarray, shape (n_inputs,)
+    y_mean, y_scale : ndarray, shape (n_outputs,)
+    """
+
+    u: Array
+    y: Array
+    u_mean: Array
+    u_scale: Array
+    y_mean: Array
+    y_scale: Array
+
+
+def scaled_data(name: str, data: IOData) -> Scaled:
+    """Take off means and divide by standard deviations.
+
+    Parameters
+    ----------
+    name : str
+    data : IOData
+
+    Returns
+    -------
+    Scaled
+
+    Raises
+    ------
+    EstimationError
+        If a channel does not move.
+    """
+    out = []
+    for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
+        mean = np.mean(values, axis=0)
+        centred = np.ascontiguousarray((values - mean).T)
+        scale = np.sqrt(np.mean(centred**2, axis=1)) if values.size else np.ones(0)
+        for k, channel in enumerate(names):
+            if not scale[k] > 1e-13 * np.max(np.abs(values[:, k])):
+                raise EstimationError(
+                    f"{name}: {channel!r} does not move (constant at {mean[k]:g}); nothing can be learnt from it. "
+                    "Excite it, or leave it out"
+                )
+        out.append((np.asarray(centred / scale[:, None]), mean, scale))
+    (u, u_mean, u_scale), (y, y_mean, y_scale) = out
+    return Scaled(u=u, y=y, u_mean=u_mean, u_scale=u_scale, y_mean=y_mean, y_scale=y_scale)
+
+
+def unit(layout: Layout, scaled: Scaled, o: int) -> Array:
+    """Return what one scaled coefficient is worth in SI, shape (n_theta,).
+
+    Parameters
+    ----------
+    layout : Layout
+    scaled : Scaled
+    o : int
+        Output.
+
+    Returns
+    -------
+    ndarray, shape (n_theta,)
+    """
+    out = np.ones(layout.n_theta)
+    for i in range(layout.n_inputs):
+        out[layout.places["B", i]] = scaled.y_scale[o] / scaled.u_scale[i]
+    return out
