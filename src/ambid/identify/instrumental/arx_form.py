@@ -1,0 +1,279 @@
+"""Instrumental variables for one output of A y = B u + noise of any colour: the steps that iv4 and cliv share.
+
+Regressors are lagged outputs and inputs and a constant; instruments are the same lags of signals that the noise did not
+make. Filtering with an autoregressive model of the equation's own noise makes the estimate optimal (Ljung 1999,
+sec. 15.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.polynomial_model import Polynomials
+from ambid.identify.blackbox.response import Offsets
+from ambid.identify.instrumental.noise import Autoregression, autoregression, noise_covariance
+from ambid.identify.instrumental.solve import Solution, solve
+
+Array = NDArray[np.float64]
+
+_NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArxOrders:
+    """Orders of one output.
+
+    Attributes
+    ----------
+    na : int
+    nb, nk : tuple of int
+        For each input.
+    """
+
+    na: int
+    nb: tuple[int, ...]
+    nk: tuple[int, ...]
+
+    @property
+    def first(self) -> int:
+        """First sample whose lags are all in the record."""
+        return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.na + sum(self.nb)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Signals:
+    """One output and the inputs, offsets roughly off.
+
+    Attributes
+    ----------
+    y : ndarray, shape (n_samples,)
+    u : ndarray, shape (n_samples, n_inputs)
+    """
+
+    y: Array
+    u: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ArxEstimate:
+    """Outcome of one output.
+
+    Attributes
+    ----------
+    A : ndarray, shape (na + 1,)
+    B : tuple of ndarray, shape (nk + nb,) each
+        For each input.
+    constant : float
+        Of the equation, for the signals as given.
+    noise : Autoregression
+        Of the equation error: A y = B u + constant + w/D.
+    solution : Solution
+        Last step; its unknowns are a_1 ..., b of every input, and the constant times D(1).
+    innovations : ndarray, shape (n_rows,)
+        Ending with the last sample.
+    """
+
+    A: Array
+    B: tuple[Array, ...]
+    constant: float
+    noise: Autoregression
+    solution: Solution
+    innovations: Array
+
+
+def regressors(signals: Signals, orders: ArxOrders, first: int) -> Array:
+    """Return -y(t-1) ... -y(t-na), u_i(t-nk) ..., 1 for t >= first, shape (n_samples - first, size + 1).
+
+    Parameters
+    ----------
+    signals : Signals
+    orders : ArxOrders
+    first : int
+
+    Returns
+    -------
+    ndarray, shape (n_rows, n_coefficients + 1)
+    """
+    n = signals.y.size
+    columns = [-signals.y[first - k : n - k] for k in range(1, orders.na + 1)]
+    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+        columns += [signals.u[first - k : n - k, i] for k in range(nk, nk + nb)]
+    return np.stack([*columns, np.ones(n - first)], axis=1)
+
+
+def step(
+    who: str, data: Signals, instruments: Signals, orders: ArxOrders, noise: Autoregression = _NO_NOISE_MODEL
+) -> Solution:
+    """Make one instrumental variable step; with `noise` all signals are filtered by its D.
+
+    Parameters
+    ----------
+    who : str
+        Method, for errors.
+    data, instruments : Signals
+    orders : ArxOrders
+    noise : Autoregression, optional
+
+    Returns
+    -------
+    Solution
+    """
+    first = orders.first + noise.order
+    filtered = _filtered(data, noise.D)
+    rows = regressors(filtered, orders, first)
+    return solve(regressors(_filtered(instruments, noise.D), orders, first), rows, filtered.y[first:], who=who)
+
+
+def least_squares(who: str, data: Signals, orders: ArxOrders) -> Array:
+    """Return the least-squares coefficients: instruments equal to regressors; biased by coloured noise.
+
+    Parameters
+    ----------
+    who : str
+    data : Signals
+    orders : ArxOrders
+
+    Returns
+    -------
+    ndarray, shape (n_coefficients + 1,)
+    """
+    return step(who, data, data, orders).theta
+
+
+def equation_error(data: Signals, theta: Array, orders: ArxOrders) -> Array:
+    """Return A y - B u - constant from the first sample with all lags on.
+
+    Parameters
+    ----------
+    data : Signals
+    theta : ndarray, shape (n_coefficients + 1,)
+    orders : ArxOrders
+
+    Returns
+    -------
+    ndarray, shape (n_rows,)
+    """
+    first = orders.first
+    return np.asarray(data.y[first:] - regressors(data, orders, first) @ theta)
+
+
+def optimal(
+    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int
+) -> ArxEstimate:
+    """Model the noise of the equation at `theta` and make the filtered, optimal step (Ljung 1999, eq. 15.25-15.29).
+
+    Parameters
+    ----------
+    who : str
+    data, instruments : Signals
+    orders : ArxOrders
+    theta : ndarray, shape (n_coefficients + 1,)
+        Consistent estimate from a step before.
+    highest : int
+        Highest order of the noise model.
+
+    Returns
+    -------
+    ArxEstimate
+    """
+    noise = autoregression(equation_error(data, theta, orders), highest)
+    solution = step(who, data, instruments, orders, noise)
+    found = solution.theta
+    constant = float(found[-1] / noise.D.sum())
+    A = np.concatenate([[1.0], found[: orders.na]])
+    B, first = list[Array](), orders.na
+    for nb, nk in zip(orders.nb, orders.nk, strict=True):
+        B.append(np.concatenate([np.zeros(nk), found[first : first + nb]]))
+        first += nb
+    return ArxEstimate(
+        A=A, B=tuple(B), constant=constant, noise=noise, solution=solution, innovations=solution.residual
+    )
+
+
+def polynomials(found: ArxEstimate) -> Polynomials:
+    """Return A, B and, as the noise model, 1/D.
+
+    Parameters
+    ----------
+    found : ArxEstimate
+
+    Returns
+    -------
+    Polynomials
+    """
+    return Polynomials(A=found.A, B=found.B, C=np.ones(1), D=found.noise.D, F=tuple(np.ones(1) for _ in found.B))
+
+
+def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
+    """Return the covariance of all coefficients of `polynomials`, leading ones and zeros included.
+
+    The noise of the filtered equation is modelled once more, so that a noise model of too low an order costs efficiency
+    but does not make the standard deviations too small.
+
+    Parameters
+    ----------
+    found : ArxEstimate
+    orders : ArxOrders
+
+    Returns
+    -------
+    ndarray, shape (n_theta, n_theta)
+    """
+    rows = found.innovations.size
+    left = autoregression(found.innovations, 10)
+    spare = rows / max(rows - orders.size - 1, 1)
+    inner = found.solution.covariance(left)[:-1, :-1] * spare
+    sizes = [found.A.size, *(b.size for b in found.B), 1, found.noise.D.size, *(1 for _ in found.B)]
+    free = [slice(1, found.A.size)]
+    start = found.A.size
+    for b, nk in zip(found.B, orders.nk, strict=True):
+        free.append(slice(start + nk, start + b.size))
+        start += b.size
+    places = np.concatenate([np.arange(s.start, s.stop) for s in free])
+    out = np.zeros((sum(sizes), sum(sizes)))
+    out[np.ix_(places, places)] = inner
+    d = slice(start + 1, start + 1 + found.noise.D.size)
+    out[d, d] = noise_covariance(found.noise, rows)
+    return out
+
+
+def operating_point(found: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
+    """Share the constants of the equations out over input and output offsets, each moved as little as possible.
+
+    A(1) y0 - B(1) u0 = constant; where A(1) is near zero (an integrating plant) the input takes it.
+
+    Parameters
+    ----------
+    found : list of ArxEstimate
+        One for each output, for signals with the means taken off.
+    u_mean, u_sd : ndarray, shape (n_inputs,), SI
+    y_mean, y_sd : ndarray, shape (n_outputs,), SI
+
+    Returns
+    -------
+    Offsets
+    """
+    n_y = y_mean.size
+    rows = np.zeros((n_y, n_y + u_mean.size))
+    for o, f in enumerate(found):
+        rows[o, o] = f.A.sum() * y_sd[o]
+        rows[o, n_y:] = -np.array([b.sum() for b in f.B]) * u_sd
+    move = np.linalg.lstsq(rows, np.array([f.constant for f in found]), rcond=None)[0]
+    return Offsets(u=u_mean + move[n_y:] * u_sd, y=y_mean + move[:n_y] * y_sd)
+
+
+def _filtered(signals: Signals, D: Array) -> Signals:
+    """Signals through D; the first order(D) samples are not usable."""
+    if D.size == 1:
+        return signals
+    from scipy.signal import lfilter
+
+    return Signals(y=lfilter(D, [1.0], signals.y), u=lfilter(D, [1.0], signals.u, axis=0))

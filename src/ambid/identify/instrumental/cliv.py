@@ -1,0 +1,69 @@
+"""Instrumental variables from the reference, for a plant in a loop, stable or not (Gilson and Van den Hof 2005).
+
+Under feedback the noise reaches the input, so that past inputs are no instruments. What the reference makes of inputs
+and outputs is, whatever the controller; with a model of the equation's noise as filter the estimate is optimal.
+"""
+
+from __future__ import annotations
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals, optimal, step
+from ambid.identify.instrumental.iv4 import arx_fit, arx_orders, centred
+from ambid.identify.instrumental.orders import Orders
+from ambid.identify.instrumental.reference import reference_part, wants_reference
+
+_NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it
+_ROUNDS = 3  # noise model and estimate in turn; the first two already agree to first order
+
+
+def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate G = B/A of a plant in a loop, with instruments from the reference; every output by itself.
+
+    Parameters
+    ----------
+    data : IOData
+        With a reference that the noise does not reach.
+    orders : Mapping[str, int or tuple of int]
+        ``na``; ``nb`` and ``nk`` (default 1), one or one for each input.
+
+    Returns
+    -------
+    BlackBoxFit
+        PolynomialModel with A, B and 1/D, an autoregressive model of the equation's noise, as noise model.
+
+    Raises
+    ------
+    EstimationError
+        If there is no reference, an order breaks a rule, or the record is too short or does not excite the plant.
+    """
+    wants_reference("cliv", data)
+    used = arx_orders("cliv", data, orders)
+    deviations, means, sds = centred(data)
+    clean = reference_part("cliv", deviations)
+    found = [
+        in_loop(Signals(y=deviations.y[:, o], u=deviations.u), Signals(y=clean.y[:, o], u=clean.u), used)
+        for o in range(data.n_outputs)
+    ]
+    fit = arx_fit("cliv", data, used, found, means, sds)
+    return fit
+
+
+def in_loop(signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
+    """Estimate one output with the parts of the signals that the reference makes as instruments.
+
+    Parameters
+    ----------
+    signals, clean : Signals
+    orders : ArxOrders
+
+    Returns
+    -------
+    ArxEstimate
+    """
+    theta = step("cliv", signals, clean, orders).theta
+    for _ in range(_ROUNDS):
+        found = optimal("cliv", signals, clean, orders, theta, orders.size + _NOISE_ORDER)
+        theta = found.solution.theta.copy()
+        theta[-1] = found.constant
+    return found

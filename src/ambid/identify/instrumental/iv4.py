@@ -1,0 +1,178 @@
+"""Four-step instrumental variables for A y = B u + noise of any colour, no feedback (Ljung 1999, sec. 15.3).
+
+Least squares is biased where the equation's noise is not white. Instruments simulated from the inputs alone carry no
+noise; filtering with a model of the noise makes the estimate as sharp as a method without a noise model of G can be.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.instrumental.arx_form import (
+    ArxEstimate,
+    ArxOrders,
+    Signals,
+    covariance,
+    least_squares,
+    operating_point,
+    optimal,
+    polynomials,
+    step,
+)
+from ambid.identify.instrumental.orders import Orders, known_orders, long_enough, per_input, single
+
+Array = NDArray[np.float64]
+
+_NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it
+_INSIDE = 0.999  # radius to which the poles of an unstable instrument are drawn
+
+
+def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate G = B/A by the four-step instrumental variable method; every output by itself.
+
+    Parameters
+    ----------
+    data : IOData
+        Without feedback: past inputs are instruments, so the noise must not reach the input.
+    orders : Mapping[str, int or tuple of int]
+        ``na``; ``nb`` and ``nk`` (default 1), one or one for each input.
+
+    Returns
+    -------
+    BlackBoxFit
+        PolynomialModel with A, B and 1/D, an autoregressive model of the equation's noise, as noise model.
+
+    Raises
+    ------
+    EstimationError
+        If an order breaks a rule, or the record is too short or does not excite the plant.
+    """
+    used = arx_orders("iv4", data, orders)
+    deviations, means, sds = centred(data)
+    found = [_one_output(Signals(y=deviations.y[:, o], u=deviations.u), used) for o in range(data.n_outputs)]
+    return arx_fit("iv4", data, used, found, means, sds)
+
+
+def arx_orders(who: str, data: IOData, orders: Orders) -> ArxOrders:
+    """Check na, nb and nk, and that the record is long enough for them.
+
+    Parameters
+    ----------
+    who : str
+    data : IOData
+    orders : Mapping[str, int or tuple of int]
+
+    Returns
+    -------
+    ArxOrders
+
+    Raises
+    ------
+    EstimationError
+        Naming the order or the channel.
+    """
+    known_orders(who, orders, ("na", "nb", "nk"), ("na", "nb"))
+    n_u = data.n_inputs
+    used = ArxOrders(
+        na=single(who, orders, "na", 0),
+        nb=per_input(who, orders, "nb", 1, n_u),
+        nk=per_input(who, {"nk": 1, **orders}, "nk", 0, n_u),
+    )
+    long_enough(who, data, data.n_samples - (used.first if n_u else 0), used.size + 1)
+    return used
+
+
+def centred(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Array]]:
+    """Return the data with means off (for the numbers' sake; constants are estimated), the means and the spreads.
+
+    Parameters
+    ----------
+    data : IOData
+
+    Returns
+    -------
+    IOData
+    tuple of ndarray, shape (n_inputs,) and (n_outputs,)
+        Means.
+    tuple of ndarray, shape (n_inputs,) and (n_outputs,)
+        Standard deviations.
+    """
+    from dataclasses import replace
+
+    means = (data.u.mean(axis=0), data.y.mean(axis=0))
+    sds = (data.u.std(axis=0), data.y.std(axis=0))
+    reference = data.reference - data.reference.mean(axis=0)
+    return replace(data, u=data.u - means[0], y=data.y - means[1], reference=reference), means, sds
+
+
+def arx_fit(
+    who: str,
+    data: IOData,
+    orders: ArxOrders,
+    found: list[ArxEstimate],
+    means: tuple[Array, Array],
+    sds: tuple[Array, Array],
+    warnings: tuple[str, ...] = (),
+) -> BlackBoxFit:
+    """Put the estimates of all outputs together.
+
+    Parameters
+    ----------
+    who : str
+    data : IOData
+    orders : ArxOrders
+    found : list of ArxEstimate
+        For each output, of the data with the means off.
+    means, sds : tuple of ndarray, shape (n_inputs,) and (n_outputs,)
+    warnings : tuple of str, optional
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    from scipy.linalg import block_diag
+
+    rows = min(f.innovations.size for f in found)
+    e = np.stack([f.innovations[-rows:] for f in found], axis=1)
+    return made(
+        who,
+        data,
+        orders={"na": orders.na, "nb": orders.nb, "nk": orders.nk},
+        model=PolynomialModel(outputs=tuple(polynomials(f) for f in found), dt=data.dt),
+        covariance=block_diag(*[covariance(f, orders) for f in found]),
+        n_estimated=sum(orders.size + f.noise.order for f in found),
+        offsets=operating_point(found, *means, *sds),
+        noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
+        warnings=warnings,
+        details={
+            "noise_order": [f.noise.order for f in found],
+            "condition": [f.solution.condition for f in found],
+        },
+    )
+
+
+def _one_output(signals: Signals, orders: ArxOrders) -> ArxEstimate:
+    start = least_squares("iv4", signals, orders)
+    theta = step("iv4", signals, _simulated(signals, start, orders), orders).theta
+    highest = orders.size + _NOISE_ORDER
+    return optimal("iv4", signals, _simulated(signals, theta, orders), orders, theta, highest)
+
+
+def _simulated(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
+    """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
+    from scipy.signal import lfilter
+
+    roots = np.roots(np.concatenate([[1.0], theta[: orders.na]]))
+    size = np.abs(roots)
+    inside = np.where(size > _INSIDE, roots / np.maximum(size, 1.0) ** 2 * np.minimum(1.0, _INSIDE), roots)
+    A = np.poly(inside).real
+    y, first = np.zeros(signals.y.size), orders.na
+    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+        y += lfilter(np.concatenate([np.zeros(nk), theta[first : first + nb]]), A, signals.u[:, i])
+        first += nb
+    return Signals(y=y, u=signals.u)

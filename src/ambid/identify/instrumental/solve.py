@@ -1,0 +1,137 @@
+"""The core of every instrumental variable method: Z' (target - Phi theta) = 0 through orthogonal factors.
+
+Neither Z' Z nor Z' Phi is formed from raw columns: Z = Q R, and Q' Phi theta = Q' target is solved by singular values.
+With more instruments than unknowns this is two-stage least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.instrumental.noise import Autoregression, score_covariance
+
+Array = NDArray[np.float64]
+
+_BLIND = 1e-11  # relative singular value under which the instruments do not see a direction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """Estimate of one instrumental variable step.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (n_theta,)
+    residual : ndarray, shape (n_samples,)
+        target - Phi theta.
+    Q : ndarray, shape (n_samples, n_instruments)
+        Orthonormal instruments.
+    inverse : ndarray, shape (n_theta, n_instruments)
+        Generalised inverse of Q' Phi.
+    condition : float
+        Of Q' Phi, its columns scaled.
+    """
+
+    theta: Array
+    residual: Array
+    Q: Array
+    inverse: Array
+    condition: float
+
+    def covariance(self, noise: Autoregression) -> Array:
+        """Return (Q' Phi)^-1 Cov(Q' e) (Q' Phi)^-T (Soderstrom and Stoica 1989, sec. 8.2).
+
+        Parameters
+        ----------
+        noise : Autoregression
+            Of the residual.
+
+        Returns
+        -------
+        ndarray, shape (n_theta, n_theta)
+        """
+        return np.asarray(self.inverse @ score_covariance(self.Q, noise) @ self.inverse.T)
+
+
+def solve(instruments: Array, regressors: Array, target: Array, *, who: str) -> Solution:
+    """Solve one instrumental variable step.
+
+    Parameters
+    ----------
+    instruments : ndarray, shape (n_samples, n_instruments)
+        At least as many as regressors.
+    regressors : ndarray, shape (n_samples, n_theta)
+    target : ndarray, shape (n_samples,)
+    who : str
+        Method, for the error.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    EstimationError
+        If the instruments do not see every regressor.
+    """
+    z_size, size = _norms(instruments), _norms(regressors)
+    Q = np.linalg.qr(instruments / z_size)[0]
+    left, values, right = np.linalg.svd(Q.T @ (regressors / size), full_matrices=False)
+    if not np.all(np.isfinite(values)) or values[-1] <= _BLIND * values[0]:
+        raise EstimationError(
+            f"{who}: the input or reference does not move every term of this model, so that its coefficients have no "
+            "single solution. Lower the orders, excite more frequencies, or give more independent references"
+        )
+    inverse = (right.T / values) @ left.T / size[:, None]
+    theta = inverse @ (Q.T @ target)
+    return Solution(
+        theta=theta,
+        residual=target - regressors @ theta,
+        Q=Q,
+        inverse=inverse,
+        condition=float(values[0] / values[-1]),
+    )
+
+
+def without(nuisance: Array, columns: Array) -> Array:
+    """Take off what offsets and initial states explain: the part of `columns` in the span of `nuisance`.
+
+    Parameters
+    ----------
+    nuisance : ndarray, shape (n_samples, n_nuisance)
+        May be rank deficient.
+    columns : ndarray, shape (n_samples, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n_columns)
+    """
+    basis = span(nuisance)
+    return np.asarray(columns - basis @ (basis.T @ columns))
+
+
+def span(columns: Array) -> Array:
+    """Return an orthonormal basis of the columns, dependent ones left out.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (n_samples, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (n_samples, rank)
+    """
+    from scipy.linalg import qr
+
+    Q, R, _ = qr(columns / _norms(columns), mode="economic", pivoting=True)
+    diagonal = np.abs(np.diag(R))
+    return np.ascontiguousarray(Q[:, diagonal > 1e-10 * diagonal[0]])
+
+
+def _norms(columns: Array) -> Array:
+    size = np.linalg.norm(columns, axis=0)
+    return np.where(size > 0, size, 1.0)
