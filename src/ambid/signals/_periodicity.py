@@ -51,7 +51,7 @@ def find_period(x: Array) -> int:
     return int(low[np.argmax(d[low] <= 2.0 * deepest + 1e-3)])
 
 
-def find_experiments(x: Array, *, quiet: int = 50) -> tuple[slice, ...]:
+def find_experiments(x: Array, *, quiet: int = 50, margin: int = 0) -> tuple[slice, ...]:
     """Find the experiments of a record: stretches of excitation between rests, at least as long as a rest.
 
     A rest is a stretch in which no channel leaves a band of 2 % of its largest deviation.
@@ -62,6 +62,9 @@ def find_experiments(x: Array, *, quiet: int = 50) -> tuple[slice, ...]:
         Excitation.
     quiet : int
         Least samples of a rest.
+    margin : int
+        Samples left out at the end of each experiment, where the excitation fades through its filter and is no longer
+        periodic.
 
     Returns
     -------
@@ -85,7 +88,8 @@ def find_experiments(x: Array, *, quiet: int = 50) -> tuple[slice, ...]:
     if not np.all(size > 0) or sum(b - a for a, b in rests) == x.shape[0]:
         raise EstimationError("the excitation rests all the time; there is no experiment in it. Pass the driven signal")
     edges = [0, *(edge for rest in rests for edge in rest), x.shape[0]]
-    return tuple(slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= quiet)
+    both = zip(edges[::2], edges[1::2], strict=True)
+    return tuple(slice(int(a), int(b) - margin) for a, b in both if b - a >= quiet + margin)
 
 
 def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
@@ -109,6 +113,14 @@ def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
         if not lines.size:
             raise EstimationError("no line of the excitation stands 10 dB above its noise. Average more periods")
     return lines, clear
+
+
+def without_strays(lines: Lines) -> tuple[Lines, Lines]:
+    """Return excited lines and strays: even lines among an odd excitation (under 5 % of all), such as mains hum."""
+    odd = (lines + 1) % 2 == 1
+    if 0 < np.sum(~odd) < 0.05 * lines.size:
+        return lines[odd], lines[~odd]
+    return lines, lines[:0]
 
 
 def transient_ratio(periods: Array) -> float:

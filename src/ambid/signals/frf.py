@@ -241,7 +241,7 @@ def frequency_response(
         "auto" takes `frf_periodic` for several experiments, a given period, or an excitation (r, or u without it) of
         one input that repeats at least twice; else `frf_local`. What was taken is in the result's `method`.
     **options
-        Passed on to the method.
+        Passed on to the method; all know `open_loop`, `hold`, `inputs`, `outputs` and `units`.
 
     Returns
     -------

@@ -17,8 +17,8 @@ import numpy as np
 from ambid.errors import EstimationError
 from ambid.record.record import Array
 from ambid.signals._distortion import at_excited, detected, distortions
-from ambid.signals._joint import checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
-from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio
+from ambid.signals._joint import FEEDBACK, checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
+from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio, without_strays
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
 
 _TRANSIENT = 6.0  # standard deviations that the first period may differ from the others
@@ -53,6 +53,7 @@ def frf_periodic(
     period: int | None = None,
     lines: Sequence[int] | None = None,
     drop_periods: int | Literal["auto"] = 0,
+    open_loop: bool = False,
     hold: Hold = "zoh",
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
@@ -78,6 +79,9 @@ def frf_periodic(
         Excited multiples of rate/period; by default found from r or u.
     drop_periods : int or "auto"
         Leading periods not used, for the transient; "auto" drops those that differ significantly, and says so.
+    open_loop : bool
+        Whether it is known that no feedback was at work; otherwise single periods, which do not show the noise that
+        feedback carries to the input, give a warning.
     hold : {"zoh", "band-limited"}
         What the input does between samples; kept with the result.
     inputs, outputs : sequence of str, optional
@@ -101,11 +105,11 @@ def frf_periodic(
     if period is None:
         period = find_period(experiments[0][0] if experiments[0][2] is None else experiments[0][2])
     spectra = [_spectra(k, *e, period, drop_periods) for k, e in enumerate(experiments)]
-    excited, clear = _lines(spectra, lines, n_y, period)
+    excited, doubts = _lines(spectra, lines, n_y, period)
     found = _over_realisations(spectra, excited, n_y, n_u)
-    warnings = tuple(w for s in spectra for w in s.warnings) + found.warnings
-    if not clear:
-        warnings += ("the excited lines do not stand out clearly from the others; check them, or give lines",)
+    warnings = tuple(w for s in spectra for w in s.warnings) + doubts + found.warnings
+    if found.noise is None and r is None and not open_loop:
+        warnings += (f"one period does not show noise at the input: {FEEDBACK}",)
     spacing = rate_hz / period
     details: dict[str, object] = {
         "period": period,
@@ -199,19 +203,29 @@ def _transient_periods(periods: Array) -> int:
     return dropped
 
 
-def _lines(spectra: list[_Spectra], lines: Sequence[int] | None, n_y: int, period: int) -> tuple[Lines, bool]:
+def _lines(
+    spectra: list[_Spectra], lines: Sequence[int] | None, n_y: int, period: int
+) -> tuple[Lines, tuple[str, ...]]:
     last = (period - 1) // 2
     if lines is not None:
         numbers = np.unique(np.asarray(lines, dtype=np.intp))
         if not numbers.size or numbers[0] < 1 or numbers[-1] > last:
             raise EstimationError(f"lines must be 1 to {last} with a period of {period} samples. Correct them")
-        return numbers - 1, True
+        return numbers - 1, ()
     source = np.stack([s.Z[:, n_y:] if s.R is None else s.R for s in spectra])
     noise = None
     if spectra[0].R is None and all(s.noise is not None for s in spectra):
         diagonals = [np.diagonal(s.noise, axis1=1, axis2=2)[:, n_y:] for s in spectra if s.noise is not None]
         noise = np.sum(np.real(diagonals), axis=(0, 2))
-    return excited_lines(source, noise)
+    excited, clear = excited_lines(source, noise)
+    excited, strays = without_strays(excited)
+    doubts: tuple[str, ...] = ()
+    if not clear:
+        doubts += ("the excited lines do not stand out clearly from the others; check them, or give lines",)
+    if strays.size:
+        listed = ", ".join(str(k + 1) for k in strays)
+        doubts += (f"even lines {listed} are excited among odd ones: taken for hum and left out. Else give lines",)
+    return excited, doubts
 
 
 def _over_realisations(spectra: list[_Spectra], excited: Lines, n_y: int, n_u: int) -> _Found:
