@@ -1,6 +1,7 @@
 """Covariance of a state-space estimate by leaving out one group of time after another.
 
-Solves: cov(theta) = (G-1)/G sum_g (theta_g - mean)(theta_g - mean)', with theta_g the estimate without group g. States
+Solves: cov(theta) = (G-1)/G sum_g (theta_g - mean)(theta_g - mean)' + b b', with theta_g the estimate without group g
+and b = (G-1)(mean - theta) the bias that shows when data are left out: large only where the record is short. States
 have no natural basis: each estimate is first turned into the basis of the full one through the observability matrices,
 which fixes the gauge, so that spreads of poles and responses follow by the delta method (delete-a-group jackknife;
 Shao and Tu 1995, ch. 2). Residuals count as they are: correlated, of changing size, of a model that is too small.
@@ -77,7 +78,8 @@ def jackknife(full: Realisation, others: Sequence[Realisation], length: int) -> 
         return None
     deviations = values - values.mean(0)
     groups = values.shape[0]
-    return np.asarray((groups - 1) / groups * deviations.T @ deviations)
+    bias = (groups - 1) * (values.mean(0) - theta(full))
+    return np.asarray((groups - 1) / groups * deviations.T @ deviations + np.outer(bias, bias))
 
 
 def theta(one: Realisation) -> Array:

@@ -220,7 +220,7 @@ def _with_prior(rows: Array, right: Array, lags: Array, given: Prior) -> Array:
         deviation = np.sqrt(size) * given.decay ** (0.5 * lags)
         scaled = np.vstack([rows * deviation, np.eye(lags.size)])
         target = np.vstack([right[:, chosen], np.zeros((lags.size, int(chosen.sum())))])
-        both = np.linalg.qr(np.hstack([scaled, target]), mode="r")
+        both = np.asarray(np.linalg.qr(np.hstack([scaled, target]), mode="r"))
         n = lags.size
         out[:, chosen] = deviation[:, None] * solve_triangular(both[:n, :n], both[:n, n:])
     return out

@@ -1,0 +1,231 @@
+"""From a plan to a result: decomposition, order, horizons, regressions, covariance. The same way for all methods."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.made import made
+from ambid.identify.subspace.classical import Projection, canonical_states, classical_columns, projected, realised
+from ambid.identify.subspace.compress import each_left_out, triangular
+from ambid.identify.subspace.jackknife import jackknife
+from ambid.identify.subspace.order import state_criterion
+from ambid.identify.subspace.plan import Method, Orders, Plan, planned
+from ambid.identify.subspace.predictor_based import Prediction, Prior, predicted, predictor_columns, prior, regressed
+from ambid.identify.subspace.realisation import Realisation
+from ambid.identify.subspace.units import embedded, offsets, with_units
+from ambid.identify.threads import one_thread
+
+Array = NDArray[np.float64]
+Tick = Callable[[], None] | None
+
+_HORIZONS = (4, 6, 8, 11, 15, 20)  # samples of future that are tried
+
+
+def fitted(
+    method: Method,
+    data: IOData,
+    orders: Orders,
+    horizon: int | None,
+    past: int | None,
+    feedthrough: bool | None,
+    tick: Tick,
+) -> BlackBoxFit:
+    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance.
+
+    Parameters
+    ----------
+    method : {"n4sid", "moesp", "cva", "pbsid"}
+    data : IOData
+    orders : Mapping
+    horizon, past : int or None
+        Samples.
+    feedthrough : bool or None
+    tick : callable or None
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        If orders or horizons break a rule, a channel is constant, or the record is too short.
+    """
+    with one_thread():
+        plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
+        given, found = decomposition(plan)
+        criterion = order_criterion(plan, found)
+        n = plan.n or max(1, int(np.argmin(criterion[: plan.n_max + 1])))
+        if method != "pbsid" and horizon is None:
+            plan = _with_horizons(plan, n, keep_past=past is not None)
+            given, found = decomposition(plan)
+        if n > found.values.size:
+            raise EstimationError(
+                f"{method}: the record shows {found.values.size} states, not {n}. Lower n, or excite the plant more"
+            )
+        full = model_of(plan, found, n)
+        others = []
+        for factor in each_left_out(plan.factors.arranged(_columns(plan))):
+            if tick is not None:
+                tick()
+            others.append(model_of(plan, _decomposed(plan, factor, given), n))
+        covariance = jackknife(full, others, plan.future)
+    return _result(method, data, plan, found, full, covariance, criterion)
+
+
+def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
+    """Decompose what all data say.
+
+    Parameters
+    ----------
+    plan : Plan
+
+    Returns
+    -------
+    given : Prior or None
+        Of the autoregression, where there is one.
+    found : Projection or Prediction
+        States of all orders.
+    """
+    total = triangular(plan.total[:, [0, *_columns(plan)]])
+    given = _prior(plan, total)
+    return given, _decomposed(plan, total, given)
+
+
+def _with_horizons(plan: Plan, n: int, *, keep_past: bool) -> Plan:
+    """Return the plan with the horizon whose model leaves the least innovations, freedom taken into account.
+
+    A long horizon averages noise out of slow states and brings it into fast ones; no rule knows which a plant has.
+    """
+    f, n_y = plan.factors, plan.factors.n_outputs
+    best, best_cost = plan, np.inf
+    for future in sorted({*_HORIZONS, plan.future}):
+        past = plan.past if keep_past else max(plan.past, future)
+        if (future - 1) * n_y < n or past + future > f.length:
+            continue
+        tried = replace(plan, past=past, future=future)
+        found = decomposition(tried)[1]
+        if found.values.size < n:
+            continue
+        model = model_of(tried, found, n)
+        free = f.n_rows - past * (f.n_inputs + n_y) - future * f.n_inputs
+        if not model.stable_predictor or free < 1:
+            continue
+        spread = model.innovation * (f.n_rows / free) + 1e-18 * np.eye(n_y)
+        cost = float(np.linalg.slogdet(spread)[1])
+        if cost < best_cost:
+            best, best_cost = tried, cost
+    return best
+
+
+def _columns(plan: Plan) -> list[int]:
+    if plan.method == "pbsid":
+        return predictor_columns(plan.factors, plan.past)
+    return classical_columns(plan.factors, plan.past, plan.future)
+
+
+def _prior(plan: Plan, total: Array) -> Prior | None:
+    """Return the prior of the autoregression, from all data: it stays when groups are left out."""
+    if plan.method != "pbsid":
+        return None
+    return prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
+
+
+def _decomposed(plan: Plan, factor: Array, given: Prior | None) -> Projection | Prediction:
+    if given is not None:
+        sizes = {"past": plan.past, "future": plan.future}
+        return predicted(factor, **sizes, feedthrough=plan.feedthrough, like=plan.factors, given=given)
+    assert plan.method != "pbsid"
+    return projected(factor, plan.method, past=plan.past, future=plan.future, like=plan.factors)
+
+
+def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
+    """Return the model of one order.
+
+    Parameters
+    ----------
+    plan : Plan
+    found : Projection or Prediction
+    n : int
+
+    Returns
+    -------
+    Realisation
+    """
+    if isinstance(found, Prediction):
+        return regressed(found, n, feedthrough=plan.feedthrough)
+    return realised(found, n, feedthrough=plan.feedthrough)
+
+
+def order_criterion(plan: Plan, found: Projection | Prediction) -> Array:
+    """Return Bayes' criterion for 0, 1, 2 ... states.
+
+    Parameters
+    ----------
+    plan : Plan
+    found : Projection or Prediction
+
+    Returns
+    -------
+    ndarray, shape (n_states + 1,)
+    """
+    n_u, n_y = plan.factors.n_inputs, plan.factors.n_outputs
+    most = min(plan.n_max, found.values.size)
+    if isinstance(found, Prediction):
+        states, y = found.state[:most], found.y
+    else:
+        states, y = canonical_states(found)[:most], found.outputs[found.inputs.shape[0] :, :n_y].T
+    return state_criterion(states, y, n_u, plan.factors.n_rows)
+
+
+def _result(
+    method: Method,
+    data: IOData,
+    plan: Plan,
+    found: Projection | Prediction,
+    full: Realisation,
+    covariance: Array | None,
+    criterion: Array,
+) -> BlackBoxFit:
+    """Give the numbers their units and say what has to be said of them."""
+    core, scale = with_units(full, plan.channels, data.dt)
+    model, places = embedded(core, plan.nk)
+    if covariance is not None:
+        wide = np.zeros((model.theta.size, model.theta.size))
+        wide[np.ix_(places, places)] = covariance * np.outer(scale, scale)
+        covariance = 0.5 * (wide + wide.T)
+    n, n_y, n_u = full.A.shape[0], data.n_outputs, data.n_inputs
+    y = plan.channels.scale_y
+    warnings = []
+    if covariance is None:
+        warnings.append("no standard deviations: parts of the record do not show the same states. Lower n")
+    if not full.stable_predictor:
+        warnings.append("no gain was found with which the predictor is stable: its predictions run away. Change n")
+    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
+    return made(
+        method,
+        data,
+        orders={"n": n, **delays},
+        model=model,
+        covariance=covariance,
+        n_estimated=n * (2 * n_y + n_u) + (n_u * n_y if plan.feedthrough else 0),
+        offsets=offsets(full, plan),
+        noise_covariance=full.innovation * np.outer(y, y),
+        warnings=warnings,
+        details={
+            "singular_values": found.values.tolist(),
+            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
+            "order_criterion": criterion.tolist(),
+            "feedthrough": plan.feedthrough,
+            "Q": full.Q.tolist(),
+            "S": (full.S * y).tolist(),
+            "R": (full.R * np.outer(y, y)).tolist(),
+        },
+    )
