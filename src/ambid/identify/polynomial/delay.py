@@ -43,8 +43,8 @@ def long_delays(name: str, y: Array, u: Array, least: int) -> tuple[int, ...]:
     """
     n_u, n = u.shape[0], y.size
     history = min(_HISTORY, n // (10 * (1 + n_u)))
-    largest = min(LARGEST_DELAY, n // (10 * n_u) - history)
-    if history < 1 or largest < least:
+    largest = min(LARGEST_DELAY, n // (5 * n_u) - history)
+    if history < 3 or largest < 5:
         raise EstimationError(f"{name}: {n} samples are too few to find the delay. Give nk")
     taps = largest + history
     long = Layout(na=history, nb=(taps,) * n_u, nc=0, nd=0, nf=(0,) * n_u, nk=(least,) * n_u)

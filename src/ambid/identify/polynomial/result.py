@@ -18,6 +18,7 @@ from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.polynomial.caution import cautions, unstable_plant
+from ambid.identify.polynomial.delay import LARGEST_DELAY
 from ambid.identify.polynomial.orders import Layout, shown_orders
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.scaled import Scaled, unit
@@ -64,6 +65,8 @@ def result(
     warnings = cautions(model, covariance, fits)
     if any(layouts[0].nf) and not data.open_loop:
         warnings += unstable_plant(layouts, scaled)
+    if estimated_delay and any(k >= LARGEST_DELAY for x in layouts for k in x.nk):
+        warnings.append(f"the delay was looked for up to {LARGEST_DELAY} samples and may be longer: give nk")
     details: dict[str, object] = {
         "iterations": [f.iterations for f in fits],
         "condition": [_condition(f.triangle) for f in fits],
