@@ -70,6 +70,26 @@ def simulation(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> 
     return _response(model.A, G, model, u, y, offsets)
 
 
+def states(F: Array, G: Array, z: Array) -> Array:
+    """Run x+ = F x + G z from rest.
+
+    Parameters
+    ----------
+    F : ndarray, shape (n, n)
+    G : ndarray, shape (n, n_z)
+    z : ndarray, shape (n_samples, n_z)
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n)
+        States before each sample.
+    """
+    n = F.shape[0]
+    work = np.hstack([np.zeros((z.shape[0], n)), z])
+    state_scan(np.ascontiguousarray(np.hstack([F, G])), work, np.zeros(n))
+    return work[:, :n]
+
+
 def stable(model: StateSpaceModel) -> bool:
     """Return whether all poles are inside the unit circle (or the left half plane).
 
@@ -89,13 +109,10 @@ def stable(model: StateSpaceModel) -> bool:
 
 def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
     """Run x+ = F x + G [u; y] from rest and add the free response that fits y best."""
-    from ambid.identify._kernels import state_scan
 
     z = np.hstack([u - offsets.u, y - offsets.y])
     n = model.order
-    work = np.hstack([np.zeros((z.shape[0], n)), z])
-    state_scan(np.ascontiguousarray(np.hstack([F, G])), work, np.zeros(n))
-    out = work[:, :n] @ model.C.T + z[:, : model.n_inputs] @ model.D.T
+    out = states(F, G, z) @ model.C.T + z[:, : model.n_inputs] @ model.D.T
     if n:
         free = _free_responses(F, model.C, z.shape[0])
         m, n_y = free.shape[0], model.n_outputs

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify._kernels import state_scan
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.identify.blackbox.response import states
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox.predictor import Errors, held_transfer
 
@@ -160,19 +160,12 @@ def _state_space_tangent(found: Errors, u: Array, y: Array) -> tuple[Array, ...]
     m, e = found.model, found.one_step
     F = m.A - m.K @ m.C
     noise = bool(np.any(m.K))
-    work = np.hstack([np.zeros((u.shape[0], m.order)), u, y])
-    drive = np.hstack([F, m.B - m.K @ m.D, m.K])
-    state_scan(np.ascontiguousarray(drive), work, np.zeros(m.order))
-    x = work[:, : m.order]
+    x = states(F, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
     signals = np.hstack([x, u, e] if noise else [x, u])
     out = list[Array]()
     for o in range(m.n_outputs):
-        rows = list[Array]()
-        M = np.ascontiguousarray(np.hstack([F.T, m.C[o][:, None]]))
-        for j in range(signals.shape[1]):
-            w = np.hstack([np.zeros((u.shape[0], m.order)), signals[:, j : j + 1]])
-            state_scan(M, w, np.zeros(m.order))
-            rows.append(w[:, : m.order])
+        drive = m.C[o][:, None]
+        rows = [states(F.T, drive, signals[:, j : j + 1]) for j in range(signals.shape[1])]
         if np.any(m.D):
             # D moves the prediction at once and, through the gain, the state
             rows.append(u)

@@ -140,7 +140,8 @@ def _families(fit: BlackBoxFit) -> Iterator[tuple[str, Roots, Roots]]:
         for o, i in np.ndindex(model.n_outputs, model.n_inputs):
             den, num = (_roots(theta, parts[o, i, which]) for which in ("den", "num"))
             yield "num and den", den, num
-    elif isinstance(model, StateSpaceModel) and model.n_inputs == model.n_outputs:
+    elif isinstance(model, StateSpaceModel) and model.n_inputs == model.n_outputs and not np.any(model.K):
+        # with a gain, a state that no input reaches may be one of the noise
         yield "of G", (model.poles(), model.pole_derivative()), (model.zeros(), model.zero_derivative())
 
 

@@ -1,0 +1,231 @@
+"""Several structures on the same data, judged on data that none of them has seen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.structures import Orders, structure
+from ambid.validate.blackbox import judged
+from ambid.validate.holdout import HELD_OUT, hold_out
+from ambid.validate.selection import select
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Entry:
+    """One structure in a comparison.
+
+    Attributes
+    ----------
+    structure : str
+    orders : Mapping[str, int or tuple of int]
+        Empty where it could not be fitted and none were given.
+    fit : BlackBoxFit or None
+        Judged, with its validation; None where the estimator refused.
+    one_step, simulation : float or None
+        NRMSE fit on data not used in the estimation, mean over the outputs; None where there is none.
+    seconds : float
+        Time of the fit, choice of orders included.
+    refusal : str
+        Why there is no fit.
+    """
+
+    structure: str
+    orders: Orders
+    fit: BlackBoxFit | None
+    one_step: float | None
+    simulation: float | None
+    seconds: float
+    refusal: str = ""
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of the checks that failed."""
+        return () if self.fit is None else tuple(k for k, c in self.fit.checks.items() if not c.passed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """Structures compared, best first.
+
+    Attributes
+    ----------
+    entries : tuple of Entry
+        Sorted by the one-step fit on unseen data; those without one last.
+    inputs, outputs : tuple of str
+    fitted_samples, judged_samples : int
+    judged_on : str
+        ``"second record"`` or ``"last 30 % of the record"``.
+    summary : str
+        One line: what the differences mean.
+    record : Mapping[str, object]
+    """
+
+    entries: tuple[Entry, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    fitted_samples: int
+    judged_samples: int
+    judged_on: str
+    summary: str
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the table, ready for JSON.
+
+        Returns
+        -------
+        dict
+            ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds and
+            refusal; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
+        """
+        return {
+            "judged_on": self.judged_on,
+            "fitted_samples": self.fitted_samples,
+            "judged_samples": self.judged_samples,
+            "inputs": list(self.inputs),
+            "outputs": list(self.outputs),
+            "summary": self.summary,
+            "entries": [
+                {
+                    "structure": x.structure,
+                    "orders": dict(x.orders),
+                    "n_estimated": None if x.fit is None else x.fit.n_estimated,
+                    "criteria": {} if x.fit is None else dict(x.fit.criteria),
+                    "one_step": x.one_step,
+                    "simulation": x.simulation,
+                    "failed_checks": list(x.failed),
+                    "seconds": x.seconds,
+                    "refusal": x.refusal or None,
+                }
+                for x in self.entries
+            ],
+        }
+
+
+def compare(
+    data: IOData,
+    candidates: Sequence[tuple[str, Orders | None]],
+    *,
+    holdout: float = HELD_OUT,
+    second: IOData | None = None,
+    criterion: str = "bic",
+    tick: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Fit structures to the same samples and judge them on others.
+
+    Parameters
+    ----------
+    data : IOData
+    candidates : sequence of (str, Mapping or None)
+        Structures with their orders; None chooses them by `criterion`.
+    holdout : float, optional
+        Last part of the record that is not fitted, 0 to 1; not used with a second record.
+    second : IOData, optional
+        Other data to judge on; then all of `data` is fitted.
+    criterion : str, optional
+        For orders that are not given, see `ambid.validate.selection.select`.
+    tick : callable, optional
+        Called with the structure before each fit; may raise to interrupt.
+
+    Returns
+    -------
+    Comparison
+        A structure that cannot be fitted is in it, with the reason.
+
+    Raises
+    ------
+    EstimationError
+        If there is no candidate, a structure or criterion is unknown, the hold-out does not fit the record, or no
+        candidate could be fitted.
+    """
+    if not candidates:
+        raise EstimationError("nothing to compare; name at least one structure")
+    for name, _ in candidates:
+        structure(name)
+    if second is None:
+        fold = hold_out(data, holdout)
+        fitted, other, where = fold.fitted, fold.judged, f"last {100 * holdout:.3g} % of the record"
+    else:
+        fitted, other, where = data, second, "second record"
+    found = list[Entry]()
+    for name, orders in candidates:
+        if tick is not None:
+            tick(name)
+        found.append(_entry(name, orders, fitted, other, criterion))
+    if all(x.fit is None for x in found):
+        raise EstimationError(f"none of the structures could be fitted; {found[0].structure}: {found[0].refusal}")
+    ranked = tuple(sorted(found, key=lambda x: -np.inf if x.one_step is None else x.one_step, reverse=True))
+    return Comparison(
+        entries=ranked,
+        inputs=data.inputs,
+        outputs=data.outputs,
+        fitted_samples=fitted.n_samples,
+        judged_samples=other.n_samples,
+        judged_on=where,
+        summary=_summary(ranked),
+        record=dict(data.record),
+    )
+
+
+def _entry(name: str, orders: Orders | None, fitted: IOData, other: IOData, criterion: str) -> Entry:
+    start = time.perf_counter()
+    try:
+        if orders is None:
+            orders = select(name, fitted, criterion=criterion).orders
+        fit = structure(name).estimator(fitted, orders)
+        seconds = time.perf_counter() - start
+        fit = judged(fit, fitted, second=other)
+    except EstimationError as refusal:
+        return Entry(
+            structure=name,
+            orders={} if orders is None else dict(orders),
+            fit=None,
+            one_step=None,
+            simulation=None,
+            seconds=time.perf_counter() - start,
+            refusal=str(refusal),
+        )
+    return Entry(
+        structure=name,
+        orders=fit.orders,
+        fit=fit,
+        one_step=_mean(fit, "one_step"),
+        simulation=_mean(fit, "simulation"),
+        seconds=seconds,
+    )
+
+
+def _mean(fit: BlackBoxFit, kind: str) -> float | None:
+    """Mean over the outputs of a fit on the second record; None where an output has none."""
+    values = list[float]()
+    for of in (fit.validation or {}).values():
+        part = of.get(kind) if isinstance(of, dict) else None
+        if part is None or not np.isfinite(part["fit"]):
+            return None
+        values.append(float(part["fit"]))
+    return float(np.mean(values)) if values else None
+
+
+def _summary(entries: Sequence[Entry]) -> str:
+    """Say in one line what the differences of BIC mean: twice the log of the odds (Kass and Raftery 1995)."""
+    scored = sorted((x for x in entries if x.fit is not None and "bic" in x.fit.criteria), key=_bic)
+    if len(scored) < 2:
+        return "one structure: nothing to compare"
+    gap = _bic(scored[1]) - _bic(scored[0])
+    strength = "hardly any" if gap < 2 else "some" if gap < 6 else "strong" if gap < 10 else "very strong"
+    return (
+        f"BIC of {scored[0].structure} is {gap:.3g} below that of {scored[1].structure}: {strength} evidence for it "
+        "(under 2 is chance, above 10 is clear)"
+    )
+
+
+def _bic(x: Entry) -> float:
+    return float("inf") if x.fit is None else x.fit.criteria["bic"]
