@@ -84,6 +84,8 @@ def states(F: Array, G: Array, z: Array) -> Array:
     ndarray, shape (n_samples, n)
         States before each sample.
     """
+    from ambid.identify._kernels import state_scan
+
     n = F.shape[0]
     work = np.hstack([np.zeros((z.shape[0], n)), z])
     state_scan(np.ascontiguousarray(np.hstack([F, G])), work, np.zeros(n))
@@ -109,7 +111,6 @@ def stable(model: StateSpaceModel) -> bool:
 
 def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
     """Run x+ = F x + G [u; y] from rest and add the free response that fits y best."""
-
     z = np.hstack([u - offsets.u, y - offsets.y])
     n = model.order
     out = states(F, G, z) @ model.C.T + z[:, : model.n_inputs] @ model.D.T
