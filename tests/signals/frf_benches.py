@@ -53,6 +53,20 @@ class Loop:
         return r - self.k * y, y
 
 
+def mimo_loop(r, v, gain=((0.5, 0.2), (-0.3, 0.4))):
+    """Return inputs and outputs of the plant of `mimo` under u(t) = r(t) - K y(t-1), y = plant + v."""
+    K, b = np.array(gain), np.zeros((3, 2, 2))
+    for i, row in enumerate(MIMO_B):
+        for j, c in enumerate(row):
+            b[: len(c), i, j] = c
+    u, y, free = np.zeros(r.shape), np.zeros(r.shape), np.zeros(r.shape)
+    for t in range(len(r)):
+        u[t] = r[t] - (K @ y[t - 1] if t else 0.0)
+        free[t] = sum(b[k] @ u[t - k] for k in range(min(3, t + 1))) - (MIMO_A[1] * free[t - 1] if t else 0.0)
+        y[t] = free[t] + v[t]
+    return u, y
+
+
 def inside(frf, truth, level=0.95):
     """Return the share of the entries whose confidence circle holds the truth."""
     return float(np.mean(np.abs(frf.G - truth) < frf.confidence_radius(level)))

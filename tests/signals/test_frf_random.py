@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import csd, lfilter, welch
 
 from ambid.errors import EstimationError, RecordError
-from ambid.signals import cross_spectra, frf_random
-from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, response
+from ambid.signals import cross_spectra, frequency_response, frf_random
+from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_loop, mimo_response, response
 
 
 def test_cross_spectra_are_those_of_welch():
@@ -126,3 +126,26 @@ def test_too_few_averages_are_refused():
     x = np.random.default_rng(11).standard_normal(1000)
     with pytest.raises(EstimationError, match="averages are needed"):
         frf_random(x, x, 1.0, segment=800)
+
+
+def test_total_least_squares_with_several_inputs():
+    rng = np.random.default_rng(12)
+    u = rng.standard_normal((60_000, 2)) @ np.array([[1.0, 0.5], [0.0, 0.8]])
+    y = mimo(u) + 0.2 * rng.standard_normal(u.shape)
+    noisy = u + 0.2 * rng.standard_normal(u.shape)
+    hv = frf_random(noisy, y, 1.0, segment=512, kind="hv", noise_ratio=1.0)
+    h1 = frf_random(noisy, y, 1.0, segment=512)
+    truth = mimo_response(hv.frequency_hz)
+    assert 0.93 < inside(hv, truth) < 0.975
+    assert inside(h1, truth) < 0.88
+
+
+@pytest.mark.parametrize("method", ["random", "local"])
+def test_a_loop_of_several_channels_is_opened_by_its_references(method):
+    rng = np.random.default_rng(13)
+    r = rng.standard_normal((10_000, 2))
+    u, y = mimo_loop(r, 0.3 * rng.standard_normal(r.shape))
+    options = {"segment": 256} if method == "random" else {"free": 20}
+    frf = frequency_response(u, y, 1.0, r=r, method=method, **options)
+    assert 0.925 < inside(frf, mimo_response(frf.frequency_hz)) < 0.975
+    assert "reference" in frf.method

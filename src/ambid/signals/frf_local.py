@@ -19,7 +19,7 @@ from ambid.signals._joint import FEEDBACK, checked, labels, ratio, weak_inputs
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
 
 _CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
-_WORST = 1e8  # condition of a window's columns, each scaled to length 1
+_WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,12 +238,14 @@ def _solved(columns: Complex, Z: Complex, n_x: int) -> tuple[Complex, Complex, A
     scale = np.linalg.norm(columns, axis=1)
     scale[scale == 0.0] = 1.0
     Q, R = np.linalg.qr(columns / scale[:, None, :])
-    s = np.linalg.svd(R, compute_uv=False)
-    condition = np.divide(s[:, 0], s[:, -1], out=np.full(s.shape[0], np.inf), where=s[:, -1] > 1e-14 * s[:, 0])
-    R[~np.isfinite(condition)] = np.eye(R.shape[1])  # refused afterwards, all such lines in one message
+    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
+    singular = diagonal.min(axis=1) < 1e-14 * diagonal.max(axis=1)
+    R[singular] = np.eye(R.shape[1])  # refused afterwards, all such lines in one message
+    inverse = np.linalg.inv(R)
+    condition = np.linalg.norm(R, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
     Qh = np.conj(np.swapaxes(Q, 1, 2))
-    L = np.linalg.solve(R, Qh)[:, :n_x] / scale[:, :n_x, None]
-    return L, Z - Q @ (Qh @ Z), condition
+    L = inverse[:, :n_x] @ Qh / scale[:, :n_x, None]
+    return L, Z - Q @ (Qh @ Z), np.where(singular, np.inf, condition)
 
 
 def _refuse_smooth(condition: Array, frequency: Array) -> None:

@@ -8,7 +8,6 @@ excitation leaves out show it (`Distortions`). Inputs are as noisy as outputs he
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -17,31 +16,12 @@ import numpy as np
 from ambid.errors import EstimationError
 from ambid.record.record import Array
 from ambid.signals._distortion import at_excited, detected, distortions
-from ambid.signals._joint import FEEDBACK, checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
+from ambid.signals._joint import FEEDBACK, checked, labels, right_inverse
 from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio, without_strays
+from ambid.signals._realisations import Found, Spectra, over_realisations
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
 
 _TRANSIENT = 6.0  # standard deviations that the first period may differ from the others
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Spectra:
-    """Mean spectra at lines 1, 2, … under half the rate: `Z` = [Y; U] (n_lines, n_z) and `R`; covariance of `Z`."""
-
-    Z: Complex
-    R: Complex | None
-    noise: Complex | None
-    n_periods: int
-    dropped: int
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Found:
-    G: Complex
-    noise: Complex | None
-    total: Complex | None
-    warnings: tuple[str, ...]
 
 
 def frf_periodic(
@@ -106,7 +86,7 @@ def frf_periodic(
         period = find_period(experiments[0][0] if experiments[0][2] is None else experiments[0][2])
     spectra = [_spectra(k, *e, period, drop_periods) for k, e in enumerate(experiments)]
     excited, doubts = _lines(spectra, lines, n_y, period)
-    found = _over_realisations(spectra, excited, n_y, n_u)
+    found = over_realisations(spectra, excited, n_y, n_u)
     warnings = tuple(w for s in spectra for w in s.warnings) + doubts + found.warnings
     if found.noise is None and r is None and not open_loop:
         warnings += (f"one period does not show noise at the input: {FEEDBACK}",)
@@ -156,7 +136,7 @@ def _experiments(
     return found
 
 
-def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int | str) -> _Spectra:
+def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int | str) -> Spectra:
     n = u.shape[0]
     count = n // period if period > 0 else 0
     least = 2 if drop == "auto" else int(drop) + 1
@@ -186,7 +166,7 @@ def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int
     count = used.shape[0]
     d = Z[:, :, :n_z] - mean[:, :n_z]
     noise = np.einsum("pfi,pfj->fij", d, d.conj()) / (count * (count - 1)) if count > 1 else None
-    return _Spectra(
+    return Spectra(
         Z=mean[:, :n_z],
         R=None if r is None else mean[:, n_z:],
         noise=noise,
@@ -203,9 +183,7 @@ def _transient_periods(periods: Array) -> int:
     return dropped
 
 
-def _lines(
-    spectra: list[_Spectra], lines: Sequence[int] | None, n_y: int, period: int
-) -> tuple[Lines, tuple[str, ...]]:
+def _lines(spectra: list[Spectra], lines: Sequence[int] | None, n_y: int, period: int) -> tuple[Lines, tuple[str, ...]]:
     last = (period - 1) // 2
     if lines is not None:
         numbers = np.unique(np.asarray(lines, dtype=np.intp))
@@ -228,64 +206,8 @@ def _lines(
     return excited, doubts
 
 
-def _over_realisations(spectra: list[_Spectra], excited: Lines, n_y: int, n_u: int) -> _Found:
-    """Return G over all realisations: averaged as ratios, or with a reference as responses to it."""
-    groups = [spectra[m : m + n_u] for m in range(0, len(spectra), n_u)]
-    Z = np.stack([np.stack([s.Z[excited] for s in g], axis=2) for g in groups])
-    C = None if any(s.noise is None for s in spectra) else np.stack([_block_noise(g, excited) for g in groups])
-    R = [s.R[excited] for s in spectra if s.R is not None]
-    if not R:
-        return _mean_of_ratios(Z, C, n_y)
-    return _ratio_of_means(Z, C, np.stack(R).reshape(len(groups), n_u, *R[0].shape).transpose(0, 2, 3, 1), n_y)
-
-
-def _mean_of_ratios(Z: Complex, C: Complex | None, n_y: int) -> _Found:
-    M, n_f = Z.shape[:2]
-    each = [ratio_map(z, n_y) for z in Z]
-    G = np.stack([g for g, _ in each])
-    weak: list[str] = []
-    noise = None
-    if C is not None:
-        noise = np.sum([transformed(c, T) for c, (_, T) in zip(C, each, strict=True)], axis=0) / M**2
-        weak = [w for z, c in zip(Z, C, strict=True) for w in weak_inputs(z, c, n_y)]
-    total = scatter(G.reshape(M, n_f, -1)) / M if M > 1 else None
-    return _Found(G=G.mean(axis=0), noise=noise, total=total, warnings=tuple(weak[:1]))
-
-
-def _ratio_of_means(Z: Complex, C: Complex | None, R: Complex, n_y: int) -> _Found:
-    """Return the ratio of the mean responses Z R⁻¹ to the reference; `Z` (M, n_f, n_z, n_u), `R` (M, n_f, n_u, n_u)."""
-    M, n_f, n_z, n_u = Z.shape
-    inverse = np.stack([right_inverse(x) for x in R])
-    responses = Z @ inverse
-    mean = responses.mean(axis=0)
-    G, T = ratio_map(mean, n_y)
-    of_noise = None
-    if C is not None:
-        by_r = np.eye(n_z)[:, None, :, None] * np.swapaxes(inverse, 2, 3)[:, :, None, :, None, :]
-        of_noise = transformed(C, by_r.reshape(M, n_f, n_z * n_u, n_z * n_u)).sum(axis=0) / M**2
-    of_all = scatter(responses.reshape(M, n_f, -1)) / M if M > 1 else None
-    known = of_noise if of_all is None else of_all
-    return _Found(
-        G=G,
-        noise=None if of_noise is None else transformed(of_noise, T),
-        total=None if of_all is None else transformed(of_all, T),
-        warnings=() if known is None else weak_inputs(mean, known, n_y),
-    )
-
-
-def _block_noise(group: list[_Spectra], excited: Lines) -> Complex:
-    """Return the covariance of vec(Z), Z (n_z, n_u) with a column of each experiment: noise is independent between."""
-    n_u = len(group)
-    C = [s.noise[excited] for s in group if s.noise is not None]
-    n_f, n_z = C[0].shape[:2]
-    blocks = np.zeros((n_f, n_z, n_u, n_z, n_u), dtype=complex)
-    for e, c in enumerate(C):
-        blocks[:, :, e, :, e] = c
-    return blocks.reshape(n_f, n_z * n_u, n_z * n_u)
-
-
 def _total(
-    spectra: list[_Spectra], excited: Lines, found: _Found, spacing: float, n_u: int, details: dict[str, object]
+    spectra: list[Spectra], excited: Lines, found: Found, spacing: float, n_u: int, details: dict[str, object]
 ) -> tuple[Complex, Array | float, tuple[str, ...]]:
     """Return the total covariance, its degrees of freedom and warnings; enter the distortion levels in `details`."""
     M = len(spectra) // n_u
