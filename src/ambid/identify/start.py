@@ -1,18 +1,20 @@
 """Start values found without the user's help: weak-form regression over frequency bands.
 
-Each equation of motion is multiplied by Fourier modulating functions phi_k(t) = w(t) exp(-j w_k t), with a window w
-that vanishes with three derivatives at both ends, and integrated by parts, so that no measured signal is differentiated
-(theory.md sec. 2.7, thesis eq. 3.8; Shinbrot 1957). All moments come from a few FFTs. Each band gives a candidate; the
+Each equation of motion is integrated against Fourier modulating functions (`ambid.identify.modulating`;
+theory.md sec. 2.7, thesis eq. 3.8), so that no measured signal is differentiated. Each band gives a candidate; the
 likelihood chooses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ambid.identify.modulating import Moments, moments
+
+__all__ = ["Moments", "candidates", "moments", "regress"]
 
 Array = NDArray[np.float64]
 Spectrum = NDArray[np.complexfloating]
@@ -30,53 +32,6 @@ _BANDS = (
     (0.01, False),
 )
 _LOWEST_LINE = 3  # the window's main lobe: lines below see the constant
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Moments:
-    """Spectra of the signals and of their first and second derivatives, by modulating functions.
-
-    Attributes
-    ----------
-    omega : ndarray, shape (n_lines,), rad/s
-    signals : Mapping[str, tuple of ndarray]
-        Role -> (value, first derivative, second derivative), each (n_lines,), complex.
-    """
-
-    omega: Array
-    signals: Mapping[str, tuple[Spectrum, Spectrum, Spectrum]]
-
-
-def moments(signals: Mapping[str, Array], held: tuple[str, ...], rate_hz: float) -> Moments:
-    """Take the modulating-function moments of all signals.
-
-    Parameters
-    ----------
-    signals : Mapping[str, ndarray]
-        Role -> samples, shape (n_samples,), SI, deviations from the operating point.
-    held : tuple of str
-        Roles that are held over a sample (inputs); the hold's amplitude and half-sample lag are taken into account.
-    rate_hz : float
-
-    Returns
-    -------
-    Moments
-    """
-    n = len(next(iter(signals.values())))
-    period, length = 1.0 / rate_hz, n / rate_hz
-    t = np.arange(n) / n
-    w = (3 - 4 * np.cos(2 * np.pi * t) + np.cos(4 * np.pi * t)) / 8
-    w1 = (8 * np.pi * np.sin(2 * np.pi * t) - 4 * np.pi * np.sin(4 * np.pi * t)) / (8 * length)
-    w2 = (16 * np.pi**2 * np.cos(2 * np.pi * t) - 16 * np.pi**2 * np.cos(4 * np.pi * t)) / (8 * length**2)
-    omega = 2 * np.pi * np.fft.rfftfreq(n, period)
-    jw = 1j * omega
-    result = {}
-    for role, x in signals.items():
-        m0, m1, m2 = np.fft.rfft(w * x), np.fft.rfft(w1 * x), np.fft.rfft(w2 * x)
-        value = m0 * np.sinc(omega * period / (2 * np.pi)) * np.exp(-0.5j * omega * period) if role in held else m0
-        # integration by parts: int phi x' = -int phi' x with phi' = (w' - jw w) e, and again for x''
-        result[role] = (value, jw * m0 - m1, m2 - 2 * jw * m1 - omega**2 * m0)
-    return Moments(omega=np.asarray(omega, dtype=np.float64), signals=result)
 
 
 def candidates(

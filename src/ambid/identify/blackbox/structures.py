@@ -109,6 +109,15 @@ STRUCTURES: Mapping[str, Structure] = {
         _subspace("moesp", "biased", "the same, past without future inputs"),
         _subspace("cva", "biased", "the same, canonical variates"),
         _subspace("pbsid", "consistent", "the same from a long autoregression: feedback does not disturb it"),
+        Structure(
+            name="weakform",
+            summary="y = B(s)/F(s) u + white noise, continuous time, by test functions",
+            orders=("nb", "nf", "nk"),
+            home="ambid.identify.weakform:weakform",
+            inputs=True,
+            feedback="biased",
+            kind="transfer function",
+        ),
     )
 }
 

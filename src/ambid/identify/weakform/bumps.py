@@ -1,0 +1,136 @@
+"""Compact test functions phi(t) = (1 - (t/h)^2)^p, and their integrals as sums over samples (thesis eq. 3.8).
+
+They vanish with p - 1 derivatives at both ends, so that the trapezoidal rule is exact to that order and integration by
+parts leaves no boundary terms: int phi y^(k) dt = (-1)^k int phi^(k) y dt (Messenger and Bortz 2021).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_OVERLAP = 5  # rows on half a support: closer ones say the same again, wider ones leave something out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bump:
+    """One test function, set at many centres.
+
+    Attributes
+    ----------
+    half : int
+        Half of its support in samples.
+    degree : int
+        p.
+    dt : float, s
+    """
+
+    half: int
+    degree: int
+    dt: float
+
+    @property
+    def hop(self) -> int:
+        """Samples between neighbouring centres."""
+        return max(1, self.half // _OVERLAP)
+
+    def centres(self, n_samples: int, lead: int) -> NDArray[np.int64]:
+        """Return the samples at which the function is centred.
+
+        Parameters
+        ----------
+        n_samples : int
+        lead : int
+            Samples at the beginning that are to be left out.
+
+        Returns
+        -------
+        ndarray, shape (n_rows,)
+        """
+        return np.arange(self.half + lead, n_samples - self.half, self.hop)
+
+    def kernel(self, order: int) -> Array:
+        """Return the weights of samples -half to half in (-1)^k int phi^(k) y dt.
+
+        Parameters
+        ----------
+        order : int
+            k.
+
+        Returns
+        -------
+        ndarray, shape (2 half + 1,)
+        """
+        tau = np.arange(-self.half, self.half + 1) / self.half
+        scale = (-1.0 / (self.half * self.dt)) ** order * self.dt
+        return np.asarray(_bump(self.degree).deriv(order)(tau) * scale)
+
+    def held_kernel(self, order: int, fraction: float) -> Array:
+        """Return the weights of values that are held over a sample, exact, for offsets -half - 1 to half.
+
+        Parameters
+        ----------
+        order : int
+            k.
+        fraction : float
+            Part of a sample by which the values come late, 0 to 1.
+
+        Returns
+        -------
+        ndarray, shape (2 half + 2,)
+        """
+        whole = _bump(self.degree).integ() if order == 0 else _bump(self.degree).deriv(order - 1)
+        edges = np.clip((np.arange(-self.half - 1, self.half + 2) + fraction) / self.half, -1.0, 1.0)
+        scale = (-1.0) ** order * (self.half * self.dt) ** (1 - order)
+        return np.asarray(np.diff(whole(edges)) * scale)
+
+
+def moments_at(x: Array, kernel: Array, last: int, centres: NDArray[np.int64]) -> Array:
+    """Return sums of x[c + o] kernel[o] at centres c.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,)
+    kernel : ndarray, shape (n_offsets,)
+        For offsets up to `last`.
+    last : int
+    centres : ndarray, shape (n_rows,)
+
+    Returns
+    -------
+    ndarray, shape (n_rows,)
+    """
+    from scipy.signal import oaconvolve
+
+    return np.asarray(oaconvolve(x, kernel[::-1])[centres + last])
+
+
+def spread_out(q: Array, kernel: Array, centres: NDArray[np.int64], n_samples: int) -> Array:
+    """Return the adjoint of `moments_at` for a symmetric range of offsets: sum over centres of q kernel[t - c].
+
+    Parameters
+    ----------
+    q : ndarray, shape (n_rows,)
+    kernel : ndarray, shape (2 half + 1,)
+    centres : ndarray, shape (n_rows,)
+    n_samples : int
+
+    Returns
+    -------
+    ndarray, shape (n_samples,)
+    """
+    from scipy.signal import oaconvolve
+
+    comb = np.zeros(n_samples)
+    comb[centres] = q
+    half = kernel.size // 2
+    return np.asarray(oaconvolve(comb, kernel)[half : half + n_samples])
+
+
+def _bump(degree: int) -> Polynomial:
+    return Polynomial([1.0, 0.0, -1.0]) ** degree
