@@ -92,6 +92,9 @@ class Lines:
     def verdict(self, cost: float, n_estimated: int, n_extra: int = 0) -> Check:
         """Compare a cost with what noise alone would leave.
 
+        Periods that are short beside the memory of the noise make its scatter, and so the standard deviations, a
+        little too large: the cost then comes out under its expectation.
+
         Parameters
         ----------
         cost : float

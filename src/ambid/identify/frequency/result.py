@@ -29,6 +29,7 @@ def made_from_lines(
     n_estimated: int,
     offsets: Offsets,
     converged: bool = True,
+    best: bool = True,
     details: Mapping[str, object] | None = None,
     warnings: Sequence[str] = (),
 ) -> BlackBoxFit:
@@ -51,6 +52,8 @@ def made_from_lines(
     n_estimated : int
     offsets : Offsets
     converged : bool
+    best : bool
+        Whether the model is where the cost is least, so that the cost can be judged.
     details : Mapping[str, object], optional
     warnings : sequence of str
 
@@ -73,7 +76,8 @@ def made_from_lines(
     if not converged:
         found.insert(0, "the search did not converge: treat the numbers as a first guess")
     if not check.passed:
-        found.insert(0, f"{name}: {check.detail}; standard deviations hold for noise alone")
+        say = "standard deviations hold for noise alone" if best else "or only the start of a search: refine it"
+        found.insert(0, f"{name}: {check.detail}; {say}")
     return BlackBoxFit(
         structure=name,
         orders=dict(orders),

@@ -128,6 +128,7 @@ def frf_subspace(
         n_estimated=n_estimated,
         offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
         converged=converged,
+        best=refine,
         warnings=warnings,
         details={
             "p": best.p,
