@@ -149,3 +149,28 @@ def test_a_loop_of_several_channels_is_opened_by_its_references(method):
     frf = frequency_response(u, y, 1.0, r=r, method=method, **options)
     assert 0.925 < inside(frf, mimo_response(frf.frequency_hz)) < 0.975
     assert "reference" in frf.method
+
+
+def test_leakage_of_short_segments_is_told():
+    rng = np.random.default_rng(14)
+    pole = np.exp((-0.01 + 1j) * 0.6)
+    resonant = ([0.0, 0.1], np.poly([pole, pole.conj()]).real)
+
+    def told(plant, segment):
+        u = rng.standard_normal(16384)
+        y = lfilter(*plant, u) + 0.05 * rng.standard_normal(u.size)
+        return any("leakage" in w for w in frf_random(u, y, 1.0, segment=segment).warnings)
+
+    assert sum(told(resonant, 128) for _ in range(10)) == 10
+    assert sum(told(resonant, 4096) for _ in range(10)) == 0
+    assert sum(told((B, A), 512) for _ in range(10)) == 0
+
+
+def test_options_that_contradict_each_other_are_refused():
+    x = np.random.default_rng(15).standard_normal((2000, 2))
+    with pytest.raises(EstimationError, match="takes its place"):
+        frf_random(x[:, 0], x[:, 1], 1.0, r=x[:, 0], kind="hv")
+    with pytest.raises(EstimationError, match="noise_ratio"):
+        frf_random(x[:, 0], x[:, 1], 1.0, noise_ratio=1.0)
+    with pytest.raises(EstimationError, match="kind 'h3'"):
+        frf_random(x[:, 0], x[:, 1], 1.0, kind="h3")

@@ -1,7 +1,8 @@
 """Frequency response from noise-like excitation, by averaged spectra.
 
 G = S_yu S_uu⁻¹ (H1: noise at the output), S_yy S_uy⁻¹ (H2: at the input), total least squares (Hv: at both), or
-S_yr S_ur⁻¹ with a reference, which feedback does not bias. Leakage, of order 1/segment, is not in the variance.
+S_yr S_ur⁻¹ with a reference, which feedback does not bias. Leakage of short segments is not in the variance: it is
+looked for by halving them.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ambid.signals.spectra import CrossSpectra, cross_spectra
 
 Kind = Literal["h1", "h2", "hv"]
 _Found = tuple[Complex, Complex, Array, str]  # G, covariance, coherence, method
+_LEAKAGE_FROM = 32  # shortest segment that is compared with its half
 _EDGE = 2  # lines at 0 and at half the rate whose window reaches over the end, where errors are not circular
 
 
@@ -83,30 +85,29 @@ def frf_random(
     Raises
     ------
     EstimationError
-        If there are too few segments, or inputs cannot be told apart.
+        If there are too few segments, options contradict each other, or inputs cannot be told apart.
+    RecordError
+        If the segment does not fit the record.
     """
     u, y, r = checked(u, y, r, rate_hz)
-    spectra = cross_spectra(
-        np.concatenate([y, u] if r is None else [y, u, r], axis=1),
-        rate_hz,
-        segment=segment,
-        overlap=overlap,
-        window=window,
-    )
+    _options_agree(kind, noise_ratio, r is not None)
+    z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
+    spectra = cross_spectra(z, rate_hz, segment=segment, overlap=overlap, window=window)
     n_y, n_u, n_x = y.shape[1], u.shape[1], (u if r is None else r).shape[1]
     if spectra.n_effective <= n_x + 1 or spectra.frequency_hz.size < 2 * _EDGE + 2:
         raise EstimationError(
             f"{spectra.n_segments} segments, worth {spectra.n_effective:.1f} averages, with {n_x} inputs or "
             f"references; more than {n_x + 1} averages are needed. Use a longer record, or shorter segments"
         )
-    S = spectra.density[_EDGE:-_EDGE]
+    found, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
     if r is None:
-        found = _by_kind(S, n_y, n_u, kind, spectra.n_effective, noise_ratio)
-        warnings: tuple[str, ...] = () if open_loop else (f"{kind.upper()}: {FEEDBACK}",)
+        warnings += () if open_loop else (f"{kind.upper()}: {FEEDBACK}",)
         if kind == "hv" and noise_ratio is None:
             warnings += ("Hv takes the noise for the same share of input and output at every line. Give noise_ratio",)
-    else:
-        found, warnings = _with_reference(S, n_y, n_u, spectra.n_effective)
+    length = round(rate_hz / spectra.frequency_hz[1])
+    if length % 2 == 0 and length >= _LEAKAGE_FROM:
+        half = cross_spectra(z, rate_hz, segment=length // 2, overlap=overlap, window=window)
+        warnings += _leakage(found, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
     G, covariance, coherence, method = found
     return FrequencyResponse(
         frequency_hz=spectra.frequency_hz[_EDGE:-_EDGE],
@@ -123,6 +124,47 @@ def frf_random(
         lines_per_independent=spectra.lines_per_independent,
         warnings=warnings,
         details=MappingProxyType(_details(spectra, rate_hz)),
+    )
+
+
+def _options_agree(kind: str, noise_ratio: float | None, reference: bool) -> None:
+    if kind not in ("h1", "h2", "hv"):
+        raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
+    if reference and kind != "h1":
+        raise EstimationError(f"kind {kind!r} with a reference, which takes its place. Leave out one of the two")
+    if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
+        raise EstimationError(
+            f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
+        )
+
+
+def _found(
+    spectra: CrossSpectra, n_y: int, n_u: int, kind: str, noise_ratio: float | None
+) -> tuple[_Found, tuple[str, ...]]:
+    S, n = spectra.density[_EDGE:-_EDGE], spectra.n_effective
+    if S.shape[1] > n_y + n_u:
+        return _with_reference(S, n_y, n_u, n)
+    return _by_kind(S, n_y, n_u, kind, n, noise_ratio), ()
+
+
+def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
+    """Return a warning where segments half as long, whose leakage is twice or more, give another response.
+
+    Both share their data, so that without leakage the difference is well under what the sum of variances allows
+    (a quarter of it on average for a Hann window).
+    """
+    k = 2 * np.arange(half[0].shape[0]) + _EDGE  # line i + 2 of half the length is line 2(i + 2) of the full one
+    apart = np.abs(full[0][k] - half[0]) ** 2
+    variance = [np.real(np.diagonal(c, axis1=1, axis2=2)).reshape(apart.shape) for c in (full[1][k], half[1])]
+    share = apart / np.maximum(variance[0] + variance[1], np.finfo(float).tiny)
+    # quantile of the F distribution with 2 and ν degrees of freedom, one false alarm in 1000 over all entries
+    limit = 0.5 * nu * np.expm1(np.log(1e3 * share.size) * 2.0 / nu)
+    if np.max(share) <= limit and np.mean(share) <= 0.6:
+        return ()
+    worst = float(np.sqrt(np.max(share)))
+    return (
+        f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which is "
+        "not in the variance. Give longer segments, or use frf_local",
     )
 
 
@@ -156,9 +198,7 @@ def _by_kind(S: Complex, n_y: int, n_u: int, kind: str, n: float, noise_ratio: f
         joint = np.zeros((S.shape[0], n_z * n_y, n_z * n_y), dtype=complex)
         joint[:, n_y * n_y :, n_y * n_y :] = C
         return (*ratio(Z, joint, n_y), coherence, "H2 (Welch)")
-    if kind == "hv":
-        return (*_total_least_squares(S_yy, S_yu, S_uu, n, noise_ratio), coherence, "Hv (Welch)")
-    raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'")
+    return (*_total_least_squares(S_yy, S_yu, S_uu, n, noise_ratio), coherence, "Hv (Welch)")
 
 
 def _regressed(S_zz: Complex, S_zx: Complex, S_xx: Complex, n: float) -> tuple[Complex, Complex, Complex]:
