@@ -8,8 +8,9 @@ import typer
 
 
 def command() -> None:
-    """List the models with their parameters and units, the excitations and the preset benches."""
+    """List models with their parameters and units, black-box structures, excitations and preset benches."""
     from ambid.cli.terminal import painter
+    from ambid.identify.blackbox.structures import STRUCTURES
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
@@ -28,6 +29,12 @@ def command() -> None:
             for p in of.parameters
         ]
         typer.echo("\n".join(columns(rows)) + "\n")
+    typer.echo(f"{paint('structures', 'strong')}  black-box models for 'ambid fit'; * is biased under feedback")
+    left = columns([(f"  {x.name}{'*' * (x.feedback == 'biased')}", " ".join(x.orders)) for x in STRUCTURES.values()])
+    wide = max(map(len, left)) + 2
+    for start, x in zip(left, STRUCTURES.values(), strict=True):
+        typer.echo(textwrap.fill(x.summary, 80, initial_indent=start.ljust(wide), subsequent_indent=" " * wide))
+    typer.echo()
     typer.echo(f"{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
     typer.echo(f"{paint('presets', 'strong')}  benches for 'ambid simulate'")
     wide = max(len(name) for name in preset_names())

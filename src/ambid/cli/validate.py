@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as json_format
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,7 @@ from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError, EstimationError
 
 if TYPE_CHECKING:
+    from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.estimate import Estimate
     from ambid.rig import Rig
 
@@ -21,7 +22,11 @@ if TYPE_CHECKING:
 def command(
     estimate: Annotated[
         Path,
-        typer.Argument(metavar="ESTIMATE.json", help="What 'ambid identify --json' wrote.", show_default=False),
+        typer.Argument(
+            metavar="ESTIMATE.json",
+            help="What 'ambid identify --json' or 'ambid fit --json' wrote.",
+            show_default=False,
+        ),
     ],
     record: RecordFile,
     rig: RigFile = None,
@@ -36,18 +41,22 @@ def command(
 
     Without --rig: the record is read as the one that the estimate came from.
     """
-    from ambid.job import load, signals_of
-    from ambid.physics.models import model
-    from ambid.report.text import validation_lines
-    from ambid.validate.second_record import validation
+    from ambid.identify.blackbox.fit import BlackBoxFit
 
     with Outputs(estimate, record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
         known = read_estimate(estimate)
-        bench = _rig_of(known, estimate, rig)
         with progress("validate"):
-            used = load(record, bench, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
-            found = validation(known, signals_of(used, model(known.model)))
+            if isinstance(known, BlackBoxFit):
+                if rig is not None:
+                    raise EstimationError(f"{estimate.name} is a black-box fit, which knows no rig. Leave --rig out")
+                found, lines = _judged_fit(known, record, (from_s, to_s), rate, gaps)
+                model, passed = known.structure, True
+            else:
+                found, lines = _judged_estimate(
+                    known, record, _rig_of(known, estimate, rig), (from_s, to_s), rate, gaps
+                )
+                model, passed = f"model {known.model}", bool(found["passed"])
         document = {"schema": "ambid.validation/1", "estimate": estimate.name, "record": record.name, **found}
         text = json_format.dumps(document, indent=1, allow_nan=False) + "\n"
         if (path := json_path(json)) is not None:
@@ -56,29 +65,59 @@ def command(
         typer.echo(text, nl=False)
     else:
         paint = painter()
-        typer.echo(f"{paint(record.name, 'strong')} judged with {estimate.name}, model {known.model}\n")
-        typer.echo("\n".join(validation_lines(found, paint=paint)))
-    if strict and not found["passed"]:
+        typer.echo(f"{paint(record.name, 'strong')} judged with {estimate.name}, {model}\n")
+        typer.echo("\n".join(lines))
+    if strict and not passed:
         raise typer.Exit(FAILED_CHECK)
 
 
-def read_estimate(path: Path) -> Estimate:
-    """Read an estimate from its file.
+Part = tuple[float | None, float | None]
+
+
+def _judged_estimate(
+    known: Estimate, record: Path, bench: Rig, part: Part, rate: float | None, gaps: str | None
+) -> tuple[dict[str, Any], list[str]]:
+    from ambid.job import load, signals_of
+    from ambid.physics.models import model
+    from ambid.report.text import validation_lines
+    from ambid.validate.second_record import validation
+
+    used = load(record, bench, from_s=part[0], to_s=part[1], rate_hz=rate, gaps=gaps)
+    found = dict(validation(known, signals_of(used, model(known.model))))
+    return found, validation_lines(found, paint=painter())
+
+
+def _judged_fit(
+    known: BlackBoxFit, record: Path, part: Part, rate: float | None, gaps: str | None
+) -> tuple[dict[str, Any], list[str]]:
+    from ambid.identify.json_values import plain_json
+    from ambid.job import read_data
+    from ambid.report.fit_text import validation_lines
+    from ambid.validate.blackbox.judge import validation
+
+    data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)
+    found = validation(known, data)
+    return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
+
+
+def read_estimate(path: Path) -> Estimate | BlackBoxFit:
+    """Read an estimate or a black-box fit from its file.
 
     Parameters
     ----------
     path : Path
-        JSON, schema ``ambid.estimate/1``.
+        JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
 
     Returns
     -------
-    Estimate
+    Estimate or BlackBoxFit
 
     Raises
     ------
     EstimationError
         If the file cannot be read, is no JSON or no estimate.
     """
+    from ambid.identify.blackbox.fit_file import SCHEMA, fit_from_json
     from ambid.identify.estimate_file import estimate_from_json
     from ambid.record.files import file_bytes, utf8_text
 
@@ -94,6 +133,8 @@ def read_estimate(path: Path) -> Estimate:
             f"estimate {path} is nested too deep, or holds a number that is too long. "
             "Give what 'ambid identify --json' wrote"
         ) from None
+    if isinstance(document, dict) and document.get("schema") == SCHEMA:
+        return fit_from_json(document, f"fit {path}")
     return estimate_from_json(document, f"estimate {path}")
 
 

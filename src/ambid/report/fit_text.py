@@ -38,7 +38,7 @@ def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> s
         coefficient_lines(fit),
         pole_lines(fit, paint=paint),
         columns(_fit_rows(fit)),
-        [] if fit.validation is None else _validation_lines(fit.validation, paint),
+        [] if fit.validation is None else [paint("on the second record", "strong"), *validation_lines(fit.validation)],
         _criteria_lines(fit, width),
         check_lines(fit.checks, width=width, paint=paint),
         _warning_lines(fit, width, paint),
@@ -143,12 +143,23 @@ def _simulation(fit: float | None) -> str:
     return "none (unstable, or no input)" if fit is None else f"{fit:.4f}"
 
 
-def _validation_lines(validation: Mapping[str, Any], paint: Paint) -> list[str]:
+def validation_lines(validation: Mapping[str, Any]) -> list[str]:
+    """Write how a fit does on a second record.
+
+    Parameters
+    ----------
+    validation : Mapping[str, object]
+        By output, as `ambid.validate.blackbox.validation` gives it.
+
+    Returns
+    -------
+    list of str
+        A header and a line for each output; errors in SI.
+    """
     rows = [("fit", "one step", "rmse", "simulation", "rmse")]
     for output, found in validation.items():
-        one, simulated = found["one_step"], found.get("simulation")
-        rows.append((output, *_pair(one), *_pair(simulated)))
-    return [paint("on the second record", "strong"), *columns(rows)]
+        rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
+    return columns(rows)
 
 
 def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
