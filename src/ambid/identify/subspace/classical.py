@@ -112,23 +112,6 @@ def projected(factor: Array, weighting: Weighting, *, past: int, future: int, li
     )
 
 
-def canonical_states(projection: Projection) -> Array:
-    """Return the states that say most of the future, best first: what orders are compared on, whatever the weighting.
-
-    Parameters
-    ----------
-    projection : Projection
-
-    Returns
-    -------
-    ndarray, shape (n_states, n_past)
-        Coordinates of the past without future inputs (Larimore 1990).
-    """
-    k1 = projection.inputs.shape[0]
-    weight, _ = _canonical(projection.outputs[k1:])
-    return np.asarray(np.linalg.svd(weight @ projection.outputs[k1 : k1 + projection.past].T, full_matrices=False)[2])
-
-
 def _canonical(future: Array) -> tuple[Array, Array]:
     """Return the weight that makes the future white, and its inverse; directions that are not there are left out."""
     _, size, vectors = np.linalg.svd(future, full_matrices=False)

@@ -12,7 +12,7 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
-from ambid.identify.subspace.classical import Projection, canonical_states, classical_columns, projected, realised
+from ambid.identify.subspace.classical import Projection, classical_columns, projected, realised
 from ambid.identify.subspace.compress import each_left_out, triangular
 from ambid.identify.subspace.jackknife import jackknife
 from ambid.identify.subspace.order import state_criterion
@@ -60,12 +60,11 @@ def fitted(
     """
     with one_thread():
         plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
-        given, found = decomposition(plan)
-        criterion = order_criterion(plan, found)
-        n = plan.n or max(1, int(np.argmin(criterion[: plan.n_max + 1])))
+        criterion = None if plan.n else order_criterion(plan)
+        n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
         if method != "pbsid" and horizon is None:
             plan = _with_horizons(plan, n, keep_past=past is not None)
-            given, found = decomposition(plan)
+        given, found = decomposition(plan)
         if n > found.values.size:
             raise EstimationError(
                 f"{method}: the record shows {found.values.size} states, not {n}. Lower n, or excite the plant more"
@@ -164,25 +163,25 @@ def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
     return realised(found, n, feedthrough=plan.feedthrough)
 
 
-def order_criterion(plan: Plan, found: Projection | Prediction) -> Array:
-    """Return Bayes' criterion for 0, 1, 2 ... states.
+def order_criterion(plan: Plan) -> Array:
+    """Return Bayes' criterion for 0, 1, 2 ... states, for every method from the autoregression's states.
+
+    Their order is that of their use for prediction, under feedback too, which oblique projections do not give.
 
     Parameters
     ----------
     plan : Plan
-    found : Projection or Prediction
 
     Returns
     -------
     ndarray, shape (n_states + 1,)
     """
-    n_u, n_y = plan.factors.n_inputs, plan.factors.n_outputs
-    most = min(plan.n_max, found.values.size)
-    if isinstance(found, Prediction):
-        states, y = found.state[:most], found.y
-    else:
-        states, y = canonical_states(found)[:most], found.outputs[found.inputs.shape[0] :, :n_y].T
-    return state_criterion(states, y, n_u, plan.factors.n_rows)
+    past = plan.past if plan.method == "pbsid" else min(max(plan.autoregression, plan.past), plan.factors.length - 1)
+    future = max(min(past, plan.future), -(-plan.n_max // plan.factors.n_outputs))
+    states = decomposition(replace(plan, method="pbsid", past=past, future=min(future, past)))[1]
+    assert isinstance(states, Prediction)
+    most = min(plan.n_max, states.values.size)
+    return state_criterion(states.state[:most], states.y, plan.factors.n_inputs, plan.factors.n_rows)
 
 
 def _result(
@@ -192,7 +191,7 @@ def _result(
     found: Projection | Prediction,
     full: Realisation,
     covariance: Array | None,
-    criterion: Array,
+    criterion: Array | None,
 ) -> BlackBoxFit:
     """Give the numbers their units and say what has to be said of them."""
     core, scale = with_units(full, plan.channels, data.dt)
@@ -222,7 +221,7 @@ def _result(
         details={
             "singular_values": found.values.tolist(),
             "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
-            "order_criterion": criterion.tolist(),
+            "order_criterion": None if criterion is None else criterion.tolist(),
             "feedthrough": plan.feedthrough,
             "Q": full.Q.tolist(),
             "S": (full.S * y).tolist(),

@@ -91,9 +91,9 @@ def subspace_models(
             method, data, {"nk": nk}, horizon=horizon, past=past, feedthrough=feedthrough, n_max=n_max, tick=tick
         )
         _, found = decomposition(plan)
-        criterion = order_criterion(plan, found)
+        criterion = order_criterion(plan)
         out = []
-        for n in range(1, min(plan.n_max, found.values.size) + 1):
+        for n in range(1, min(plan.n_max, found.values.size, criterion.size - 1) + 1):
             scaled = model_of(plan, found, n)
             model, _ = with_units(scaled, plan.channels, data.dt)
             scale = plan.channels.scale_y

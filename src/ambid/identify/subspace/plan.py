@@ -21,7 +21,7 @@ Orders = Mapping[str, int | str | tuple[int, ...]]
 _GROUPS = 20  # of time, for the jackknife: its standard deviations are good to 1 / sqrt(2 * 19)
 _AUTO_MAX = 10  # largest order tried where none is given
 _LONGEST = {"n4sid": 20, "moesp": 20, "cva": 20, "pbsid": 60}  # samples of past
-_WIDEST = {"n4sid": 100, "moesp": 100, "cva": 100, "pbsid": 160}  # columns of past
+_WIDEST = {"n4sid": 100, "moesp": 100, "cva": 100, "pbsid": 240}  # columns of past
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,6 +44,8 @@ class Plan:
     factors : Factors
     total : ndarray, shape (n_columns, n_columns)
         All groups together.
+    autoregression : int
+        Lags that an autoregression wants, and half as many again.
     past_limited : bool
         Whether the criterion wanted a longer past than was tried.
     """
@@ -58,6 +60,7 @@ class Plan:
     channels: Channels
     factors: Factors
     total: Array
+    autoregression: int
     past_limited: bool
 
 
@@ -108,7 +111,7 @@ def planned(
         tick()
     total = merged(factors.groups)
     criterion = autoregression_criterion(factors, total)
-    wanted = int(np.argmin(criterion))
+    wanted = wanted_lags = int(np.argmin(criterion))
     least = _shortest(data, largest, bool(n or n_max))
     if method == "pbsid":  # the prior makes a long past cheap, and a short one is what leaves bias
         least, wanted = max(least, 20), wanted + wanted // 2
@@ -128,7 +131,8 @@ def planned(
         channels=given,
         factors=factors,
         total=total,
-        past_limited=past is None and wanted >= length - 1,
+        autoregression=max(20, wanted_lags + wanted_lags // 2),
+        past_limited=past is None and wanted_lags >= length - 1,
     )
 
 
