@@ -75,7 +75,7 @@ def fitted(
             if tick is not None:
                 tick()
             others.append(model_of(plan, _decomposed(plan, factor, given), n))
-        covariance = jackknife(full, others, plan.future)
+        covariance = jackknife(full, others, plan.future, with_bias=method != "pbsid")
     return _result(method, data, plan, found, full, covariance, criterion)
 
 

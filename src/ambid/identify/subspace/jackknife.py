@@ -1,10 +1,11 @@
 """Covariance of a state-space estimate by leaving out one group of time after another.
 
 Solves: cov(theta) = (G-1)/G sum_g (theta_g - mean)(theta_g - mean)' + b b', with theta_g the estimate without group g
-and b = (G-1)(mean - theta) the bias that shows when data are left out: large only where the record is short. States
-have no natural basis: each estimate is first turned into the basis of the full one through the observability matrices,
-which fixes the gauge, so that spreads of poles and responses follow by the delta method (delete-a-group jackknife;
-Shao and Tu 1995, ch. 2). Residuals count as they are: correlated, of changing size, of a model that is too small.
+and b = (G-1)(mean - theta) the bias that shows when data are left out: what oblique projections owe to short records.
+A regression with a prior gets no b: fewer data only make its prior weigh more. States have no natural basis: each
+estimate is first turned into the basis of the full one through the observability matrices, which fixes the gauge, so
+that spreads of poles and responses follow by the delta method (delete-a-group jackknife; Shao and Tu 1995, ch. 2).
+Residuals count as they are: correlated, of changing size, of a model that is too small.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def aligned(one: Realisation, like: Realisation, length: int) -> Realisation:
     )
 
 
-def jackknife(full: Realisation, others: Sequence[Realisation], length: int) -> Array | None:
+def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, with_bias: bool) -> Array | None:
     """Return the covariance of vec(A, B, C, D, K), each row by row.
 
     Parameters
@@ -60,6 +61,8 @@ def jackknife(full: Realisation, others: Sequence[Realisation], length: int) -> 
         Each without one group.
     length : int
         Block rows of the observability matrices that are compared.
+    with_bias : bool
+        Whether to add the square of the bias that leaving out data shows.
 
     Returns
     -------
@@ -78,8 +81,11 @@ def jackknife(full: Realisation, others: Sequence[Realisation], length: int) -> 
         return None
     deviations = values - values.mean(0)
     groups = values.shape[0]
-    bias = (groups - 1) * (values.mean(0) - theta(full))
-    return np.asarray((groups - 1) / groups * deviations.T @ deviations + np.outer(bias, bias))
+    covariance = (groups - 1) / groups * deviations.T @ deviations
+    if with_bias:
+        bias = (groups - 1) * (values.mean(0) - theta(full))
+        covariance = covariance + np.outer(bias, bias)
+    return np.asarray(covariance)
 
 
 def theta(one: Realisation) -> Array:

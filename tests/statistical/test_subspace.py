@@ -1,0 +1,59 @@
+"""Standard deviations of subspace estimates are what estimates scatter by, in open and closed loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambid.identify.blackbox.spread import pole_covariance, response_covariance
+from ambid.identify.blackbox.state_space import StateSpaceModel
+from ambid.identify.subspace import n4sid, pbsid
+from tests.identify.subspace.systems import COLOURED, UNSTABLE, record
+
+RUNS = 100
+OMEGA = np.array([1.0, 20.0, 50.0, 150.0, 280.0])
+
+
+def real_numbers(fit, truth: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and standard deviations of poles (matched) and frequency response, real and imaginary parts."""
+    poles, true = fit.model.poles(), truth.poles()
+    true = true[true.imag >= 0]
+    at = [int(np.argmin(np.abs(poles - p))) for p in true]
+    error = [(poles[at] - true).real, (poles[at] - true).imag]
+    spread = pole_covariance(fit.model, fit.covariance)[at]
+    sd = [np.sqrt(spread[:, 0, 0]), np.sqrt(spread[:, 1, 1])]
+    keep = [np.ones(true.size, bool), true.imag > 0]
+    difference = (fit.model.frequency_response(OMEGA) - truth.frequency_response(OMEGA))[:, 0, 0]
+    of = response_covariance(fit.model, fit.covariance, OMEGA)[:, 0, 0]
+    error += [difference.real, difference.imag]
+    sd += [np.sqrt(of[:, 0, 0]), np.sqrt(of[:, 1, 1])]
+    keep += [np.ones(OMEGA.size, bool)] * 2
+    chosen = np.concatenate(keep)
+    return np.concatenate(error)[chosen], np.concatenate(sd)[chosen]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "plant", "hold", "bias"),
+    [(n4sid, COLOURED, None, 0.8), (pbsid, COLOURED, None, 0.6), (pbsid, UNSTABLE, 1.2, 0.6)],
+    ids=["n4sid", "pbsid", "pbsid in a loop"],
+)
+def test_intervals_hold_the_truth_as_often_as_they_say(estimator, plant, hold, bias):
+    errors, sds = [], []
+    for seed in range(RUNS):
+        fit = estimator(record(plant, 2500, 5000 + seed, hold=hold), {"n": plant.order})
+        error, sd = real_numbers(fit, plant)
+        errors.append(error)
+        sds.append(sd)
+    e, s = np.array(errors), np.array(sds)
+    inside = np.mean(np.abs(e) < 1.96 * s, axis=0)
+    # 100 runs: one number's share scatters by 0.02; the mean over all by less
+    assert np.all(inside > 0.85)
+    assert 0.90 < np.mean(inside) < 0.985
+    assert np.all(np.abs(np.mean(e, axis=0)) < bias * np.std(e, axis=0))
+    ratio = np.median(s, axis=0) / np.std(e, axis=0)  # the median: single short records have long tails
+    assert 0.85 < np.median(ratio) < 1.25
+
+
+def test_order_is_found_in_most_records():
+    right = sum(pbsid(record(UNSTABLE, 2500, 9000 + seed, hold=1.2), {}).orders["n"] == 2 for seed in range(30))
+    assert right >= 27
