@@ -24,38 +24,40 @@ _LOST = 1e-30
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _add_moving_sum(c: Array, lag: int, x: Array, y: Array, pad: int, m: int) -> None:
-    """Add sum_j c_j x(t - lag - j) to y(t)."""
+    """Add sum_j c_j x(t - lag - j) to y(t). Slices, whose indices cannot be negative, let vector instructions in."""
+    out = y[pad : pad + m]
     for j in range(c.size):
         a, first = c[j], pad - lag - j
         if a != 0:
+            past = x[first : first + m]
             for t in range(m):
-                y[pad + t] += a * x[first + t]
+                out[t] += a * past[t]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _recurse(c: Array, y: Array, pad: int, m: int) -> None:
     """Turn y into y / c in place, c = c_1, c_2, ...; one and two coefficients stay in registers."""
-    n = c.size
+    n, out = c.size, y[pad : pad + m]
     if n == 1:
         p, a = y[pad - 1], c[0]
-        for t in range(pad, pad + m):
-            p = y[t] - a * p
-            y[t] = p
+        for t in range(m):
+            p = out[t] - a * p
+            out[t] = p
     elif n == 2:
         p, q, a, b = y[pad - 1], y[pad - 2], c[0], c[1]
-        for t in range(pad, pad + m):
-            r = (y[t] - b * q) - a * p
+        for t in range(m):
+            r = (out[t] - b * q) - a * p
             q = p
             p = r
-            y[t] = r
+            out[t] = r
     elif n == 3:
         p, q, r, a, b, d = y[pad - 1], y[pad - 2], y[pad - 3], c[0], c[1], c[2]
-        for t in range(pad, pad + m):
-            s = (y[t] - d * r - b * q) - a * p
+        for t in range(m):
+            s = (out[t] - d * r - b * q) - a * p
             r = q
             q = p
             p = s
-            y[t] = s
+            out[t] = s
     else:
         for t in range(pad, pad + m):
             s = y[t]
@@ -102,11 +104,9 @@ def _next_block(s: Array, y: Array, u: Array, impulse_row: int, t0: int, first: 
         for t in range(pad):
             s[i, t] = s[i, m + t]
     last = min(first + m, y.size)
-    for t in range(first, last):
-        s[0, pad + t - first] = y[t]
+    s[0, pad : pad + last - first] = y[first:last]
     for i in range(u.shape[0]):
-        for t in range(first, last):
-            s[1 + i, pad + t - first] = u[i, t]
+        s[1 + i, pad : pad + last - first] = u[i, first:last]
     s[impulse_row - 1, pad : pad + m] = 1
     s[impulse_row, pad : pad + m] = 0
     if first <= t0 < last:
@@ -159,31 +159,35 @@ def predictor_rows(
 def add_rows(R: Array, w: Array, n: int, first: int) -> None:
     """Take the first `n` samples of rows `w` (n_columns, block) into the triangle R by Householder reflections.
 
-    A reflection for column j mixes R[j] with the new samples only. Columns before `first` are zero in `w`.
+    The reflection of column j mixes R[j] with the new samples alone. Columns before `first` are zero in `w`. Each
+    column passes all reflections before it at once: one sweep takes one off and sums the product with the next.
     """
     p = R.shape[0]
-    for j in range(first, p):
-        v = w[j]
-        s = 0.0
+    tau, size = np.zeros(p), np.zeros(p)
+    for k in range(first, p):
+        x, s = w[k], 0.0
+        v = w[first]
         for t in range(n):
-            s += v[t] * v[t]
-        if s == 0.0:
-            continue
-        a = R[j, j]
-        b = -np.sqrt(a * a + s) if a > 0 else np.sqrt(a * a + s)
-        d = 1.0 / (a - b)
-        tau = -(a - b) / b
-        for k in range(j + 1, p):
-            x = w[k]
-            g = 0.0
-            for t in range(n):
-                g += v[t] * x[t]
-            g = tau * (R[j, k] + g * d)
+            s += v[t] * x[t]
+        for j in range(first, k):
+            g = tau[j] * (R[j, k] + s * size[j])
             R[j, k] -= g
-            g *= d
-            for t in range(n):
-                x[t] -= g * v[t]
-        R[j, j] = b
+            g *= size[j]
+            v, after, s = w[j], w[j + 1], 0.0
+            if j + 1 < k:
+                for t in range(n):
+                    x[t] -= g * v[t]
+                    s += after[t] * x[t]
+            else:
+                for t in range(n):
+                    x[t] -= g * v[t]
+                    s += x[t] * x[t]
+        if s > 0.0:
+            a = R[k, k]
+            b = -np.sqrt(a * a + s) if a > 0 else np.sqrt(a * a + s)
+            size[k] = 1.0 / (a - b)
+            tau[k] = (b - a) / b
+            R[k, k] = b
 
 
 @njit(cache=True, nogil=True)
@@ -215,9 +219,9 @@ def block_rows(
     rows = max(0, min(m, n - first) - skip)
     for j in range(p):
         a, sign = pad + skip - columns[j, 1], columns[j, 2]
-        x = s[columns[j, 0]]
+        x, out = s[columns[j, 0], a : a + rows], w[j, :rows]
         for t in range(rows):
-            w[j, t] = sign * x[a + t]
+            out[t] = sign * x[t]
     return rows, ringing
 
 

@@ -13,6 +13,7 @@ from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.scaled import Scaled
 from ambid.identify.polynomial.search import BLIND, Fitted, searched
+from ambid.identify.polynomial.stability import roots_of
 from ambid.identify.polynomial.starts import starts
 
 Array = NDArray[np.float64]
@@ -93,7 +94,7 @@ def _roots(model: PolynomialModel, o: int) -> dict[str, tuple[Complex, Complex]]
         if output != o or not used.size:
             continue
         lead = int(used[0])
-        roots = np.roots(c[lead:]).astype(np.complex128)
+        roots = roots_of(c[lead:])
         rows = np.zeros((roots.size, theta.size), dtype=np.complex128)
         if roots.size:
             rows[:, place.start + lead : place.stop] = root_derivative(c[lead:], roots)

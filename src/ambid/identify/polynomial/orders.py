@@ -244,6 +244,8 @@ def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, flo
     EstimationError
         If a name is not one of the coefficients that would be estimated, or a value is not a finite number.
     """
+    if not fixed:
+        return [{} for _ in layouts]
     outputs = tuple(layout.polynomials(layout.start()) for layout in layouts)
     names = PolynomialModel(outputs=outputs, dt=1.0).names
     free = {}

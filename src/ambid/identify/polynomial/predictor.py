@@ -22,7 +22,7 @@ from ambid.identify.polynomial.orders import Layout
 Array = NDArray[np.float64]
 Table = NDArray[np.int64]
 
-_BLOCK = 1024  # samples: signals and rows of a small model stay in the fast cache
+_BLOCK = 512  # samples: signals and rows of a small model stay in the fast cache
 _ONE, _MINUS, _CONSTANT, _THETA = 0, 1, 2, 3  # places in the vector of all coefficients
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.polynomial.predictor import Predictor
-from ambid.identify.polynomial.stability import stable_predictor
+from ambid.identify.polynomial.stability import solved, stable_predictor
 
 Array = NDArray[np.float64]
 
-_ENOUGH = 1e-8  # squared length of the next step in standard deviations
+_ENOUGH = 1e-6  # squared length of the last step in standard deviations
 _NOTHING_LEFT = 1e-24  # squared residual over squared output where the data are matched to rounding
 _MOST = 100
 BLIND = 1e8  # condition number, columns of unit length, beyond which a direction counts as not seen
@@ -77,7 +77,8 @@ class _Point:
 
     @property
     def cost(self) -> float:
-        return float(np.sum(self.R[self.n :, -1] ** 2))
+        e = self.R[self.n :, -1]
+        return float(e @ e)
 
 
 def searched(
@@ -118,7 +119,8 @@ def searched(
     n_rows = y.size - predictor.first_row
     floor = _NOTHING_LEFT * float(y @ y)
     at = evaluated(start, np.zeros(n))
-    if predictor.n_initial and not _linear(predictor):
+    explained = float(np.sum(at.R[:n, -1] ** 2))
+    if predictor.n_initial and explained > 0.01 * at.cost:  # gradients by F and C need the initial states
         at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
     damping, converged, shortened, count = 0.0, False, False, 1
     while True:
@@ -140,7 +142,7 @@ def searched(
         step, cut = _kept_stable(predictor, at.theta, free, step)
         trial = evaluated(_moved(at.theta, free, step), at.nuisance + _nuisance_step(at, step))
         count += 1
-        if np.isfinite(trial.cost) and trial.cost < at.cost:
+        if trial.cost < at.cost:  # not where it is no number
             expected = at.cost - float(np.sum((at.R[n:-1, n:-1] @ step + at.gradient) ** 2)) - at.rest
             good = at.cost - trial.cost > 0.5 * expected
             damping = (0.0 if damping < 1e-6 else damping * 0.1) if good else max(damping, 1e-6)
@@ -182,10 +184,7 @@ def _nuisance_step(at: _Point, step: Array) -> Array:
     """Nuisance numbers that go with a step; the smallest where the data do not tell them apart."""
     if not at.n:
         return np.zeros(0)
-    R = at.R[: at.n, : at.n]
-    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-300)
-    right = at.R[: at.n, at.n : -1] @ step + at.R[: at.n, -1]
-    return np.asarray(-np.linalg.lstsq(R / scale, right, rcond=1e-10)[0] / scale)
+    return -solved(at.R[: at.n, : at.n], at.R[: at.n, at.n : -1] @ step + at.R[: at.n, -1])
 
 
 def _moved(theta: Array, free: NDArray[np.int64], step: Array) -> Array:

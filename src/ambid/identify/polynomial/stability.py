@@ -47,6 +47,8 @@ def reflected(p: Array, radius: float = 0.98) -> Array:
     """
     if p.size < 2 or not np.all(np.isfinite(p)):
         return np.asarray(np.eye(1, p.size)[0])
+    if stable(p / radius ** np.arange(p.size)):
+        return p
     roots = np.roots(p)
     size = np.abs(roots)
     outside = size > 1.0
@@ -87,3 +89,52 @@ def largest_root(p: Array) -> float:
     """
     used = np.trim_zeros(p, "b")
     return float(np.max(np.abs(np.roots(used)))) if used.size > 1 else 0.0
+
+
+def roots_of(p: Array) -> NDArray[np.complex128]:
+    """Return the roots in z; the formula serves for up to two, which are most.
+
+    Parameters
+    ----------
+    p : ndarray, shape (n + 1,)
+        The first is not 0.
+
+    Returns
+    -------
+    ndarray, shape (n,), complex
+    """
+    if p.size == 1:
+        return np.empty(0, dtype=np.complex128)
+    if p.size == 2:
+        return np.array([-p[1] / p[0]], dtype=np.complex128)
+    if p.size == 3:
+        half, product = -0.5 * float(p[1] / p[0]), float(p[2] / p[0])
+        d = half * half - product
+        if d < 0:
+            return np.array([complex(half, (-d) ** 0.5), complex(half, -((-d) ** 0.5))])
+        far = half + (d**0.5 if half >= 0 else -(d**0.5))
+        return np.array([far, product / far if far else 0.0], dtype=np.complex128)
+    return np.asarray(np.roots(p), dtype=np.complex128)
+
+
+def solved(R: Array, right: Array) -> Array:
+    """Solve R x = right for a triangle R; the shortest x where R leaves some of it open.
+
+    Parameters
+    ----------
+    R : ndarray, shape (n, n)
+        Upper triangular.
+    right : ndarray, shape (n,) or (n, k)
+
+    Returns
+    -------
+    ndarray, shape of `right`
+    """
+    if not R.size:
+        return np.zeros(right.shape)
+    scale = np.sqrt(np.einsum("ij,ij->j", R, R))
+    scale[scale == 0.0] = 1.0
+    S = R / scale
+    diagonal = np.abs(S.diagonal())
+    x = np.linalg.solve(S, right) if np.min(diagonal) > 1e-8 else np.linalg.lstsq(S, right, rcond=1e-10)[0]
+    return np.asarray((x.T / scale).T)

@@ -18,13 +18,14 @@ from ambid.identify.polynomial._kernels import filtered
 from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.search import searched
-from ambid.identify.polynomial.stability import reflected
+from ambid.identify.polynomial.stability import reflected, solved
 
 Array = NDArray[np.float64]
 
 _ROWS = 4096  # of the long model: more would not make a better start
-_CHUNK = 512
+_CHUNK = 1024
 _SM_ITERATIONS = 5
+_WINDOW = 8192  # samples that a start from the data takes of a long record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,9 +72,7 @@ def _regression(layout: Layout, y: Array, u: Array, most_rows: int | None) -> tu
     for part in _pieces(y.size, layout.first_row, most_rows):
         more = p.triangle(y[part], np.ascontiguousarray(u[:, part]), theta, np.zeros(p.n_nuisance))
         R = more if part.stop - part.start == y.size else np.asarray(np.linalg.qr(np.vstack([R, more]), mode="r"))
-    scale = np.maximum(np.linalg.norm(R[:-1, :-1], axis=0), 1e-300)
-    step = -np.linalg.lstsq(R[:-1, :-1] / scale, R[:-1, -1], rcond=1e-10)[0] / scale
-    theta[layout.free] += step[p.n_nuisance :]
+    theta[layout.free] -= solved(R[:-1, :-1], R[:-1, -1])[p.n_nuisance :]
     return theta, R[p.n_nuisance : -1, p.n_nuisance : -1]
 
 
@@ -91,6 +90,9 @@ def starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     ------
     ndarray, shape (n_theta,)
     """
+    if not (layout.nc or layout.nd or any(layout.nf)):
+        yield layout.start()  # one step from anywhere
+        return
     free = Layout(na=layout.na, nb=layout.nb, nc=layout.nc, nd=layout.nd, nf=layout.nf, nk=layout.nk)
     if any(layout.nf):
         yield from _output_error(free, y, u)
@@ -309,6 +311,15 @@ def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
     return theta
 
 
+def _liveliest(u: Array) -> slice:
+    """The piece of a long record in which the input moves most: a start needs no more."""
+    if u.size <= 2 * _WINDOW:
+        return slice(0, u.size)
+    energy = np.add.reduceat(u * u, np.arange(0, u.size - _WINDOW + 1, _WINDOW))
+    first = int(np.argmax(energy[:-1])) * _WINDOW
+    return slice(first, first + _WINDOW)
+
+
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Array, Array]:
     """Fit B/F by least squares on data filtered by the last 1/F (Steiglitz & McBride 1965).
 
@@ -323,7 +334,8 @@ def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Ar
         B and a stable F.
     """
     arx = Layout(na=nf, nb=(nb,), nc=0, nd=0, nf=(0,), nk=(nk,))
-    F = np.ones(1)
+    part, F = _liveliest(u), np.ones(1)
+    y, u = y[part], u[part]
     for _ in range(_SM_ITERATIONS if nf else 1):
         one = np.ones(1)
         found = arx_coefficients(arx, filtered(one, F, y), filtered(one, F, u)[None, :])
