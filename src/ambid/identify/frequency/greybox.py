@@ -19,6 +19,7 @@ from ambid.identify.frequency.lines import Lines, lines
 from ambid.identify.frequency.physical import Channels, start_values
 from ambid.identify.frequency.physical_estimate import FrequencyEstimate, frequency_estimate
 from ambid.identify.frequency.physical_problem import PhysicalProblem
+from ambid.identify.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 from ambid.signals.frf import FrequencyResponse
@@ -69,10 +70,11 @@ def greybox_frf(
     if not free:
         raise EstimationError("no parameter is free; nothing is left to estimate. Give one the role 'free' or 'prior'")
     ln = lines(frf, len(free) + 1)
-    problem, v = _raced(model, ln, channels, ordered, delay)
-    cost, v, converged = _search(problem, v)
-    if delay == "auto":
-        problem, cost, v, converged = _with_fraction(problem, cost, v, converged)
+    with one_thread():
+        problem, v = _raced(model, ln, channels, ordered, delay)
+        cost, v, converged = _search(problem, v)
+        if delay == "auto":
+            problem, cost, v, converged = _with_fraction(problem, cost, v, converged)
     return frequency_estimate(frf, problem, ordered, cost, v, converged, "estimated" if delay == "auto" else "given")
 
 
@@ -111,15 +113,18 @@ def _raced(
     """All starts of all delays by their cost, the best searched a little way, the best of those."""
     fixed = {p.name: p.value for p in parameters if p.role == "fixed" and p.value is not None}
     given = {p.name: p.value for p in parameters if p.value is not None}
+    positive = {s.name for s in model.parameters if s.positive}
     scored: list[tuple[float, int, PhysicalProblem, Array]] = []
     for lag in [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]:
         from_data = list(start_values(model, ln, channels, lag, fixed))
-        for values in [*from_data, *({**x, **given} for x in [*from_data[:3], {}] if given != fixed or not x)]:
+        for found in [*from_data, *({**x, **given} for x in [*from_data[:3], {}] if given != fixed or not x)]:
+            # noise may turn the sign of what hardly shows (a resistance at a sharp resonance): its size is a start
+            values = {k: abs(x) if k in positive else x for k, x in found.items()}
             problem = _problem(model, ln, channels, parameters, fixed, values, lag)
             if problem is not None:
                 v = problem.vector(values)
                 cost = _cost(problem, v)
-                if np.isfinite(cost):
+                if cost < 1e100:
                     scored.append((cost, len(scored), problem, v))
     if not scored:
         raise EstimationError(
@@ -165,11 +170,7 @@ def _problem(
 
 
 def _cost(problem: PhysicalProblem, v: Array) -> float:
-    try:
-        with np.errstate(all="ignore"):
-            return float(np.sum(problem.residual(v) ** 2)) / 2
-    except (np.linalg.LinAlgError, ValueError):
-        return np.inf
+    return float(np.sum(problem.residual(v) ** 2)) / 2
 
 
 def _search(problem: PhysicalProblem, v: Array, *, evaluations: int = 200) -> tuple[float, Array, bool]:

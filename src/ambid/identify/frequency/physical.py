@@ -48,6 +48,7 @@ def response(
     delay: float,
     *,
     slope: bool = True,
+    moving: bool = True,
 ) -> tuple[Complex, Complex]:
     """Return the model's response and its derivative by parameters and delay.
 
@@ -63,11 +64,13 @@ def response(
     delay : float, samples
     slope : bool
         Whether derivatives are wanted.
+    moving : bool
+        Whether the derivative by the delay is one of them.
 
     Returns
     -------
     G : ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
-    derivative : ndarray, shape (n_frequencies, n_outputs, n_inputs, len(names) + 1), complex
+    derivative : ndarray, shape (n_frequencies, n_outputs, n_inputs, len(names) + moving), complex
         The last by the delay in samples; empty where not wanted.
     """
     space = model.matrices(theta)
@@ -78,7 +81,8 @@ def response(
         points = np.exp(1j * ln.omega * ln.dt)
         late = np.exp(-1j * ln.omega * ln.dt)[:, None, None]
         shift = late**whole
-        at, directions = discretise(space, ln.dt, fraction=delay - whole, derivatives=along)
+        fraction = delay - whole
+        at, directions = discretise(space, ln.dt, fraction=fraction if fraction or moving else None, derivatives=along)
         A, C = at.A, at.C[rows]
         B = at.B[:, columns] + at.B_late[:, columns] * late
         changes = [(d.A, d.B[:, columns] + d.B_late[:, columns] * late, d.C[rows]) for d in directions if slope]
@@ -95,10 +99,10 @@ def response(
         return G, np.empty((*G.shape, 0), dtype=np.complex128)
     wide = np.broadcast_to(C.T.astype(np.complex128), (points.size, n, len(rows)))
     left = np.swapaxes(np.linalg.solve(np.swapaxes(pencil, 1, 2), wide), 1, 2)
-    out = np.empty((*G.shape, len(names) + 1), dtype=np.complex128)
-    for j, (dA, dB, dC) in enumerate(changes):
+    out = np.empty((*G.shape, len(names) + int(moving)), dtype=np.complex128)
+    for j, (dA, dB, dC) in enumerate(changes[: out.shape[-1]]):
         out[..., j] = left @ (dA @ right + dB * shift) + dC @ right
-    if not ln.held:
+    if moving and not ln.held:
         out[..., -1] = -1j * (ln.omega * ln.dt)[:, None, None] * G
     return G, out
 

@@ -15,6 +15,8 @@ from ambid.physics.parameters import Parameter
 
 Array = NDArray[np.float64]
 
+_FAR = 1e100  # standard deviations: worse than anything
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PhysicalProblem:
@@ -58,8 +60,8 @@ class PhysicalProblem:
         -------
         dict of str to float
         """
-        values = np.where(self.positive, self.size * np.exp(np.minimum(v[: self.size.size], 50.0)), 0.0)
-        values = np.where(self.positive, values, self.size * v[: self.size.size])
+        x = v[: self.size.size]
+        values = self.size * np.where(self.positive, np.exp(np.clip(np.where(self.positive, x, 0.0), -50.0, 50.0)), x)
         return {**self.known, **{p.name: float(x) for p, x in zip(self.estimated, values, strict=True)}}
 
     def delay_at(self, v: Array) -> float:
@@ -103,10 +105,14 @@ class PhysicalProblem:
         -------
         ndarray, shape (n_rows,)
         """
-        G, _ = response(
-            self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v), slope=False
-        )  # fmt: skip
-        return np.concatenate([self.lines.whitened(G - self.lines.G), self._prior(v)])
+        n_rows = 2 * self.lines.n_lines * self.lines.entries
+        try:
+            with np.errstate(all="ignore"):  # a step too far overflows: the search turns back from what is not finite
+                G, _ = response(self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v), slope=False)
+                rows = self.lines.whitened(G - self.lines.G)
+        except (np.linalg.LinAlgError, ValueError):
+            rows = np.full(n_rows, _FAR)
+        return np.concatenate([np.where(np.isfinite(rows), rows, _FAR), self._prior(v)])
 
     def slope(self, v: Array, *, by_parameters: bool = False) -> Array:
         """Return the derivative of `residual`.
@@ -122,7 +128,7 @@ class PhysicalProblem:
         ndarray, shape (n_rows, n_vector)
         """
         theta, names = self.theta(v), [p.name for p in self.estimated]
-        _, d = response(self.model, theta, names, self.lines, self.channels, self.delay_at(v))
+        _, d = response(self.model, theta, names, self.lines, self.channels, self.delay_at(v), moving=self.fractional)
         J = self.lines.whitened(d)
         rows = np.zeros((sum(p.role == "prior" for p in self.estimated), J.shape[1]))
         for row, (j, p) in zip(rows, ((j, p) for j, p in enumerate(self.estimated) if p.role == "prior"), strict=True):
@@ -131,9 +137,10 @@ class PhysicalProblem:
         if not by_parameters:
             n = self.size.size
             J[:, :n] *= np.where(self.positive, [theta[k] for k in names], self.size)
-            part = self.delay_at(v) - self.delay
-            J[:, n] *= part * (1 - part) if self.lines.held else 1.0
-        return J if self.fractional else J[:, :-1]
+            if self.fractional and self.lines.held:
+                part = self.delay_at(v) - self.delay
+                J[:, n] *= part * (1 - part)
+        return J
 
     def _prior(self, v: Array) -> Array:
         theta = self.theta(v)

@@ -23,6 +23,7 @@ from ambid.identify.frequency.basis import orthogonal_polynomials
 from ambid.identify.frequency.lines import Lines, lines
 from ambid.identify.frequency.result import made_from_lines
 from ambid.identify.frequency.vector_fitting import vector_fit
+from ambid.identify.threads import one_thread
 from ambid.signals.frf import FrequencyResponse
 
 Array = NDArray[np.float64]
@@ -117,6 +118,16 @@ def frf_ml(
     period = form.lines.dt
     if domain == "z" and delay != "auto" and abs(delay / period - round(delay / period)) > 1e-9:
         raise EstimationError(f"a delay of {delay} s is no whole number of samples of {period} s. Use domain 's'")
+    with one_thread():
+        best = _fitted(form, delay, domain)
+    return _result(frf, orders, best, domain)
+
+
+def _fitted(
+    form: _Form, delay: float | Literal["auto"], domain: Literal["s", "z"]
+) -> tuple[float, _Form, Array, float, bool]:
+    """Cost, form, vector, delay and whether it converged: the best of the searches from the best starts."""
+    period = form.lines.dt
     lags = period * np.arange(MAX_DELAY + 1.0) if delay == "auto" else np.array([delay])
     found = sorted((start for lag in lags for start in _starts(form, float(lag))), key=lambda c: c[0])
     if not found:
@@ -129,7 +140,7 @@ def frf_ml(
         if best is None or cost < best[0]:
             best = (cost, free, end, lag, converged)
     assert best is not None
-    return _result(frf, orders, best, domain)
+    return best
 
 
 def _form(

@@ -24,6 +24,7 @@ from ambid.identify.frequency.laguerre import best_conditioned, block_rows_condi
 from ambid.identify.frequency.lines import Lines, lines
 from ambid.identify.frequency.result import made_from_lines
 from ambid.identify.frequency.state_search import continuous, information, refined, resampled
+from ambid.identify.threads import one_thread
 from ambid.signals.frf import FrequencyResponse
 
 Array = NDArray[np.float64]
@@ -90,9 +91,25 @@ def frf_subspace(
         If orders, options or lines break a rule.
     """
     _checked(frf, orders, delay, domain, max_order)
-    if orders == "auto":
-        return _chosen(frf, p, block_rows, delay, feedthrough, domain, refine, max_order, resamples)
-    n, n_y, n_u = orders["n"], frf.n_outputs, frf.n_inputs
+    with one_thread():
+        if orders == "auto":
+            return _chosen(frf, p, block_rows, delay, feedthrough, domain, refine, max_order, resamples)
+        return _of_order(frf, orders["n"], p, block_rows, delay, feedthrough, domain, refine, resamples)
+
+
+def _of_order(
+    frf: FrequencyResponse,
+    n: int,
+    p: float | None,
+    block_rows: int | None,
+    delay: float,
+    feedthrough: bool,
+    domain: Literal["s", "z"],
+    refine: bool,
+    resamples: int,
+) -> BlackBoxFit:
+    """One order: subspace, refinement or resampling, continuous form."""
+    n_y, n_u = frf.n_outputs, frf.n_inputs
     n_estimated = n * (n_y + n_u) + (n_y * n_u if feedthrough else 0)
     ln = _undelayed(lines(frf, n_estimated), delay)
     rows = _block_rows(ln, n, block_rows)
@@ -191,10 +208,8 @@ def _chosen(
         if verdict.p is not None and verdict.p > 0.01:
             tried = [tried[-1]]
             break
-    fit = frf_subspace(
-        frf, {"n": min(tried)[1]}, p=p, block_rows=block_rows, delay=delay, feedthrough=feedthrough, domain=domain,
-        refine=refine, resamples=resamples,
-    )  # fmt: skip
+    n = min(tried)[1]
+    fit = _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
     return replace(fit, details={**fit.details, "bic_by_order": bic})
 
 
