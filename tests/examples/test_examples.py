@@ -64,6 +64,16 @@ def test_unstable_bearing_is_recovered_in_closed_loop():
     assert estimate.passed
 
 
+def test_the_laguerre_operator_keeps_the_condition(tmp_path):
+    picture = tmp_path / "condition.png"
+    result = example("laguerre_condition").main(picture)
+    assert result.orders.tolist() == list(range(2, 21))
+    assert result.with_operator.max() < 10.0
+    assert result.without[-1] > 1e8
+    assert np.all(result.without[1:] / result.without[:-1] > 2.0)
+    assert picture.stat().st_size > 10_000
+
+
 def test_real_maglev_agrees_with_gravity():
     module = example("real_maglev")
     results = module.main()
