@@ -110,6 +110,15 @@ STRUCTURES: Mapping[str, Structure] = {
         _subspace("cva", "biased", "the same, canonical variates"),
         _subspace("pbsid", "consistent", "the same from a long autoregression: feedback does not disturb it"),
         Structure(
+            name="rfir",
+            summary="y = B u + e, many taps with a fading prior",
+            orders=("nb", "nk"),
+            home="ambid.identify.nonparametric:rfir",
+            inputs=True,
+            feedback="biased",
+            kind="polynomial",
+        ),
+        Structure(
             name="weakform",
             summary="y = B(s)/F(s) u + white noise, continuous time, by test functions",
             orders=("nb", "nf", "nk"),

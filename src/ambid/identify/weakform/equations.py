@@ -198,7 +198,7 @@ def solve(system: System, bump: Bump, start: Mapping[str, float] | None = None) 
 
 
 def best_support(system: System, halves: Sequence[int], degree: int) -> tuple[Solution, list[dict[str, float]]]:
-    """Solve from long supports to short, each from the one before or anew, and keep the one that predicts least variance.
+    """Solve from long supports to short, from the one before or anew; keep the one that predicts least variance.
 
     Long supports average most, short ones use more of the band; those that find much more noise than others have missed
     the plant and do not count.
