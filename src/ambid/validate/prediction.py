@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ambid.identify.likelihood import Fit
 from ambid.identify.predictor import Predictor, assemble
 from ambid.identify.sensitivity import Workspace, innovations, run
+from ambid.validate.ahead import covariance_ahead, errors_ahead
 
 Array = NDArray[np.float64]
 
@@ -73,14 +74,8 @@ def prediction_error(fit: Fit, steps: int) -> Array:
     predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
     if e is None:
         raise ValueError("the fit has no predictor; it has failed")
-    # error now = sum over the innovations since: what the gain has fed in between was not known
-    n_used, A, K, C = e.shape[0], predictor.A, predictor.gain, predictor.C
-    out = e[steps - 1 :].copy()
-    power = K
-    for j in range(1, steps):
-        out += e[steps - 1 - j : n_used - j] @ (C @ power).T
-        power = A @ power
-    return np.asarray(out * fit.problem.scales.output)
+    ahead = errors_ahead(e, predictor.A, predictor.gain, predictor.C, steps)
+    return np.asarray(ahead * fit.problem.scales.output)
 
 
 def expected_prediction_sd(fit: Fit, steps: int) -> Array:
@@ -96,11 +91,7 @@ def expected_prediction_sd(fit: Fit, steps: int) -> Array:
     ndarray, shape (n_outputs,)
     """
     predictor = _predictor(fit)
-    total, power = fit.covariance.copy(), predictor.gain
-    for _ in range(1, steps):
-        h = predictor.C @ power
-        total += h @ fit.covariance @ h.T
-        power = predictor.A @ power
+    total = covariance_ahead(fit.covariance, predictor.A, predictor.gain, predictor.C, steps)
     return np.asarray(np.sqrt(np.diag(total)) * fit.problem.scales.output)
 
 

@@ -17,7 +17,7 @@ from ambid.identify.sensitivity import innovations, linearise
 from ambid.identify.threads import one_thread
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
-from ambid.validate.prediction import fit_of, prediction_error, simulation_error
+from ambid.validate.prediction import expected_prediction_sd, fit_of, prediction_error, simulation_error
 from ambid.validate.residuals import residuals_uncorrelated, residuals_white
 
 Array = NDArray[np.float64]
@@ -168,7 +168,8 @@ def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
     Returns
     -------
     dict
-        ``fit``: by output one_step, simulation, rms of the innovation in SI, and k_step fits; ``checks``:
+        ``fit``: by output one_step, simulation, rms of the innovation in SI, k_step fits, and by k_step_ratio how many
+        times as large as expected the errors are that many steps ahead; ``checks``:
         residuals_white, residuals_uncorrelated and innovations_consistent (sizes as at identification), each with
         ``passed`` and ``detail``; ``passed``.
 
@@ -189,7 +190,10 @@ def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
     before = np.sqrt(np.diag(estimate.noise.innovation_covariance))
     roles = model(estimate.model).outputs
     horizons = [k for k in _HORIZONS if k < run.measured.shape[0] // 2]
-    ahead = {k: fit_of(prediction_error(run.fit, k), run.measured[k - 1 :]) for k in horizons}
+    errors = {k: prediction_error(run.fit, k) for k in horizons}
+    ahead = {k: fit_of(e, run.measured[k - 1 :]) for k, e in errors.items()}
+    expected = _expected_sd(run, estimate, horizons)
+    ratio = {k: np.sqrt(np.mean(e**2, axis=0)) / expected[k] for k, e in errors.items()}
     checks = _checks(run, dict(zip(roles, (rms / before).tolist(), strict=True)))
     return {
         "fit": {
@@ -198,6 +202,7 @@ def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
                 "simulation": None if simulation is None else float(simulation[j]),
                 "innovation_rms": float(rms[j]),
                 "k_step": {str(k): float(f[j]) for k, f in ahead.items()},
+                "k_step_ratio": {str(k): float(r[j]) for k, r in ratio.items()},
             }
             for j, role in enumerate(roles)
         },
@@ -205,6 +210,13 @@ def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
         "passed": all(c.passed for c in checks.values()),
         "samples": signals.y.shape[0],
     }
+
+
+def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[int, Array]:
+    """Standard deviations of the errors ahead that the estimate expects, with the innovations of its own record."""
+    scale = run.fit.problem.scales.output
+    own = replace(run.fit, covariance=estimate.noise.innovation_covariance / np.outer(scale, scale))
+    return {k: expected_prediction_sd(own, k) for k in horizons}
 
 
 def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.structures import structure
 from ambid.identify.estimate import OutputFit
 from ambid.validate.blackbox.checks import coloured_warning, feedback_warning, residual_verdicts, stable_predictor
 from ambid.validate.blackbox.colour import coloured_covariance
@@ -23,6 +24,7 @@ from ambid.validate.prediction import fit_of
 Array = NDArray[np.float64]
 
 _MOST = 4e7  # numbers in the derivatives of one output that are kept at once
+_ASSUME_WHITE = ("fir", "oe")  # covariance of white noise; the instrumental structures allow for the colour
 _LEAST = 60  # samples from which residuals can be tested
 
 
@@ -57,8 +59,9 @@ def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> B
     if sound and checks["stable_predictor"].passed and data.n_samples >= _LEAST:
         part, tail = _last(data, found)
         slopes = gradient(fit, part, tail)
-        tests = residual_tests(part, tail, slopes)
-        if any(c.size > 1 for c in tests.colours):
+        in_loop = not found.claims_noise and structure(fit.structure).feedback == "consistent"
+        tests = residual_tests(part, tail, slopes, with_reference=in_loop and bool(data.references))
+        if any(c.size > 1 for c in tests.colours) and fit.structure in _ASSUME_WHITE:
             whole = slopes if part is data else None
             again = None if whole is None else coloured_covariance(fit, found.one_step, whole, tests.colours)
             covariance = fit.covariance if again is None else again

@@ -83,7 +83,7 @@ class ResidualTests:
     colours: tuple[Array, ...]
 
 
-def residual_tests(data: IOData, found: Errors, slopes: Gradient) -> ResidualTests:
+def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_reference: bool = False) -> ResidualTests:
     """Test the residuals of a fit.
 
     Parameters
@@ -93,12 +93,16 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient) -> ResidualTes
         The data run through the fit.
     slopes : Gradient
         Derivatives of its predictions.
+    with_reference : bool, optional
+        Test residuals against the reference of the loop instead of the inputs: in a loop, noise that a model does not
+        describe reaches the inputs, but not the reference.
 
     Returns
     -------
     ResidualTests
     """
     e, u = found.one_step, data.u
+    source = data.reference if with_reference else u
     colours = tuple(
         np.ones(1) if found.claims_noise else autoregression(column[skipped(e.shape[0]) :]) for column in e.T
     )
@@ -106,7 +110,7 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient) -> ResidualTes
     white = [_tested(e[:, o], J, e, white_lags) for o, J in enumerate(slopes.rows)]
     lags = input_lags(e.shape[0], with_now=data.open_loop)
     against = [
-        _tested(e[:, o], J, u, lags, colour=None if colours[o].size == 1 else colours[o])
+        _tested(e[:, o], J, source, lags, colour=None if colours[o].size == 1 else colours[o])
         for o, J in enumerate(slopes.rows)
         if data.n_inputs
     ]

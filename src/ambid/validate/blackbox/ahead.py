@@ -1,0 +1,84 @@
+"""A black-box fit several steps ahead, on any record: fit, error, and the error that the model expects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.validate.ahead import covariance_ahead, errors_ahead
+from ambid.validate.blackbox.criteria import skipped
+from ambid.validate.blackbox.predictor import errors_elsewhere
+from ambid.validate.prediction import fit_of
+
+HORIZONS = (1, 5, 20, 100)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ahead:
+    """One output, a number of steps ahead.
+
+    Attributes
+    ----------
+    output : str
+    steps : int
+    fit : float
+        1 - |error|/|y - mean|.
+    rmse : float, SI
+    expected_sd : float, SI
+        What model and innovations of the fit make of it; a larger error says that the model is wrong, or that it is
+        used where it does not hold.
+    """
+
+    output: str
+    steps: int
+    fit: float
+    rmse: float
+    expected_sd: float
+
+
+def ahead(fit: BlackBoxFit, data: IOData, horizons: Sequence[int] = HORIZONS) -> tuple[Ahead, ...]:
+    """Predict several steps ahead, inputs known.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+    data : IOData
+        The fit's own record or another; a constant in its outputs is fitted.
+    horizons : sequence of int, optional
+        Steps; those above half the record are left out.
+
+    Returns
+    -------
+    tuple of Ahead
+        Output by output, in the order of the horizons.
+
+    Raises
+    ------
+    EstimationError
+        If a horizon is under 1, or channels or rate of the record differ from those of the fit.
+    """
+    if any(k < 1 for k in horizons):
+        raise EstimationError(f"horizons of {', '.join(map(str, horizons))} samples; each must be at least 1")
+    found = errors_elsewhere(fit, data)
+    m, first = found.model, skipped(data.n_samples)
+    e, y = found.one_step[first:], data.y[first:]
+    out = list[Ahead]()
+    for j, name in enumerate(fit.outputs):
+        for k in (k for k in horizons if k <= e.shape[0] // 2):
+            error = errors_ahead(e, m.A, m.K, m.C, k)[:, j]
+            expected = covariance_ahead(fit.noise_covariance, m.A, m.K, m.C, k)
+            out.append(
+                Ahead(
+                    output=name,
+                    steps=k,
+                    fit=float(fit_of(error[:, None], y[k - 1 :, [j]])[0]),
+                    rmse=float(np.sqrt(np.mean(error**2))),
+                    expected_sd=float(np.sqrt(expected[j, j])),
+                )
+            )
+    return tuple(out)

@@ -1,0 +1,219 @@
+"""Sensitivity analysis: how much each estimated number matters to the fit, the poles and the frequency response.
+
+The information matrix I = covariance^-1 is half the curvature of -2 log L: a step d costs d' I d. So what a number does
+to the fit by itself is I_jj, and with all others free to follow 1/covariance_jj; the ratio of the two is how well the
+others can stand in for it (variance inflation). The collinearity index 1/smallest singular value of the scaled
+sensitivities (Brun, Reichert and Kuensch 2001) says how well all of them can: 10 means that a change of one number can
+be undone by the others to a tenth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.spread import pole_covariance
+from ambid.identify.estimate import Estimate
+from ambid.validate.blackbox.criteria import skipped
+
+Array = NDArray[np.float64]
+
+_PAIR = 0.9  # correlation from which two numbers are named as a pair
+_DEPENDENT = 1e-10  # eigenvalue of the correlation matrix under which a direction is not independent
+_FREQUENCIES = 60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Influence:
+    """One estimated number.
+
+    Attributes
+    ----------
+    name : str
+    value, sd : float, SI
+    fit_alone : float
+        Rise of -2 log L when it alone moves by 1 %.
+    fit_free : float
+        The same when the others are fitted again: (0.01 value/sd)^2.
+    inflation : float
+        First over second: how much of its effect the others can undo; 1 is none.
+    poles : float or None
+        Largest relative move of a pole when it moves by 1 %: |dp|/|p| (of log z for a discrete model, which is p times
+        the sampling interval). None where there are no poles, or no structure is at hand.
+    response : float or None
+        The same for the frequency response, root mean square over the band up to half the sampling rate.
+    """
+
+    name: str
+    value: float
+    sd: float
+    fit_alone: float
+    fit_free: float
+    inflation: float
+    poles: float | None
+    response: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SensitivityAnalysis:
+    """What matters, and what cannot be told apart.
+
+    Attributes
+    ----------
+    influences : tuple of Influence
+        Largest effect on the fit first.
+    collinearity : float
+        Index of all numbers together; under 10 is good, infinite where they are not independent.
+    dependent : int
+        Directions that are not independent (a full state space always has some: states can be exchanged).
+    pairs : tuple of (str, str, float)
+        Numbers whose estimates are correlated by more than 0.9, strongest first, with the correlation.
+    weakest : tuple of (str, float)
+        Combination that the data see least, relative changes, largest share first; up to four.
+    pole_sd : ndarray, shape (n_poles,)
+        Relative standard deviation of each pole, in the order of the model's poles; empty without structure.
+    """
+
+    influences: tuple[Influence, ...]
+    collinearity: float
+    dependent: int
+    pairs: tuple[tuple[str, str, float], ...]
+    weakest: tuple[tuple[str, float], ...]
+    pole_sd: Array
+
+
+def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
+    """Analyse a black-box fit.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+        With a covariance.
+    data : IOData
+        What it was estimated from; its length sets the lowest frequency looked at.
+
+    Returns
+    -------
+    SensitivityAnalysis
+
+    Raises
+    ------
+    EstimationError
+        If the fit has no covariance.
+    """
+    if fit.covariance is None or not np.any(np.diag(fit.covariance) > 0):
+        raise EstimationError(
+            f"{fit.structure} gave no covariance for these data; without one no sensitivity can be told. Lower orders"
+        )
+    model = fit.model
+    free = np.nonzero(np.diag(fit.covariance) > 0)[0]
+    theta = model.theta[free]
+    poles, slopes = model.poles(), model.pole_derivative()[:, free]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.abs(poles) if model.dt is None else np.abs(poles * np.log(poles))
+        moves = np.abs(slopes * theta) / size[:, None]
+        spread = np.sqrt(np.trace(pole_covariance(model, fit.covariance), axis1=1, axis2=2)) / size
+    moves = np.where(np.isfinite(moves), moves, 0.0)
+    longest = max(data.n_samples - skipped(data.n_samples), 2) * fit.dt
+    omega = np.geomspace(2 * np.pi / longest, 0.999 * np.pi / fit.dt, _FREQUENCIES)
+    response = None
+    if model.n_inputs:
+        g = model.frequency_response(omega)
+        change = model.frequency_response_derivative(omega)[..., free] * theta
+        level = np.sqrt(np.mean(np.abs(g) ** 2, axis=0))
+        relative = np.sqrt(np.mean(np.abs(change) ** 2, axis=0)) / np.maximum(level, 1e-300)[..., None]
+        response = np.max(relative, axis=(0, 1))
+    return _analysis(
+        [model.names[k] for k in free],
+        theta,
+        fit.covariance[np.ix_(free, free)],
+        np.max(moves, axis=0) if poles.size else None,
+        response,
+        np.asarray(spread),
+    )
+
+
+def estimate_sensitivity(estimate: Estimate) -> SensitivityAnalysis:
+    """Analyse an estimate of physical parameters.
+
+    Parameters
+    ----------
+    estimate : Estimate
+
+    Returns
+    -------
+    SensitivityAnalysis
+        Without poles and frequency response.
+
+    Raises
+    ------
+    EstimationError
+        If nothing was estimated.
+    """
+    names = estimate.covariance_names
+    if not names:
+        raise EstimationError("the estimate has no free parameter, so that nothing can be sensitive. Free one")
+    theta = np.array([estimate.values[k] for k in names])
+    return _analysis(names, theta, estimate.covariance, None, None, np.zeros(0))
+
+
+def _analysis(
+    names: Sequence[str], theta: Array, covariance: Array, poles: Array | None, response: Array | None, pole_sd: Array
+) -> SensitivityAnalysis:
+    sd = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sd, sd)
+    values, vectors = np.linalg.eigh(correlation)
+    seen = values > _DEPENDENT * values[-1]
+    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    information = np.diag(inverse)  # times sd^2: I_jj covariance_jj
+    influences = [
+        Influence(
+            name=name,
+            value=float(theta[j]),
+            sd=float(sd[j]),
+            fit_alone=float((0.01 * theta[j] / sd[j]) ** 2 * information[j]),
+            fit_free=float((0.01 * theta[j] / sd[j]) ** 2),
+            inflation=float(max(information[j], 1.0)),
+            poles=None if poles is None else float(0.01 * poles[j]),
+            response=None if response is None else float(0.01 * response[j]),
+        )
+        for j, name in enumerate(names)
+    ]
+    return SensitivityAnalysis(
+        influences=tuple(sorted(influences, key=lambda x: -x.fit_alone)),
+        collinearity=_collinearity(inverse) if np.all(seen) else float("inf"),
+        dependent=int(np.count_nonzero(~seen)),
+        pairs=_pairs(names, correlation),
+        weakest=_weakest(names, theta, sd, vectors[:, -1]),
+        pole_sd=pole_sd,
+    )
+
+
+def _collinearity(inverse: Array) -> float:
+    """Index of the sensitivities, each scaled to length 1: their Gram matrix is the scaled information."""
+    size = np.sqrt(np.diag(inverse))
+    return float(1 / np.sqrt(np.linalg.eigvalsh(inverse / np.outer(size, size))[0]))
+
+
+def _pairs(names: Sequence[str], correlation: Array) -> tuple[tuple[str, str, float], ...]:
+    found = [
+        (names[j], names[k], float(correlation[j, k]))
+        for j in range(len(names))
+        for k in range(j)
+        if abs(correlation[j, k]) > _PAIR
+    ]
+    return tuple(sorted(found, key=lambda x: -abs(x[2])))
+
+
+def _weakest(names: Sequence[str], theta: Array, sd: Array, direction: Array) -> tuple[tuple[str, float], ...]:
+    """Direction of the largest spread, as relative changes of the numbers, largest 1."""
+    step = direction * sd / np.where(theta == 0, 1.0, np.abs(theta))
+    step = step / step[np.argmax(np.abs(step))]
+    order = np.argsort(-np.abs(step))[:4]
+    return tuple((names[k], float(step[k])) for k in order)

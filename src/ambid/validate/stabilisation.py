@@ -1,0 +1,284 @@
+"""Stabilisation diagram: poles of models of all orders; those of the plant stay where they are as the order grows.
+
+A pole is stable when the model of the order below has one of nearly the same frequency, damping and mode shape (modal
+assurance criterion, Allemang and Brown 1982; tolerances as in Peeters and De Roeck 1999). Stable poles that many orders
+share are one cluster, which is a mode of the plant; the others are of noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError, nearest
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.subspace import subspace_models
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Method = Literal["n4sid", "moesp", "cva", "pbsid"]
+
+_FREQUENCY, _DAMPING, _SHAPE = 0.01, 0.05, 0.98
+_SHARE = 0.4  # part of the orders, from a cluster's first one on, that must show it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModePole:
+    """One pole of one model; of a complex pair the one above the real axis.
+
+    Attributes
+    ----------
+    order : int
+        Of the model.
+    pole : complex, rad/s
+        In continuous time, log(z)/dt.
+    frequency_hz : float
+        |pole|/(2 pi).
+    damping : float
+        -Re(pole)/|pole|; negative for an unstable pole.
+    shape : tuple of complex
+        Mode shape: the outputs that go with the pole, largest 1.
+    stable_frequency, stable_damping, stable_shape : bool
+        Whether the next lower order has a pole that agrees in that.
+    """
+
+    order: int
+    pole: complex
+    frequency_hz: float
+    damping: float
+    shape: tuple[complex, ...]
+    stable_frequency: bool = False
+    stable_damping: bool = False
+    stable_shape: bool = False
+
+    @property
+    def stable(self) -> bool:
+        """Whether it agrees in everything."""
+        return self.stable_frequency and self.stable_damping and self.stable_shape
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mode:
+    """A cluster of stable poles: a mode of the plant.
+
+    Attributes
+    ----------
+    pole : complex, rad/s
+        Median.
+    frequency_hz, damping : float
+        Of that.
+    frequency_spread, damping_spread : float
+        Standard deviation over the orders; not the uncertainty from noise.
+    orders : tuple of int
+        Models that show it.
+    """
+
+    pole: complex
+    frequency_hz: float
+    damping: float
+    frequency_spread: float
+    damping_spread: float
+    orders: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stabilisation:
+    """Poles of models of all orders.
+
+    Attributes
+    ----------
+    method : {"n4sid", "moesp", "cva", "pbsid"}
+    orders : tuple of int
+    poles : tuple of ModePole
+        Lowest order first.
+    modes : tuple of Mode
+        Lowest frequency first.
+    singular_values : tuple of float
+        By order.
+    criteria : tuple of float
+        Bayes' criterion by order, less is better.
+    """
+
+    method: Method
+    orders: tuple[int, ...]
+    poles: tuple[ModePole, ...]
+    modes: tuple[Mode, ...]
+    singular_values: tuple[float, ...]
+    criteria: tuple[float, ...]
+
+    @property
+    def suggested(self) -> int:
+        """Order of least criterion."""
+        return self.orders[int(np.argmin(self.criteria))]
+
+
+def stabilisation(
+    data: IOData,
+    method: str = "pbsid",
+    n_max: int = 20,
+    *,
+    frequency: float = _FREQUENCY,
+    damping: float = _DAMPING,
+    shape: float = _SHAPE,
+    tick: Callable[[], None] | None = None,
+) -> Stabilisation:
+    """Identify models of all orders and follow their poles.
+
+    Parameters
+    ----------
+    data : IOData
+    method : {"pbsid", "n4sid", "moesp", "cva"}, optional
+        All but pbsid are biased under feedback.
+    n_max : int, optional
+        Largest order.
+    frequency : float, optional
+        Relative change of a stable frequency, at most.
+    damping : float, optional
+        Change of a stable damping at most: relative, or absolute in units of 0.1 where damping is under 0.1.
+    shape : float, optional
+        Modal assurance criterion of a stable shape, at least (0 to 1).
+    tick : callable, optional
+        Called between steps; may raise to interrupt.
+
+    Returns
+    -------
+    Stabilisation
+
+    Raises
+    ------
+    EstimationError
+        If the method is unknown, a tolerance is out of range, or as for the method.
+    """
+    known = get_args(Method)
+    if method not in known:
+        raise EstimationError(f"method {method!r} is not one of {', '.join(known)}.{nearest(method, known)}")
+    if not (frequency > 0 and damping > 0 and 0 <= shape <= 1):
+        raise EstimationError(
+            f"tolerances of frequency {frequency:g}, damping {damping:g} and shape {shape:g}; the first two must be "
+            "positive, the last between 0 and 1. Leave them out for the usual ones"
+        )
+    models = subspace_models(data, cast(Method, method), n_max, tick=tick)
+    rows = [_poles(m.order, m.model.A, m.model.C, data) for m in models]
+    found = list(rows[0])
+    for before, after in pairwise(rows):
+        found += [_marked(p, before, frequency, damping, shape) for p in after]
+    return Stabilisation(
+        method=cast(Method, method),
+        orders=tuple(m.order for m in models),
+        poles=tuple(found),
+        modes=_modes(found, models[-1].order, frequency, damping),
+        singular_values=tuple(m.singular_value for m in models),
+        criteria=tuple(m.criterion for m in models),
+    )
+
+
+def _poles(order: int, A: Array, C: Array, data: IOData) -> list[ModePole]:
+    """Poles with their mode shapes, outputs in units of their standard deviations; poles at z = 0 are delays."""
+    values, vectors = np.linalg.eig(A)
+    shapes = (C / np.maximum(np.std(data.y, axis=0), 1e-300)[:, None]) @ vectors
+    out = list[ModePole]()
+    for z, v in sorted(zip(values, shapes.T, strict=True), key=lambda x: abs(np.angle(x[0]))):
+        if z.imag < 0 or abs(z) < 1e-8:
+            continue
+        s = complex(np.log(complex(z)) / data.dt)
+        largest = v[np.argmax(np.abs(v))]
+        size = abs(s)
+        out.append(
+            ModePole(
+                order=order,
+                pole=s,
+                frequency_hz=size / (2 * np.pi),
+                damping=-s.real / size if size else 0.0,
+                shape=tuple(complex(x) for x in (v / largest if abs(largest) > 0 else v)),
+            )
+        )
+    return out
+
+
+def _marked(p: ModePole, before: Sequence[ModePole], frequency: float, damping: float, shape: float) -> ModePole:
+    """Compare a pole with the nearest one of the order below that is of its kind."""
+    same = [q for q in before if (q.pole.imag > 0) == (p.pole.imag > 0)]
+    if not same:
+        return p
+    near = min(same, key=lambda q: abs(q.pole - p.pole))
+    return ModePole(
+        order=p.order,
+        pole=p.pole,
+        frequency_hz=p.frequency_hz,
+        damping=p.damping,
+        shape=p.shape,
+        stable_frequency=_close(p.frequency_hz, near.frequency_hz, frequency),
+        stable_damping=_damped_alike(p, near, damping),
+        stable_shape=assurance(p.shape, near.shape) >= shape,
+    )
+
+
+def _close(a: float, b: float, tolerance: float) -> bool:
+    return abs(a - b) <= tolerance * max(abs(a), abs(b), 1e-300)
+
+
+def _damped_alike(p: ModePole, q: ModePole, tolerance: float) -> bool:
+    return abs(p.damping - q.damping) <= tolerance * max(abs(p.damping), abs(q.damping), 0.1)
+
+
+def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
+    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
+
+    Parameters
+    ----------
+    one, other : sequence of complex
+
+    Returns
+    -------
+    float
+        1 for equal shapes, whatever their size; 0 for orthogonal ones.
+    """
+    a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
+    size = float(np.vdot(a, a).real * np.vdot(b, b).real)
+    return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
+
+
+def _modes(poles: Sequence[ModePole], largest: int, frequency: float, damping: float) -> tuple[Mode, ...]:
+    """Gather stable poles: from the highest order down, each joins the cluster it is near to, or begins one."""
+    clusters = list[list[ModePole]]()
+    for p in sorted((p for p in poles if p.stable), key=lambda p: -p.order):
+        fitting = [c for c in clusters if _belongs(p, c, frequency, damping)]
+        if fitting:
+            min(fitting, key=lambda c: abs(_centre(c) - p.pole)).append(p)
+        else:
+            clusters.append([p])
+    out = list[Mode]()
+    for c in clusters:
+        orders = sorted({p.order for p in c})
+        if len(orders) < max(3, _SHARE * (largest - orders[0] + 1)):
+            continue
+        centre = _centre(c)
+        out.append(
+            Mode(
+                pole=centre,
+                frequency_hz=abs(centre) / (2 * np.pi),
+                damping=-centre.real / abs(centre) if centre else 0.0,
+                frequency_spread=float(np.std([p.frequency_hz for p in c])),
+                damping_spread=float(np.std([p.damping for p in c])),
+                orders=tuple(orders),
+            )
+        )
+    return tuple(sorted(out, key=lambda m: m.frequency_hz))
+
+
+def _belongs(p: ModePole, cluster: Sequence[ModePole], frequency: float, damping: float) -> bool:
+    centre = _centre(cluster)
+    size = max(abs(centre), abs(p.pole))
+    same = (p.pole.imag > 0) == (cluster[0].pole.imag > 0) and all(q.order != p.order for q in cluster)
+    reach = 2 * size * (frequency + damping * max(abs(p.damping), 0.1))
+    return same and abs(p.pole - centre) <= reach
+
+
+def _centre(cluster: Sequence[ModePole]) -> complex:
+    values = np.array([p.pole for p in cluster])
+    return complex(np.median(values.real), np.median(values.imag))
