@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --no-input
 PYTEST_ARGS ?=
+BENCH ?=
 
 # Without byte code every start of the command compiles its imports again: 3 to 6 times slower.
 unexport PYTHONDONTWRITEBYTECODE
@@ -17,7 +18,7 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types bench docs format changelog lock clean distclean
+.PHONY: help setup demo test lint types peers bench docs format changelog lock clean distclean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -51,8 +52,17 @@ lint: setup  ## formatting and lint
 types: setup  ## strict type check
 	$(BIN)/mypy
 
-bench: setup  ## measure speed and accuracy beside plain SciPy; writes bench/results and docs/benchmarks.md
-	@$(BIN)/python bench/run.py
+peers: bench/.venv/linear/.setup  ## make the environment of the packages that the benchmarks compare with
+
+bench/.venv/linear/.setup: requirements/peers-linear.txt tools/venv.sh
+	@mkdir -p bench/.venv
+	@sh tools/venv.sh bench/.venv/linear "$(PYTHON)"
+	@echo "Installing the peers into bench/.venv/linear (a minute or two, once) ..." >&2
+	@bench/.venv/linear/bin/python -m pip --disable-pip-version-check --no-input install -qq --require-hashes -r $<
+	@touch $@
+
+bench: setup peers  ## measure speed and accuracy beside SciPy and peers; writes docs/benchmarks.md (BENCH="speed records" chooses)
+	@$(BIN)/python bench/run.py $(BENCH)
 
 docs: $(VENV)/.docs  ## build the documentation into docs/_site
 	@$(BIN)/python -m sphinx --quiet -b html docs docs/_site
@@ -77,4 +87,4 @@ clean:  ## remove caches and builds
 	@find src tests bench tools docs -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean  ## clean, and remove .venv
-	@rm -rf $(VENV) src/*.egg-info
+	@rm -rf $(VENV) bench/.venv src/*.egg-info

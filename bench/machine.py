@@ -8,6 +8,8 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
+from peers import versions
+
 
 def processor() -> str:
     """The processor's own name, as far as the system tells it."""
@@ -27,6 +29,7 @@ def description() -> dict[str, object]:
         "system": platform.system(),
         "python": platform.python_version(),
         **{name: version(name) for name in ("ambid", "numpy", "scipy", "numba")},
+        "peers": versions(),
         "threads": 1,
         "load_average_before": os.getloadavg()[0],
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

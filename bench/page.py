@@ -5,60 +5,62 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from timing import Line, Timing
+from table import Table
+from timing import Line, quantity, shown
 
 INTRODUCTION = """# Benchmarks
 
-Made by `make bench` (`bench/run.py`), which also writes every number to `bench/results/latest.json`. Each job is timed
-beside a straightforward implementation of the same job with SciPy (`bench/scipy_*.py`), in the same run, the two in
-turn. Medians, with minima in brackets; the ratio is that of the medians, above 1 where ambid takes less. Everything is
-warm (compiled, files cached) where nothing else is said, and runs on one thread: `OPENBLAS_NUM_THREADS`,
-`OMP_NUM_THREADS`, `MKL_NUM_THREADS` and `NUMBA_NUM_THREADS` are 1 for both sides, because threads only cost time on
-matrices of this size.
+Made by `make bench` (`bench/run.py`), which also writes every number to `bench/results/latest.json`. Physical
+identification is timed beside a straightforward implementation of the same job with SciPy (`bench/scipy_*.py`), the
+black-box estimators beside other packages, each in its best setting (`bench/peer_*.py`, in an environment of their
+own), all in the same run and in turn. Medians, with minima in brackets; the ratio is that of the medians, above 1 where
+ambid takes less. Everything is warm (compiled, files cached) where nothing else is said, and runs on one thread:
+`OPENBLAS_NUM_THREADS`, `OMP_NUM_THREADS`, `MKL_NUM_THREADS` and `NUMBA_NUM_THREADS` are 1 for all, because threads only
+cost time on matrices of this size.
 """
 
 
-def page(machine: Mapping[str, Any], lines: Sequence[Line]) -> str:
-    """Write the page in Markdown."""
-    on = (
+def page(parts: Sequence[Mapping[str, Any]]) -> str:
+    """Write the page in Markdown; `parts` are those of the file of results."""
+    written = [INTRODUCTION]
+    told = ""
+    for part in parts:
+        on = _measured_on(part["machine"])
+        written += [on, ""] if on != told else []
+        told = on
+        written += [Table.from_json(x).as_markdown() for x in part["items"] if "columns" in x]
+        written += _groups([Line.from_json(x) for x in part["items"] if "columns" not in x])
+    return "\n".join(written).rstrip() + "\n"
+
+
+def _measured_on(machine: Mapping[str, Any]) -> str:
+    peers = ", ".join(f"{name} {version}" for name, version in machine["peers"].items())
+    return (
         f"Measured on: {machine['processor']}, {machine['cores']} cores; Python {machine['python']},"
-        f" NumPy {machine['numpy']}, SciPy {machine['scipy']}, Numba {machine['numba']}; {machine['date']}."
+        f" NumPy {machine['numpy']}, SciPy {machine['scipy']}, Numba {machine['numba']}; peers: {peers};"
+        f" {machine['date'].split()[0]}."
     )
-    groups = list(dict.fromkeys(line.group for line in lines))
-    parts = [INTRODUCTION, on, ""]
-    for group in groups:
+
+
+def _groups(lines: Sequence[Line]) -> Iterator[str]:
+    for group in dict.fromkeys(line.group for line in lines):
         members = [line for line in lines if line.group == group]
-        parts += [f"## {group}", "", "| job | ambid | beside it | takes | ratio |", "|---|---|---|---|---|"]
-        parts += [_row(line) for line in members]
-        parts += ["", *_remarks(members)]
-    return "\n".join(parts).rstrip() + "\n"
+        yield from (f"## {group}", "", "| job | ambid | beside it | takes | ratio |", "|---|---|---|---|---|")
+        yield from (_row(line) for line in members)
+        yield ""
+        yield from _remarks(members)
 
 
 def _row(line: Line) -> str:
     ratios = line.ratios()
-    other = "–" if line.other is None else _shown(line.other, line.unit)
+    other = "–" if line.other is None else shown(line.other, line.unit)
     ratio = "–" if ratios is None else f"{ratios['of_medians']:.3g}"
-    return f"| {line.job} | {_shown(line.ambid, line.unit)} | {line.beside or '–'} | {other} | {ratio} |"
-
-
-def _shown(timing: Timing, unit: str) -> str:
-    middle = quantity(timing.median, unit)
-    return middle if timing.repeats == 1 else f"{middle} ({quantity(timing.minimum, unit)})"
-
-
-def quantity(value: float, unit: str) -> str:
-    """Write a time or a size with three digits and a fitting prefix."""
-    if unit == "B":
-        return f"{value / 1e6:.0f} MB"
-    for factor, name in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
-        if value >= factor:
-            return f"{value / factor:.3g} {name}"
-    return f"{value / 1e-9:.3g} ns"
+    return f"| {line.job} | {shown(line.ambid, line.unit)} | {line.beside or '–'} | {other} | {ratio} |"
 
 
 def _remarks(lines: Sequence[Line]) -> Iterator[str]:
     """Say below a table what its columns cannot."""
-    seen = set()
+    seen: list[object] = []
     for line in lines:
         notes: dict[str, Any] = line.notes
         if "relative_error_of_differences" in notes:
@@ -78,8 +80,8 @@ def _remarks(lines: Sequence[Line]) -> Iterator[str]:
                 f" {notes['other_steps_per_second']:.3g}, measured over {notes['other_steps_run']} steps."
                 f" Without noise the two differ by at most {apart['position_m']:.1g} m and {apart['current_A']:.1g} A."
             )
-        if "accuracy" in notes and id(notes) not in seen:
-            seen.add(id(notes))
+        if "accuracy" in notes and notes["accuracy"] not in seen:
+            seen.append(notes["accuracy"])
             yield from _accuracy(line, notes)
         if "scipy_wall_s" in notes:
             yield (

@@ -1,6 +1,7 @@
-"""Measure ambid beside straightforward SciPy: ``make bench``.
+"""Measure ambid beside straightforward SciPy and beside peers: ``make bench``, or ``make bench BENCH="speed records"``.
 
-Writes bench/results/latest.json and docs/benchmarks.md; ends within about three minutes.
+Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about a quarter of an
+hour, the physical one three minutes.
 """
 
 from __future__ import annotations
@@ -9,54 +10,74 @@ import json
 import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+PARTS = ("physical", "montecarlo", "speed", "records")
 
 
-def main() -> None:
+def main(wanted: list[str]) -> None:
+    unknown = sorted(set(wanted) - set(PARTS))
+    if unknown:
+        raise SystemExit(f"no part {unknown[0]!r}; there are: {' '.join(PARTS)}")
     # The libraries look at this once, when they are first imported; all imports are below for that reason.
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     if str(HERE) not in sys.path:
         sys.path.insert(0, str(HERE))
-    from cases import all_cases
-    from computing import identification_lines, residual_lines, simulation_lines
     from machine import description
-    from page import page, quantity
-    from processes import large_lines, process_lines
+    from page import page
+    from timing import quantity
 
-    print(f"one thread for both sides: {', '.join(ONE_THREAD)} = 1", flush=True)
-    before, machine = time.perf_counter(), description()
-    cases = all_cases()
-    bearing = cases[-1]
-    sources = [
-        *(residual_lines(case) for case in cases),
-        *(identification_lines(case) for case in cases),
-        simulation_lines(),
-        process_lines(bearing),
-        large_lines(bearing),
-    ]
-    lines = []
-    for source in sources:
-        for line in source:
-            lines.append(line)
-            ratios = line.ratios()
-            print(f"{quantity(line.ambid.median, line.unit):>10}  {line.job}", flush=True)
-            if line.other is not None and ratios is not None:
-                other = quantity(line.other.median, line.unit)
-                print(f"{other:>10}  {line.beside}; ratio {ratios['of_medians']:.3g}", flush=True)
-            if "largest_difference_of_residuals_sd" in line.notes:
-                print(f"{'':12}residuals differ by at most {line.notes['largest_difference_of_residuals_sd']:.1g} sd")
-    machine["took_s"] = time.perf_counter() - before
-    RESULTS.parent.mkdir(exist_ok=True)
-    result = {"schema": "ambid.bench/1", "machine": machine, "lines": [line.as_json() for line in lines]}
-    RESULTS.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(page(machine, lines), encoding="utf-8")
-    print(f"{quantity(machine['took_s'], 's')} in all; {RESULTS.relative_to(HERE.parent)} and docs/{PAGE.name} written")
+    print(f"one thread for all: {', '.join(ONE_THREAD)} = 1", flush=True)
+    results = _earlier()
+    for part in wanted or PARTS:
+        print(f"-- {part}", flush=True)
+        before, machine = time.perf_counter(), description()
+        found = [item.as_json() for item in _measured(part)]
+        machine["took_s"] = time.perf_counter() - before
+        results[part] = {"machine": machine, "items": found}
+        print(f"{quantity(machine['took_s'], 's')} for {part}", flush=True)
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps({"schema": "ambid.bench/2", "parts": results}, indent=1) + "\n", encoding="utf-8")
+    missing = [part for part in PARTS if part not in results]
+    if missing:
+        print(f"docs/{PAGE.name} not written: not measured yet: {' '.join(missing)}")
+        return
+    PAGE.write_text(page([results[part] for part in PARTS]), encoding="utf-8")
+    print(f"{RESULTS.relative_to(HERE.parent)} and docs/{PAGE.name} written")
+
+
+def _earlier() -> dict[str, Any]:
+    """What earlier runs measured, by part."""
+    if not RESULTS.exists():
+        return {}
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    return dict(found["parts"]) if found.get("schema") == "ambid.bench/2" else {}
+
+
+def _measured(part: str) -> Iterator[Any]:
+    """Lines and tables of one part."""
+    if part == "physical":
+        from physical import physical_lines
+
+        return physical_lines()
+    if part == "montecarlo":
+        from montecarlo import accuracy_tables
+
+        return accuracy_tables()
+    if part == "speed":
+        from speed import speed_tables
+
+        return speed_tables()
+    from records import record_tables
+
+    return record_tables()
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +48,12 @@ class Line:
     def as_json(self) -> dict[str, object]:
         return {**asdict(self), "ratio": self.ratios()}
 
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Line:
+        values = {k: v for k, v in found.items() if k != "ratio"}
+        times = {k: Timing(**values[k]) for k in ("ambid", "other") if values[k] is not None}
+        return cls(**{**values, **times})
+
 
 def seconds(call: Callable[[], object]) -> float:
     before = time.perf_counter()
@@ -66,3 +73,19 @@ def alternate(rounds: int, *jobs: tuple[Callable[[], object], int]) -> list[Timi
         for (call, times), values in zip(jobs, taken, strict=True):
             values.extend(seconds(call) for _ in range(times))
     return [Timing.of(values) for values in taken]
+
+
+def quantity(value: float, unit: str) -> str:
+    """Write a time or a size with three digits and a fitting prefix."""
+    if unit == "B":
+        return f"{value / 1e6:.0f} MB"
+    for factor, name in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
+        if value >= factor:
+            return f"{value / factor:.3g} {name}"
+    return f"{value / 1e-9:.3g} ns"
+
+
+def shown(timing: Timing, unit: str) -> str:
+    """Write the median, and the minimum where there are repeats."""
+    middle = quantity(timing.median, unit)
+    return middle if timing.repeats == 1 else f"{middle} ({quantity(timing.minimum, unit)})"
