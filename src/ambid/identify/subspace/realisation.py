@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import solve_discrete_are, solve_triangular
 
 Array = NDArray[np.float64]
 
 _FLOORS = (1e-18, 1e-14, 1e-10, 1e-6)  # noise added to outputs of unit variance until the Riccati equation has a root
+
+_DEPENDENT = 1e-11  # diagonal beside its largest below which columns count as dependent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,7 +107,13 @@ def least_squares(rows: Array, right: Array) -> Array:
     -------
     ndarray, shape (n_unknowns, n_right)
     """
-    return np.asarray(np.linalg.lstsq(rows, right, rcond=1e-12)[0])
+    n = rows.shape[1]
+    if rows.shape[0] >= n > 0:
+        factor = np.asarray(np.linalg.qr(np.hstack([rows, right]), mode="r"))
+        size = np.abs(np.diag(factor[:n, :n]))
+        if np.min(size) > _DEPENDENT * np.max(size):
+            return np.asarray(solve_triangular(factor[:n, :n], factor[:n, n:], check_finite=False))
+    return np.asarray(np.linalg.lstsq(rows, right, rcond=_DEPENDENT / 10)[0])
 
 
 def observability(A: Array, C: Array, length: int) -> Array:
