@@ -1,8 +1,9 @@
 """Do the data support the orders? Pole-zero pairs that cannot be told apart, and last coefficients that may be zero.
 
 A model of too high an order puts a pole and a zero on top of each other, anywhere: their difference is then within its
-own 95 % region around 0 (delta method), and their place means nothing. Which pairs could cancel depends on the
-structure: B with F, C with D, A with C and B at once (ARMAX); in ARX a factor common to A and B is a noise model.
+own 99.9 % region around 0 (delta method; wide, because where an order is too high the likelihood is far from a
+parabola), and their place means nothing. Which pairs could cancel depends on the structure: B with F, C with D, A with
+C and B at once (ARMAX); in ARX a factor common to A and B is a noise model.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ambid.identify.estimate import Check
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_CHI2_95 = (3.841458820694124, 5.991464547107979)  # of one and two degrees of freedom
+_CHI2_999 = (10.827566170662733, 13.815510557964274)  # of one and two degrees of freedom
 _P_LEAST = 0.05
 
 
@@ -38,7 +39,7 @@ class Cancellation:
     where : str
         Which polynomials.
     distance : float
-        In standard deviations.
+        Over that at the edge of the 99.9 % region: less than 1.
     """
 
     pole: complex
@@ -80,7 +81,7 @@ def orders_supported(fit: BlackBoxFit) -> Check | None:
 
 
 def cancellations(fit: BlackBoxFit) -> tuple[Cancellation, ...]:
-    """Find pole-zero pairs that are within the 95 % region of their difference.
+    """Find pole-zero pairs that are within the 99.9 % region of their difference.
 
     Parameters
     ----------
@@ -105,9 +106,7 @@ def cancellations(fit: BlackBoxFit) -> tuple[Cancellation, ...]:
             if near:
                 d, j = min(near)
                 used.add(j)
-                found.append(
-                    Cancellation(pole=complex(pole), zero=complex(zeros[0][j]), where=where, distance=d * 1.96)
-                )
+                found.append(Cancellation(pole=complex(pole), zero=complex(zeros[0][j]), where=where, distance=d))
     return tuple(found)
 
 
@@ -115,7 +114,7 @@ Roots = tuple[Complex, Complex]
 
 
 def _distance(pole: complex, dp: Complex, zero: complex, dz: Complex, covariance: Array) -> float:
-    """Distance over that at the edge of the 95 % region; infinite where nothing was estimated, or no spread exists."""
+    """Distance over that at the edge of the 99.9 % region; infinite where no spread exists."""
     gap, slope = pole - zero, dp - dz
     if not np.all(np.isfinite(slope)):
         return np.inf
@@ -126,7 +125,7 @@ def _distance(pole: complex, dp: Complex, zero: complex, dz: Complex, covariance
     if values[0] <= 0:
         return np.inf
     v = vectors.T @ (np.array([gap.real]) if real else np.array([gap.real, gap.imag]))
-    return float(np.sqrt(np.sum(v**2 / values) / _CHI2_95[len(v) - 1]))
+    return float(np.sqrt(np.sum(v**2 / values) / _CHI2_999[len(v) - 1]))
 
 
 def _families(fit: BlackBoxFit) -> Iterator[tuple[str, Roots, Roots]]:

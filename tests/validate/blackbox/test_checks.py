@@ -1,0 +1,228 @@
+"""Checks of black-box fits: what is wrong is found, and only that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete, lfilter
+
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.response import Offsets
+from ambid.identify.blackbox.state_space import StateSpaceModel
+from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.identify.polynomial import armax, bj, oe
+from ambid.validate.blackbox import judged
+from ambid.validate.blackbox.ahead import ahead
+from ambid.validate.blackbox.gradient import gradient, polynomial_gradient
+from ambid.validate.blackbox.predictor import errors, innovations_form
+from tests.validate.blackbox.fits import DT, arx, io, polynomial, run
+
+TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
+BJ = polynomial(F=((1, -1.5, 0.7),), B=((0, 1.0, 0.5),), C=(1, 0.4), D=(1, -0.8))
+
+
+def record(model=TRUTH, seed=0, n=800, **options):
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((n, 1))
+    return io(u, run(model, u, 0.3 * rng.standard_normal((n, 1))), **options)
+
+
+def loop(seed=0, n=800, gain=0.5, **options):
+    """An output-error plant with coloured noise under u = r - gain y."""
+    rng = np.random.default_rng(seed)
+    v = lfilter([1.0], [1, -0.9], 0.3 * rng.standard_normal(n))
+    x, u, y = np.zeros(n), np.zeros(n), np.zeros(n)
+    for k in range(2, n):
+        x[k] = 1.5 * x[k - 1] - 0.7 * x[k - 2] + 0.3 * u[k - 1] + 0.1 * u[k - 2]
+        y[k] = x[k] + v[k]
+        u[k] = rng.standard_normal() - gain * y[k]
+    return io(u, y, **options)
+
+
+def failed(fit):
+    return {k for k, c in fit.checks.items() if not c.passed}
+
+
+def test_a_right_model_passes_everything():
+    data = record()
+    fit = judged(arx(data, 2, 2), data)
+    assert not failed(fit)
+    assert {"residuals_white", "residuals_uncorrelated", "feedback", "stable_predictor", "orders_supported"} == set(
+        fit.checks
+    )
+    assert fit.passed
+    assert all(c.detail for c in fit.checks.values())
+
+
+def test_a_missing_order_is_found():
+    data = record()
+    assert {"residuals_white", "residuals_uncorrelated"} <= failed(judged(arx(data, 1, 1), data))
+
+
+def test_a_late_delay_is_found_in_the_inputs():
+    data = record()
+    assert "residuals_uncorrelated" in failed(judged(arx(data, 2, 2, nk=2), data))
+
+
+def test_a_missing_noise_model_is_found_although_the_inputs_are_white():
+    data = record(polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),), C=(1, 0.8)))
+    assert "residuals_white" in failed(judged(arx(data, 2, 2), data))
+
+
+def test_coloured_noise_is_no_fault_of_an_output_error_model():
+    data = record(BJ)
+    fit = judged(oe(data, {"nb": 2, "nf": 2, "nk": 1}), data)
+    assert fit.checks["residuals_white"].passed
+    assert fit.checks["residuals_white"].p < 1e-3
+    assert "residuals_uncorrelated" not in failed(fit)
+    assert sum("coloured" in w for w in fit.warnings) == 1
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_feedback_fails_an_output_error_model_and_warns_a_noise_model(told):
+    data = loop(open_loop=told)
+    biased = judged(oe(data, {"nb": 2, "nf": 2, "nk": 1}), data)
+    assert "feedback" in failed(biased)
+    assert any("there is feedback in this record" in w for w in biased.warnings)
+    consistent = judged(bj(data, {"nb": 2, "nc": 0, "nd": 1, "nf": 2, "nk": 1}), data)
+    assert "feedback" not in failed(consistent)
+    assert consistent.checks["feedback"].values["seen"] == 1.0
+    assert any("said to be open loop" in w for w in consistent.warnings) == told
+
+
+def test_a_wrong_model_alone_is_no_sign_of_feedback():
+    rng = np.random.default_rng(4)
+    u = lfilter([1.0], [1, -0.9], rng.standard_normal((800, 1)), axis=0)
+    data = io(u, run(TRUTH, u, 0.3 * rng.standard_normal((800, 1))))
+    fit = judged(arx(data, 1, 1), data)
+    assert "residuals_uncorrelated" in failed(fit)
+    assert fit.checks["feedback"].p > 1e-3
+
+
+def test_a_periodic_input_says_nothing_of_feedback():
+    t = np.arange(800.0)[:, None]
+    u = np.sin(0.3 * t) + np.cos(1.1 * t)
+    data = io(u, run(TRUTH, u, 0.3 * np.random.default_rng(5).standard_normal((800, 1))))
+    assert judged(arx(data, 2, 2), data).checks["feedback"].passed
+
+
+@pytest.mark.parametrize(
+    ("make", "where"),
+    [
+        (lambda d: oe(d, {"nb": 3, "nf": 3, "nk": 1}), "B and F"),
+        (lambda d: armax(d, {"na": 3, "nb": 3, "nc": 3, "nk": 1}), "A with B and C"),
+        (lambda d: bj(d, {"nb": 2, "nc": 2, "nd": 2, "nf": 2, "nk": 1}), "C and D"),
+        (lambda d: arx(d, 4, 3), "a4, b3"),
+    ],
+)
+def test_too_high_an_order_is_found(make, where):
+    model = {
+        "B and F": polynomial(F=((1, -1.5, 0.7),), B=((0, 1.0, 0.5),)),
+        "A with B and C": polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),), C=(1, 0.5, 0.2)),
+        "C and D": BJ,
+        "a4, b3": TRUTH,
+    }[where]
+    data = record(model, n=1500)
+    check = judged(make(data), data).checks["orders_supported"]
+    assert not check.passed
+    assert where in check.detail
+
+
+def test_gradients_of_the_predictor_agree_with_differences():
+    model = polynomial(A=(1, -0.3), B=((0, 1.0, 0.5),), C=(1, 0.4, 0.1), D=(1, -0.6), F=((1, -1.2, 0.5),))
+    rng = np.random.default_rng(1)
+    u, y = rng.standard_normal((300, 1)), rng.standard_normal(300)
+
+    def predicted(theta):
+        p = model.with_theta(theta).outputs[0]
+        v = lfilter(p.A, [1.0], y) - lfilter(p.B[0], p.F[0], u[:, 0])
+        return y - lfilter(p.D, p.C, v)
+
+    theta = model.theta
+    every = polynomial_gradient(model.outputs[0], u, y, y - predicted(theta))
+    for k in [k for k, n in enumerate(model.names) if n not in ("a0", "c0", "d0", "f0")]:
+        h = np.zeros(theta.size)
+        h[k] = 1e-6
+        slope = (predicted(theta + h) - predicted(theta - h)) / 2e-6
+        np.testing.assert_allclose(every[:, k], slope, atol=1e-6 * np.abs(every).max())
+
+
+def test_the_tangent_of_a_state_space_holds_the_change_of_every_entry():
+    rng = np.random.default_rng(2)
+    parts = {
+        "A": np.array([[0.8, 0.2], [-0.3, 0.7]]),
+        "B": rng.standard_normal((2, 1)),
+        "C": rng.standard_normal((2, 2)),
+        "D": np.array([[0.3], [0.1]]),
+        "K": 0.2 * rng.standard_normal((2, 2)),
+    }
+    data = io(rng.standard_normal((400, 1)), rng.standard_normal((400, 2)))
+    fit = by_hand(StateSpaceModel(**parts, dt=DT), data)
+    found = errors(fit, data)
+    rows = gradient(fit, data, found).rows
+    wide = np.vstack([J[60:] for J in rows])
+    # one set of directions serves both outputs, but for those of D
+    for name, value in parts.items():
+        for at in np.ndindex(value.shape):
+            h = np.zeros(value.shape)
+            h[at] = 1e-6
+            ends = [
+                errors(by_hand(StateSpaceModel(**{**parts, name: value + s * h}, dt=DT), data), data) for s in (1, -1)
+            ]
+            slope = (ends[1].one_step - ends[0].one_step) / 2e-6
+            for o, J in enumerate(rows):
+                rest = slope[60:, o] - J[60:] @ np.linalg.lstsq(J[60:], slope[60:, o], rcond=1e-10)[0]
+                assert np.linalg.norm(rest) < 1e-5 * np.linalg.norm(slope[60:]) + 1e-9, (name, at)
+    assert wide.shape[1] == 2 * (2 + 1 + 2) + 1
+
+
+def by_hand(model, data) -> BlackBoxFit:
+    return made(
+        "n4sid" if isinstance(model, StateSpaceModel) else "srivc",
+        data,
+        orders={"n": 2},
+        model=model,
+        covariance=None,
+        n_estimated=4,
+        offsets=Offsets(u=np.zeros(data.n_inputs), y=np.zeros(data.n_outputs)),
+        noise_covariance=0.01 * np.eye(data.n_outputs),
+    )
+
+
+def test_a_delayed_continuous_model_is_discretised_as_the_plant_samples():
+    """2.4 samples of delay: the held input of a fine grid, sampled."""
+    fine, n = 10, 200
+    rng = np.random.default_rng(3)
+    num, den = [3.0, 40.0], [1.0, 4.0, 90.0]
+    u = rng.standard_normal(n)
+    a, b, c, _, _ = cont2discrete([np.array(m) for m in _companion(num, den)], DT / fine, method="zoh")
+    held = np.concatenate([np.zeros(24), np.repeat(u, fine)])[: n * fine]
+    x, y = np.zeros(2), np.zeros(n)
+    for k in range(n * fine):
+        if k % fine == 0:
+            y[k // fine] = (c @ x)[0]
+        x = a @ x + b[:, 0] * held[k]
+    data = io(u, y)
+    fit = by_hand(TransferModel(num=((num,),), den=((den,),), dt=None, delay=(2.4 * DT,)), data)
+    assert innovations_form(fit).dt == DT
+    found = judged(fit, data)
+    assert found.fit["y0"].simulation > 1 - 1e-6
+    slopes = gradient(fit, data, errors(fit, data))
+    assert slopes.rows[0].shape[1] >= 4
+
+
+def _companion(num, den):
+    return [[0.0, 1.0], [-den[2], -den[1]]], [[0.0], [1.0]], [[num[1], num[0]]], [[0.0]]
+
+
+def test_errors_ahead_are_as_large_as_the_model_expects():
+    data = record(BJ, n=4000)
+    fit = bj(data, {"nb": 2, "nc": 1, "nd": 1, "nf": 2, "nk": 1})
+    found = ahead(fit, record(BJ, seed=9, n=4000), (1, 4, 30))
+    assert [x.steps for x in found] == [1, 4, 30]
+    for x in found:
+        assert x.rmse == pytest.approx(x.expected_sd, rel=0.08)
+    assert found[0].fit > found[1].fit > found[2].fit
+    noise = lfilter([1, 0.4], [1, -0.8], np.eye(1, 30)[0])
+    assert found[2].expected_sd == pytest.approx(0.3 * np.linalg.norm(noise), rel=0.1)
