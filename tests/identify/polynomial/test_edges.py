@@ -172,3 +172,10 @@ def test_stability_is_that_of_the_roots(roots: list[complex]) -> None:
     assert stable(np.append(p, 0.0)) == stable(p)
     assert stable(reflected(p))
     assert not stable(np.array([1.0, np.nan]))
+
+
+def test_a_long_impulse_response() -> None:
+    data = SYSTEMS["arx"].data(20, 3000)
+    fit = polynomial.fir(data, {"nb": 200, "nk": 0})
+    truth = lfilter(B, A, np.eye(1, 200)[0])
+    assert np.mean(np.abs(fit.model.outputs[0].B[0] - truth) < 1.96 * fit.sd[1:201]) > 0.85

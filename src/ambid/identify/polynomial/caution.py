@@ -88,16 +88,20 @@ def unstable_plant(layouts: Sequence[Layout], scaled: Scaled) -> list[str]:
 def _roots(model: PolynomialModel, o: int) -> dict[str, tuple[Complex, Complex]]:
     """Roots of each polynomial of one output, with their derivatives by all coefficients."""
     theta, several, out = model.theta, model.n_inputs > 1, {}
+    n_c = model.outputs[o].C.size
     for output, letter, i, place in model.blocks():
         c = theta[place]
         used = np.nonzero(c)[0]
         if output != o or not used.size:
             continue
         lead = int(used[0])
+        if letter == "B" and not (model.outputs[o].F[i or 0].size > 1 or min(model.outputs[o].A.size, n_c) > 1):
+            continue  # nothing that it could cancel, and there may be hundreds
         roots = roots_of(c[lead:])
         rows = np.zeros((roots.size, theta.size), dtype=np.complex128)
         if roots.size:
-            rows[:, place.start + lead : place.stop] = root_derivative(c[lead:], roots)
+            with np.errstate(over="ignore", invalid="ignore"):  # roots far away; what is not finite is left out below
+                rows[:, place.start + lead : place.stop] = root_derivative(c[lead:], roots)
         out[letter + (f".{i}" if several and i is not None else "")] = roots, rows
     return out
 

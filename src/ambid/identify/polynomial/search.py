@@ -120,9 +120,9 @@ def searched(
     floor = _NOTHING_LEFT * float(y @ y)
     at = evaluated(start, np.zeros(n))
     explained = float(np.sum(at.R[:n, -1] ** 2))
-    if predictor.n_initial and explained > 0.01 * at.cost:  # gradients by F and C need the initial states
+    if predictor.n_initial and explained > 1e-3 * at.cost:  # gradients by F and C need the initial states
         at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
-    damping, converged, shortened, count = 0.0, False, False, 1
+    damping, converged, shortened, exact, count = 0.0, False, False, False, 1
     while True:
         U, s, Vt, scale = _directions(at, n)
         spread = max(at.rest / max(n_rows - n - free.size, 1), 1e-300)
@@ -146,7 +146,10 @@ def searched(
             expected = at.cost - float(np.sum((at.R[n:-1, n:-1] @ step + at.gradient) ** 2)) - at.rest
             good = at.cost - trial.cost > 0.5 * expected
             damping = (0.0 if damping < 1e-6 else damping * 0.1) if good else max(damping, 1e-6)
-            at, shortened = trial, cut
+            at, shortened, exact = trial, cut, False
+        elif not exact:  # gradients at initial states that belong to these coefficients
+            at, exact = evaluated(at.theta, at.nuisance + _nuisance_step(at, np.zeros(free.size))), True
+            count += 1
         else:
             damping = max(damping * 10.0, 1e-3)
     return Fitted(
