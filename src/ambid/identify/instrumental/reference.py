@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 _HIGHEST = 16  # lags of the autoregression that are looked at
 _FORGOTTEN = 1e-6  # of an impulse response, where it is cut
+_ROUNDING = 1e-12  # variance, relative to the signal's, that counts as none: a controller without noise is exact
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +122,7 @@ def _by_criterion(R: Array, rows: int, n_w: int, n_r: int, highest: int) -> list
     for p in range(1, highest + 1):
         size = 1 + n_r + p * (n_w + n_r)
         left = R[size:, -n_w:]
-        _, logdet = np.linalg.slogdet(left.T @ left / rows + 1e-30 * np.eye(n_w))
+        _, logdet = np.linalg.slogdet(left.T @ left / rows + _ROUNDING * np.eye(n_w))
         score.append(rows * logdet + 2 * size * n_w)
     return [int(k) + 1 for k in np.argsort(score, kind="stable")]
 
@@ -134,8 +135,9 @@ def _impulse(theta: Array, n_w: int, n_r: int, p: int, n: int) -> Array | None:
     F[:n_w] = np.hstack([m[:, :n_w] for m in lags])
     F[n_w:, :-n_w] = np.eye(n_s - n_w)
     radius = float(np.max(np.abs(np.linalg.eigvals(F))))
-    if radius >= 1 - 1.0 / n:
+    if radius > 1 + 1.0 / n:  # over one record a pole this near to the circle grows by less than e: still an instrument
         return None
+    radius = min(radius, 1 - 1e-12)
     m = min(n, p + 50 + int(np.log(_FORGOTTEN) / np.log(max(radius, 1e-3))))
     drive = [theta[:n_r].T] + [lag[:, n_w:] for lag in lags]
     out = np.empty((m, n_w, n_r))
