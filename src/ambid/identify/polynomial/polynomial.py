@@ -19,7 +19,7 @@ from ambid.identify.polynomial.delay import long_delays
 from ambid.identify.polynomial.orders import Layout, Orders, fixed_places, layout_of, read_orders
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.result import result
-from ambid.identify.polynomial.scaled import Scaled, scaled_data, unit
+from ambid.identify.polynomial.scaled import Scaled, liveliest, scaled_data, unit
 from ambid.identify.polynomial.search import Fitted, searched
 from ambid.identify.polynomial.stability import stable_predictor
 from ambid.identify.polynomial.starts import starts
@@ -28,6 +28,7 @@ from ambid.identify.threads import one_thread
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-24  # squared residual, in units of the output's variance
+_WINDOW = 8192  # samples of a long record that decide between neighbouring delays
 _SMOOTH = 12  # evaluations; a longer way hints at a second minimum (always to be expected where A and D share roots)
 
 
@@ -80,20 +81,27 @@ def _layouts(
     n_u, n_y = scaled.u.shape[0], scaled.y.shape[0]
     if "nk" not in read or read["nk"] is not None:
         return [layout_of(read, n_u)] * n_y
+    piece = liveliest(scaled.u, _WINDOW)
+    part = replace(scaled, u=np.ascontiguousarray(scaled.u[:, piece]), y=np.ascontiguousarray(scaled.y[:, piece]))
+    rows = part.y.shape[1]
     out: list[Layout] = []
     for o in range(n_y):
         nk = long_delays(name, scaled.y[o], scaled.u, least)
         layout = layout_of({**read, "nk": nk}, n_u)
-        rows, cost = scaled.y.shape[1], fit_output(name, layout, scaled, o, {}, tick).cost
+        loss = _loss(fit_output(name, layout, part, o, {}, tick))
         for i in range(n_u):  # the structure itself decides between neighbours, where they clearly differ
             for k in (nk[i] - 1, nk[i] + 1):
                 near = replace(layout, nk=(*layout.nk[:i], k, *layout.nk[i + 1 :]))
                 if k >= least:
-                    found = fit_output(name, near, scaled, o, {}, tick).cost
-                    if rows * np.log(max(found, _ROUNDING * rows) / max(cost, _ROUNDING * rows)) < -np.log(rows):
-                        layout, cost = near, found
+                    found = _loss(fit_output(name, near, part, o, {}, tick))
+                    if rows * np.log(found / loss) < -np.log(rows):
+                        layout, loss = near, found
         out.append(layout)
     return out
+
+
+def _loss(fit: Fitted) -> float:
+    return max(fit.cost / fit.n_rows, _ROUNDING)
 
 
 def fit_output(

@@ -84,3 +84,24 @@ def unit(layout: Layout, scaled: Scaled, o: int) -> Array:
     for i in range(layout.n_inputs):
         out[layout.places["B", i]] = scaled.y_scale[o] / scaled.u_scale[i]
     return out
+
+
+def liveliest(u: Array, size: int) -> slice:
+    """Return the piece of a long record in which the inputs move most, for a start or a first choice.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_inputs, n_samples)
+    size : int
+        Of the piece; records up to twice as long are taken whole.
+
+    Returns
+    -------
+    slice
+    """
+    n = u.shape[1]
+    if n <= 2 * size:
+        return slice(0, n)
+    energy = np.add.reduceat(np.sum(u * u, axis=0), np.arange(0, n - size + 1, size))
+    first = int(np.argmax(energy[:-1])) * size
+    return slice(first, first + size)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ambid.identify.polynomial._kernels import filtered
 from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
+from ambid.identify.polynomial.scaled import liveliest
 from ambid.identify.polynomial.search import searched
 from ambid.identify.polynomial.stability import reflected, solved
 
@@ -311,15 +312,6 @@ def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
     return theta
 
 
-def _liveliest(u: Array) -> slice:
-    """The piece of a long record in which the input moves most: a start needs no more."""
-    if u.size <= 2 * _WINDOW:
-        return slice(0, u.size)
-    energy = np.add.reduceat(u * u, np.arange(0, u.size - _WINDOW + 1, _WINDOW))
-    first = int(np.argmax(energy[:-1])) * _WINDOW
-    return slice(first, first + _WINDOW)
-
-
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Array, Array]:
     """Fit B/F by least squares on data filtered by the last 1/F (Steiglitz & McBride 1965).
 
@@ -334,7 +326,7 @@ def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Ar
         B and a stable F.
     """
     arx = Layout(na=nf, nb=(nb,), nc=0, nd=0, nf=(0,), nk=(nk,))
-    part, F = _liveliest(u), np.ones(1)
+    part, F = liveliest(u[None, :], _WINDOW), np.ones(1)
     y, u = y[part], u[part]
     for _ in range(_SM_ITERATIONS if nf else 1):
         one = np.ones(1)
