@@ -125,6 +125,7 @@ def test_unstable_bearing_in_its_loop_has_its_poles_within_one_per_cent(bearing,
     poles = fit.model.poles()
     found = np.log(poles[np.abs(poles) > 0.5]) / data.dt
     assert found.size == 3
+    assert fit.details["condition_number"] > 1e10  # a band-limited input: it is the prior that makes this solvable
     for s in truth:
         assert np.min(np.abs(found - s)) < 0.01 * abs(s)
 

@@ -76,7 +76,7 @@ def fitted(
                 tick()
             others.append(model_of(plan, _decomposed(plan, factor, given), n))
         covariance = jackknife(full, others, plan.future, with_bias=method != "pbsid")
-    return _result(method, data, plan, found, full, covariance, criterion)
+    return _result(method, data, plan, found, given, full, covariance, criterion)
 
 
 def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
@@ -189,6 +189,7 @@ def _result(
     data: IOData,
     plan: Plan,
     found: Projection | Prediction,
+    given: Prior | None,
     full: Realisation,
     covariance: Array | None,
     criterion: Array | None,
@@ -223,8 +224,18 @@ def _result(
             "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
             "order_criterion": None if criterion is None else criterion.tolist(),
             "feedthrough": plan.feedthrough,
+            "condition_number": _condition(plan),
+            "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
             "Q": full.Q.tolist(),
             "S": (full.S * y).tolist(),
             "R": (full.R * np.outer(y, y)).tolist(),
         },
     )
+
+
+def _condition(plan: Plan) -> float:
+    """Return the condition number of the scaled regressors, at most 1e18: beyond is rounding."""
+    n_y = plan.factors.n_outputs
+    columns = _columns(plan)[: -n_y if plan.method == "pbsid" else -n_y * plan.future]
+    values = np.linalg.svd(triangular(plan.total[:, [0, *columns]])[1:, 1:], compute_uv=False)
+    return float(values[0] / max(values[-1], 1e-18 * values[0]))
