@@ -11,7 +11,9 @@ from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
-from ambid.identify.polynomial import armax, bj, oe
+from ambid.identify.instrumental import two_stage
+from ambid.identify.polynomial import arma, armax, bj, oe
+from ambid.identify.subspace import n4sid, pbsid
 from ambid.validate.blackbox import judged
 from ambid.validate.blackbox.ahead import ahead
 from ambid.validate.blackbox.gradient import gradient, polynomial_gradient
@@ -89,6 +91,43 @@ def test_feedback_fails_an_output_error_model_and_warns_a_noise_model(told):
     assert "feedback" not in failed(consistent)
     assert consistent.checks["feedback"].values["seen"] == 1.0
     assert any("said to be open loop" in w for w in consistent.warnings) == told
+
+
+def test_in_a_loop_an_output_error_model_is_judged_by_the_reference():
+    """Coloured noise goes round the loop and into the inputs: that is no fault of a consistent estimate."""
+    plain = loop(seed=6, n=3000)
+    reference = plain.u[:, 0] + 0.5 * plain.y[:, 0]
+    data = io(plain.u, plain.y, reference=reference[:, None], references=("r0",))
+    fit = judged(two_stage(data, {"nb": 2, "nf": 2, "nk": 1}), data)
+    assert fit.checks["residuals_uncorrelated"].passed
+    assert fit.checks["feedback"].passed
+    assert fit.checks["feedback"].values["seen"] == 1.0
+
+
+def test_two_outputs_are_judged_each_by_itself():
+    rng = np.random.default_rng(7)
+    u = rng.standard_normal((1500, 1))
+    other = polynomial(A=(1, -0.6), B=((0, 0.4),))
+    y = np.hstack([run(m, u, 0.2 * rng.standard_normal((1500, 1))) for m in (TRUTH, other)])
+    data = io(u, y)
+    for method in (n4sid, pbsid):
+        right, low = (judged(method(data, {"n": n}), data) for n in (3, 1))
+        assert set(right.fit) == {"y0", "y1"}
+        assert not failed(right) & {"residuals_white", "residuals_uncorrelated", "feedback"}
+        assert {"residuals_white", "residuals_uncorrelated"} <= failed(low)
+        assert "y0" in low.checks["residuals_white"].detail
+
+
+def test_a_time_series_has_no_inputs_to_test():
+    rng = np.random.default_rng(8)
+    none = np.zeros((600, 0))
+    truth = polynomial(A=(1, -1.2, 0.5), B=(), C=(1, 0.4), F=())
+    data = io(none, run(truth, none, rng.standard_normal((600, 1))))
+    fit = judged(arma(data, {"na": 2, "nc": 1}), data)
+    assert not failed(fit)
+    assert not {"residuals_uncorrelated", "feedback"} & set(fit.checks)
+    assert fit.fit["y0"].simulation is None
+    assert "residuals_white" in failed(judged(arma(data, {"na": 1, "nc": 0}), data))
 
 
 def test_a_wrong_model_alone_is_no_sign_of_feedback():

@@ -72,7 +72,7 @@ def residual_verdicts(fit: BlackBoxFit, data: IOData, found: Errors, tests: Resi
 def _feedback(fit: BlackBoxFit, test: ResidualTest, name: str) -> Check:
     seen, biased = test.p < P_LEAST, structure(fit.structure).feedback == "biased"
     if not seen:
-        detail = "no sign of feedback: inputs do not depend on past residuals"
+        detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
     elif biased:
         detail = f"input {name} depends on past residuals: there is feedback, and {fit.structure} is biased by it"
     else:

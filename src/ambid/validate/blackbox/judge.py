@@ -23,7 +23,7 @@ from ambid.validate.prediction import fit_of
 
 Array = NDArray[np.float64]
 
-_MOST = 4e7  # numbers in the derivatives of one output that are kept at once
+_MOST = 2e7  # numbers in the derivatives of one output that are kept at once
 _ASSUME_WHITE = ("fir", "oe")  # covariance of white noise; the instrumental structures allow for the colour
 _LEAST = 60  # samples from which residuals can be tested
 

@@ -17,7 +17,7 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.gradient import Gradient
 from ambid.validate.blackbox.predictor import Errors
-from ambid.validate.blackbox.score import Score, autoregression, score
+from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
 from ambid.validate.residuals import ResidualTest
 
 Array = NDArray[np.float64]
@@ -110,7 +110,14 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_refere
     white = [_tested(e[:, o], J, e, white_lags) for o, J in enumerate(slopes.rows)]
     lags = input_lags(e.shape[0], with_now=data.open_loop)
     against = [
-        _tested(e[:, o], J, source, lags, colour=None if colours[o].size == 1 else colours[o])
+        _tested(
+            e[:, o],
+            J,
+            source,
+            lags,
+            colour=colours[o] if with_reference or colours[o].size > 1 else None,
+            instrumental=with_reference,
+        )
         for o, J in enumerate(slopes.rows)
         if data.n_inputs
     ]
@@ -185,7 +192,13 @@ def _drawn(output: str, other: str, kind: str, lags: NDArray[np.int64], s: Score
 
 
 def _tested(
-    e: Array, J: Array, signals: Array, lags: tuple[int, ...], *, colour: Array | None = None
+    e: Array,
+    J: Array,
+    signals: Array,
+    lags: tuple[int, ...],
+    *,
+    colour: Array | None = None,
+    instrumental: bool = False,
 ) -> tuple[Score, tuple[int, ...]]:
     """Score test of lagged signals; the second is the lag of each regressor."""
     n = e.size
@@ -194,7 +207,10 @@ def _tested(
     last = n + min(0, *lags)
     centred = signals - signals.mean(axis=0)
     lagged = np.hstack([centred[first - k : last - k] for k in lags])
-    return score(e[first:last], J[first:last], lagged, colour=colour), tuple(np.repeat(lags, signals.shape[1]).tolist())
+    at = tuple(np.repeat(lags, signals.shape[1]).tolist())
+    if instrumental and colour is not None:
+        return instrumental_score(e[first:last], J[first:last], lagged, colour=colour), at
+    return score(e[first:last], J[first:last], lagged, colour=colour), at
 
 
 def _feedback(u: Array, e: Array) -> list[tuple[Score, tuple[int, ...]]]:
@@ -203,6 +219,9 @@ def _feedback(u: Array, e: Array) -> list[tuple[Score, tuple[int, ...]]]:
     own, loop = min(_OWN_LAGS, n // 20), min(_LOOP_LAGS, n // 20)
     if not u.shape[1] or loop < 1:
         return []
+    longest = int(_MOST / (own * u.shape[1] + loop * e.shape[1]))
+    u, e = u[-longest:], e[-longest:]
+    n = u.shape[0]
     centred = u - u.mean(axis=0)
     past = np.zeros((n, own * u.shape[1]))
     for k in range(1, own + 1):

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 _SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
 _PREDICTED = 1e-16  # power from which a residual is more than rounding
+_ROWS = 1000  # of a block
 _DEPENDENT = 1e-9  # singular value from which a direction of J counts
 
 
@@ -62,9 +63,13 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
     """
     from scipy.special import chdtrc
 
-    Q = basis(np.hstack([J, np.ones((e.size, 1))]))
-    size = np.linalg.norm(regressors, axis=0)
-    L = regressors / np.where(size > 0, size, 1.0)
+    n, rows = e.size, np.hstack([J, np.ones((e.size, 1)), regressors, e[:, None]])
+    if colour is None:  # inner products are all that counts: those of the triangle are the same
+        rows = triangle(rows)
+    Q = basis(rows[:, : J.shape[1] + 1])
+    L, e = rows[:, J.shape[1] + 1 : -1], rows[:, -1]
+    size = np.linalg.norm(L, axis=0)
+    L = L / np.where(size > 0, size, 1.0)
     for _ in range(2):  # twice is enough (Kahan): the first pass loses what cancels
         L = L - Q @ (Q.T @ L)
     rest = e - Q @ (Q.T @ e)
@@ -72,7 +77,7 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
     if power <= _PREDICTED * float(e @ e) or not L.shape[1]:
         nothing = np.zeros(L.shape[1])
         return Score(p=1.0, statistic=0.0, degrees=0, correlation=nothing, sd=nothing)
-    variance = power / max(e.size - Q.shape[1], 1)
+    variance = power / max(n - Q.shape[1], 1)
     inner = rest @ L
     _, s, right = np.linalg.svd(triangle(L), full_matrices=False)
     kept = s > _SEEN
@@ -93,6 +98,44 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
         degrees=degrees,
         correlation=inner / np.sqrt(power),
         sd=np.asarray(spread * np.sqrt(variance / power)),
+    )
+
+
+def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array) -> Score:
+    """Test whether instruments explain a residual that feedback makes depend on `J`.
+
+    There J cannot be projected out, because the noise is part of it. Instead only those combinations of the instruments
+    count that are orthogonal to J, so that the error of the estimate does not reach them (the overidentification
+    test of Sargan 1958).
+
+    Parameters
+    ----------
+    e : ndarray, shape (n_used,)
+    J : ndarray, shape (n_used, n_directions)
+    instruments : ndarray, shape (n_used, n_regressors)
+        Independent of all noise.
+    colour : ndarray, shape (n + 1,)
+        Autoregression of the residuals.
+
+    Returns
+    -------
+    Score
+        Correlations are those with the instruments themselves.
+    """
+    centred, rest = instruments - instruments.mean(axis=0), e - e.mean()
+    size = np.linalg.norm(centred, axis=0)
+    L = centred / np.where(size > 0, size, 1.0)
+    length = np.linalg.norm(J, axis=0)
+    u, s, _ = np.linalg.svd(L.T @ (J / np.where(length > 0, length, 1.0)))
+    rank = int(np.count_nonzero(s > _DEPENDENT * max(float(s[0]), 1e-300))) if s.size else 0
+    inner = score(rest, np.zeros((e.size, 0)), L @ u[:, rank:], colour=colour)
+    power = float(np.linalg.norm(rest))
+    return Score(
+        p=inner.p,
+        statistic=inner.statistic,
+        degrees=inner.degrees,
+        correlation=rest @ L / power if power > 0 else np.zeros(L.shape[1]),
+        sd=np.full(L.shape[1], 1 / np.sqrt(e.size)),
     )
 
 
@@ -127,7 +170,11 @@ def triangle(a: Array) -> Array:
     -------
     ndarray, shape (min(n, n_columns), n_columns)
     """
-    return np.asarray(np.linalg.qr(a, mode="r"), dtype=np.float64)
+    block = max(_ROWS, 4 * a.shape[1])
+    R = np.zeros((0, a.shape[1]))
+    for first in range(0, a.shape[0], block):  # blocks that stay in the cache
+        R = np.asarray(np.linalg.qr(np.vstack([R, a[first : first + block]]), mode="r"), dtype=np.float64)
+    return R
 
 
 def autoregression(e: Array) -> Array:
