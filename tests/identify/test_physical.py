@@ -7,16 +7,21 @@ import pytest
 from scipy.linalg import expm
 
 from ambid.errors import EstimationError
+from ambid.identify.blackbox import structures
+from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.identify.greybox import greybox
 from ambid.identify.physical import agreement, physical_parameters
 from ambid.identify.physical_response import physical_response
+from ambid.identify.uncertainty import uncertainty
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
-from tests.identify.benches import BEARING, COIL, SPRUNG, THESIS
+from tests.identify.benches import BEARING, COIL, SPRUNG, THESIS, parameters, run
 
 UNITS = {"voltage": "V", "current": "A", "position": "m"}
 PLANTS = {"one-axis": (THESIS, 1e-4), "coil": (COIL, 1e-4), "rotor": (SPRUNG, 2e-4)}
@@ -168,7 +173,7 @@ def test_intervals_cover_the_truth():
     values, ways = np.linalg.eigh(exact.covariance)
     factor = ways * np.sqrt(np.maximum(values, 0.0))
     n, inside, left = exact.model.order, [], []
-    for _ in range(120):
+    for _ in range(50):
         theta = exact.model.theta + factor @ rng.standard_normal(factor.shape[1])
         A, B, C = (
             theta[: n * n].reshape(n, n),
@@ -178,7 +183,7 @@ def test_intervals_cover_the_truth():
         found = physical_parameters(replace(exact, model=state_space(A, B, C, dt)), of, asked(of, THESIS, "c"), delay=0)
         inside.append([p.ci95[0] <= THESIS[p.name] <= p.ci95[1] for p in found.parameters if p.role == "free"])
         left.append(found.misfit.p)
-    assert np.all(np.abs(np.mean(inside, axis=0) - 0.95) < 0.06)
+    assert np.all(np.abs(np.mean(inside, axis=0) - 0.95) < 0.09)
     assert np.mean(np.array(left) < 0.1) < 0.25
 
 
@@ -228,18 +233,18 @@ def test_channels_are_found_by_unit_and_by_role():
 
 
 def test_another_plant_is_called_another_plant():
-    # a coil with an eddy-current pole is no coil: a black box that knows it well says so, and marks every number
+    # a coil with an eddy-current pole is no coil: the better a black box knows it, the louder it says so
     of, dt = model("coil"), 1e-4
     A = np.array([[-860.0, 0.0], [1500.0, -1500.0]])
     B, C = np.array([[550.0], [0.0]]), np.array([[0.7, 0.3]])
     big = expm(np.block([[A, B], [np.zeros((1, 3))]]) * dt)
-    found = physical_parameters(
-        fit_of(state_space(big[:2, :2], big[:2, 2:], C, dt), 1e-4, of="coil"), of, asked(of, COIL)
-    )
-    assert not found.misfit.passed
-    assert not found.passed
-    assert not any(p.identifiable for p in found.parameters)
-    assert any("is not a 'coil' plant" in w for w in found.warnings)
+    eddy = state_space(big[:2, :2], big[:2, 2:], C, dt)
+    rough, sharp = (physical_parameters(fit_of(eddy, s, of="coil"), of, asked(of, COIL), delay=0) for s in (1e-2, 1e-4))
+    assert not rough.misfit.passed
+    assert not rough.passed
+    assert any("only roughly" in w for w in rough.warnings)
+    assert any("not a 'coil' plant" in w for w in sharp.warnings)
+    assert not any(p.identifiable for p in sharp.parameters)
 
 
 def test_what_does_not_show_is_not_identifiable():
@@ -276,3 +281,65 @@ def test_agreement_sees_a_difference_of_a_few_standard_deviations():
     moved = values.copy()
     moved[0] += 8 * np.sqrt(2 * found.covariance[0, 0])
     assert not agreement(found, found.covariance_names, moved, found.covariance).passed
+
+
+def test_a_model_without_a_number_to_spare_keeps_its_own_delay():
+    # one pole, one number: any delay could be had by another R and L, so none is searched for
+    of, dt = model("coil"), 1e-4
+    d, _ = discretise(of.matrices(COIL), dt, fraction=0.0)
+    one = np.ones(1)
+    held = Polynomials(A=[1.0, -d.A[0, 0]], B=([0.0, 0.0, 0.0, d.B[0, 0]],), C=one, D=one, F=(one,))
+    fit = fit_of(PolynomialModel(outputs=(held,), dt=dt), 1e-4, of="coil", structure="arx")
+    fixed = np.array([n in ("a0", "c0", "d0", "f0", "b0", "b1", "b2") for n in fit.model.names])
+    covariance = np.where(fixed[:, None] | fixed, 0.0, fit.covariance)
+    found = physical_parameters(replace(fit, covariance=covariance), of, asked(of, COIL))
+    assert (found.delay.samples, found.delay.how) == (2, "given")
+    assert found.values["L"] == pytest.approx(COIL["L"], rel=1e-6)
+    assert found.misfit.p is None
+
+
+def identified(name, n, seed, structure, orders):
+    bench = run(name, n, seed)
+    data = IOData(
+        u=bench.signals.u, y=bench.signals.y, dt=1 / bench.signals.rate_hz, inputs=bench.model.inputs,
+        outputs=bench.model.outputs, units=UNITS, record={"samples": n},
+    )  # fmt: skip
+    return bench, structures.structure(structure).estimator(data, orders)
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "fixed", "structure", "orders"),
+    [("thesis", 8000, ("c",), "pbsid", {"n": 3}),
+     ("bearing", 20_000, ("c",), "pbsid", {"n": 4}),
+     ("falling rotor", 8000, ("m", "c"), "armax", {"na": 2, "nb": 2, "nc": 2, "nk": 2}),
+     ("coil", 5000, (), "srivc", {"nb": 1, "nf": 1, "nk": 0})],
+)  # fmt: skip
+def test_black_box_and_grey_box_agree_on_the_same_record(name, n, fixed, structure, orders):
+    bench, fit = identified(name, n, 0, structure, orders)
+    asks = parameters(bench, fixed=fixed)
+    found = physical_parameters(fit, bench.model, asks)
+    grey = greybox(bench.model, bench.signals, asks)
+    known = uncertainty(grey)
+    values = grey.vector[grey.problem.slices["physical"]] * grey.problem.magnitude
+    check = agreement(found, known.names, values, known.information)
+    assert check.passed, check.detail
+    assert found.delay.samples == bench.delay
+    assert all(p.identifiable for p in found.parameters)
+    for k, sd in zip(found.covariance_names, np.sqrt(np.diag(found.covariance)), strict=True):
+        assert abs(found.values[k] - bench.truth[k]) < min(5 * sd, 0.02 * abs(bench.truth[k])), k
+        # nothing is sharper than the maximum likelihood of the right model
+        assert sd > 0.6 * np.sqrt(known.information[known.names.index(k), known.names.index(k)])
+
+
+def test_intervals_from_identified_black_boxes_hold():
+    # an unstable plant in a loop, 24 records: standard deviations are those of the errors
+    z = []
+    for seed in range(24):
+        bench, fit = identified("falling rotor", 5000, seed, "armax", {"na": 2, "nb": 2, "nc": 2, "nk": 2})
+        found = physical_parameters(fit, bench.model, parameters(bench, fixed=("m", "c")))
+        z.append([(found.values[k] - bench.truth[k]) / np.sqrt(v) for k, v in
+                  zip(found.covariance_names, np.diag(found.covariance), strict=True)])  # fmt: skip
+    z = np.array(z)
+    assert np.all(np.abs(z.mean(axis=0)) < 0.75)
+    assert np.all(np.mean(np.abs(z) < 1.96, axis=0) > 0.79)  # 95 % of 24: fewer than 19 in one of 10 000 trials
+    assert np.all(np.std(z, axis=0) > 0.5)

@@ -26,7 +26,8 @@ from ambid.physics.parameters import Parameter
 Array = NDArray[np.float64]
 
 _NORMAL_95 = 1.959963984540054
-_MISFIT = 1e-3  # probability of the misfit below which a black box is not taken for this physics
+_MISFIT = 1e-3  # probability of the misfit below which a black box does not agree with this physics
+_GROSS = 25.0  # chi-square over degrees of freedom from which nothing of it is believed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,7 +102,7 @@ def physical_parameters(
         One for each of the model's: free, fixed, or with a prior.
     delay : float or "auto"
         Delay of the inputs in samples beyond the hold; "auto": whole samples from 0 to 6, and a fraction where the
-        response shows one.
+        response shows one; the black box's own where it is in continuous time or has no number to spare.
     roles : Mapping[str, str], optional
         Role -> channel; by default by name, else by unit where only one channel has it.
     band_hz : (float, float), optional
@@ -130,7 +131,8 @@ def physical_parameters(
             "parameters, raise its order, or excite more"
         )
     found = matched(target, model, parameters, delay)
-    return _result(fit, model, parameters, target, found, delay_how="estimated" if delay == "auto" else "given")
+    own = target.dt is None or target.rank <= len(free)
+    return _result(fit, model, parameters, target, found, delay_how="given" if delay != "auto" or own else "estimated")
 
 
 def agreement(found: PhysicalFit, names: Sequence[str], values: Array, covariance: Array) -> Check:
@@ -194,9 +196,11 @@ def _result(
     relative = whole[:n, :n] / np.outer(scale, scale)
     sizes, ways = np.linalg.eigh(relative)
     sd = dict(zip(names, np.sqrt(np.diag(whole)).tolist(), strict=False))
-    seen = {k: check.passed and bool(r < WEAK**2) for k, r in zip(names, np.diag(relative), strict=True)}
+    near = factor**2 < _GROSS
+    seen = {k: near and bool(r < WEAK**2) for k, r in zip(names, np.diag(relative), strict=True)}
     weak = ways[:, -1] / ways[np.argmax(np.abs(ways[:, -1])), -1]
     warnings = [] if check.passed else [check.detail]
+    warnings += [f"the black box fails its own check: {c.detail}" for c in fit.checks.values() if not c.passed]
     hidden = [k for k in names if not relative[names.index(k), names.index(k)] < WEAK**2]
     if hidden:
         warnings.append(f"the black box does not show {', '.join(hidden)}: relative sd above {WEAK:.0%}")
@@ -231,15 +235,21 @@ def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match) 
         return Check(passed=True, detail="the black box has no number left to test the physics by", p=None), 1.0
     p = float(chi2.sf(left, freedom))
     text = f"chi-square {left:.4g} for {freedom} degrees of freedom (p = {p:.2g})"
-    passed = p > _MISFIT
-    detail = (
-        f"the {fit.structure} model agrees with {model.name!r}: {text}"
-        if passed
-        else f"the {fit.structure} model is not a {model.name!r} plant: {text}. Other orders, a structure that stands "
-        "feedback, or the grey-box method"
-    )
+    passed, factor = p > _MISFIT, max(1.0, float(np.sqrt(left / freedom)))
+    if passed:
+        detail = f"the {fit.structure} model agrees with {model.name!r}: {text}"
+    elif factor**2 < _GROSS:
+        detail = (
+            f"the {fit.structure} model agrees with {model.name!r} only roughly: {text}. Standard deviations are "
+            f"widened by {factor:.2g}; other orders or the grey-box method may do better"
+        )
+    else:
+        detail = (
+            f"the {fit.structure} model is not a {model.name!r} plant: {text}. Other orders (a delay takes poles too), "
+            "a structure that stands feedback, or the grey-box method"
+        )
     values = {"statistic": left, "freedom": float(freedom)}
-    return Check(passed=passed, detail=detail, p=p, values=values), max(1.0, float(np.sqrt(left / freedom)))
+    return Check(passed=passed, detail=detail, p=p, values=values), factor
 
 
 def _ordered(model: LinearModel, parameters: Sequence[Parameter]) -> list[Parameter]:

@@ -106,7 +106,11 @@ def matched(
     free = [p for p in parameters if p.role != "fixed"]
     fixed = {p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None}
     given = {p.name: float(p.value) for p in parameters if p.value is not None}
-    delays = [float(delay)] if delay != "auto" else [d / 2 for d in range(2 * _MAX_DELAY + 1)]
+    # a model in continuous time holds its own delay apart; one without a number to spare cannot tell of another
+    free_delay = delay == "auto" and target.dt is not None and target.rank > len(free)
+    delays = [target.own_delay] if delay == "auto" else [float(delay)]
+    if free_delay:
+        delays = [d / 2 for d in range(2 * _MAX_DELAY + 1)]
     scored = []
     for samples in delays:
         for values in _possible(target, model, fixed, given, samples):
@@ -131,11 +135,14 @@ def matched(
             prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in free]),
             prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in free]),
             delay=samples * target.period_s,
-            delay_free=delay == "auto",
+            delay_free=free_delay,
             criterion=np.inf,
             J=np.empty((0, 0)),
             period_s=target.period_s,
         )
+        if free_delay:
+            at = round(samples) * target.period_s
+            found.append(search(target, replace(blank, delay=at, delay_free=False)))
         found.append(search(target, blank))
     physical = [m for m in found if all(m.theta[p.name] > 0 for p in model.parameters if p.positive)]
     if not physical or not np.isfinite(min(m.criterion for m in physical)):
@@ -143,8 +150,8 @@ def matched(
             f"the black box leads to a negative {' or '.join(p.name for p in model.parameters if p.positive)}: it is "
             f"no {model.name!r} plant. Check channels and signs, and use a structure that stands feedback"
         )
-    best = min(physical, key=lambda m: m.criterion)
-    if delay != "auto":
+    best = min(physical, key=lambda m: m.criterion + _FRACTION * m.delay_free)
+    if not best.delay_free:
         return best
     nearest = max(0, round(best.delay / target.period_s)) * target.period_s
     whole = search(target, replace(best, delay=nearest, delay_free=False))

@@ -46,6 +46,8 @@ class Target:
         None for a model in continuous time.
     period_s : float
         Sampling interval of the record.
+    own_delay : float
+        Delay that the black box's structure holds beside its poles, samples beyond the hold.
     moments : tuple of Moments
         The response on the grids of the starts.
     """
@@ -56,6 +58,7 @@ class Target:
     omega: Array
     dt: float | None
     period_s: float
+    own_delay: float
     moments: tuple[Moments, ...]
 
     @property
@@ -140,6 +143,7 @@ def target_of(
         omega=omega,
         dt=fit.model.dt,
         period_s=fit.dt,
+        own_delay=_own_delay(fit, rows, columns),
         moments=moments,
     )
 
@@ -176,6 +180,19 @@ def _check_poles(fit: BlackBoxFit, model: LinearModel, rows: list[int], columns:
                     f"the {fit.structure} model has {poles} pole(s) from {fit.inputs[i]!r} to {fit.outputs[o]!r}; "
                     f"{model.name!r} has {least}. Identify it with an order of at least {least}"
                 )
+
+
+def _own_delay(fit: BlackBoxFit, rows: list[int], columns: list[int]) -> float:
+    """Delay in samples: that of a transfer function, or leading zeros of B but one, which the hold makes; else none."""
+    if isinstance(fit.model, TransferModel):
+        hold = 0.0 if fit.model.dt is None else 1.0
+        degrees = [fit.model.den[o][i].size - fit.model.num[o][i].size for o in rows for i in columns]
+        beyond = max(0.0, min(degrees) - hold) if hold else 0.0
+        return min(fit.model.delay[i] for i in columns) / fit.dt + beyond
+    if isinstance(fit.model, PolynomialModel):
+        leading = [int(np.argmax(fit.model.outputs[o].B[i] != 0)) for o in rows for i in columns]
+        return float(max(0, min(leading) - 1))
+    return 0.0
 
 
 def _known(fit: BlackBoxFit, omega: Array, rows: list[int], columns: list[int]) -> tuple[Complex, NDArray[np.bool_]]:
