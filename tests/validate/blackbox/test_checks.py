@@ -255,6 +255,16 @@ def _companion(num, den):
     return [[0.0, 1.0], [-den[2], -den[1]]], [[0.0], [1.0]], [[num[1], num[0]]], [[0.0]]
 
 
+def test_a_predictor_that_runs_away_fails_its_check_and_breaks_nothing():
+    data = record(n=3000)
+    model = StateSpaceModel(A=[[1.6]], B=[[1.0]], C=[[1.0]], D=[[0.0]], K=[[0.1]], dt=DT)
+    fit = judged(by_hand(model, data), data, second=data)
+    assert failed(fit) == {"stable_predictor"}
+    assert np.isnan(fit.fit["y0"].one_step)
+    assert fit.fit["y0"].simulation is None
+    assert not fit.criteria
+
+
 def test_errors_ahead_are_as_large_as_the_model_expects():
     data = record(BJ, n=4000)
     fit = bj(data, {"nb": 2, "nc": 1, "nd": 1, "nf": 2, "nk": 1})

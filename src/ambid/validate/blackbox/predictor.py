@@ -20,6 +20,8 @@ from ambid.identify.blackbox.transfer_model import TransferModel
 
 Array = NDArray[np.float64]
 
+_RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record from which nothing is left of its digits
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Errors:
@@ -30,7 +32,7 @@ class Errors:
     model : StateSpaceModel
         Discrete innovations form that was used.
     one_step : ndarray, shape (n_samples, n_outputs)
-        Output minus its prediction from all samples before.
+        Output minus its prediction from all samples before; not a number where an unstable predictor runs away.
     simulation : ndarray, shape (n_samples, n_outputs), or None
         Output minus its simulation from the inputs alone; None for an unstable model, or without inputs.
     """
@@ -74,8 +76,7 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
             f"{len(fit.outputs)}; they have to agree. Name the same channels"
         )
     model = innovations_form(fit)
-    with np.errstate(over="ignore", invalid="ignore"):
-        e = data.y - one_step(model, data.u, data.y, fit.offsets)
+    e = _one_step_error(model, data, data.y, fit)
     simulated = simulation(model, data.u, data.y, fit.offsets)
     return Errors(model=model, one_step=e, simulation=None if simulated is None else data.y - simulated)
 
@@ -107,9 +108,9 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
     late = slice(data.n_samples // 2, None)  # the initial state has taken up the constant at the start
     moved, shifted = np.zeros(m.n_outputs), np.zeros(m.n_outputs)
     for _ in range(2):
-        moved += np.linalg.lstsq(through, e[late].mean(axis=0), rcond=1e-6)[0]
-        y = data.y - moved
-        e = y - one_step(m, data.u, y, fit.offsets)
+        if np.all(np.isfinite(e)):
+            moved += np.linalg.lstsq(through, e[late].mean(axis=0), rcond=1e-6)[0]
+            e = _one_step_error(m, data, data.y - moved, fit)
         if simulated is not None:
             shifted += simulated[late].mean(axis=0)
             y = data.y - shifted
@@ -120,6 +121,14 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
         one_step=e - e.mean(axis=0),
         simulation=None if simulated is None else simulated - simulated.mean(axis=0),
     )
+
+
+def _one_step_error(model: StateSpaceModel, data: IOData, y: Array, fit: BlackBoxFit) -> Array:
+    F = model.A - model.K @ model.C
+    radius = float(np.max(np.abs(np.linalg.eigvals(F)), initial=0.0)) if model.order else 0.0
+    if radius > 1 and data.n_samples * np.log(radius) > _RUNAWAY:
+        return np.full(y.shape, np.nan)
+    return y - one_step(model, data.u, y, fit.offsets)
 
 
 def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
