@@ -118,6 +118,7 @@ def test_every_input_has_its_own_denominator_and_delay():
     truth = np.array([25, 1, 3, 25, -2, 1, 0.8])
     np.testing.assert_array_less(np.abs(fit.model.theta - truth), 4 * fit.sd + 1e-12)
     assert np.all(fit.sd < 0.02 * np.abs(truth) + 1e-12)
+    assert fit.status == "converged"
     assert fit.model.delay == pytest.approx((0.0, 0.06))
 
 

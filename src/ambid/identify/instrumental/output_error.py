@@ -27,7 +27,7 @@ WHITE = Autoregression(D=np.ones(1), variance=1.0)
 _ROUGH, _FINE = 6, 60  # steps spent on a start, and on the best of them
 _HALVINGS = 6
 _SETTLED = 1e-6  # change of the output by a step, relative to the error
-_NUMERIC = 1e-4  # the same, where rounding keeps the error from falling further
+_NUMERIC = 5e-4  # the same, where rounding keeps the error from falling further
 _AGREE = 1e-6  # relative difference in loss of two starts that found the same model
 _EXACT = 1e-13  # error relative to the output that counts as none
 _NOISE_ORDER = 20
@@ -171,15 +171,15 @@ def linearise(setting: Setting, chains: Sequence[Chain], noise: Autoregression =
     nuisance = _nuisance(setting, chains)
     basis = span(nuisance)
     error = raw - basis @ (basis.T @ raw)
-    Z = np.hstack([_columns(c, m.of_output, m, setting.u) for c, m in zip(chains, made, strict=True)])
-    Phi = np.hstack(
-        [
-            _columns(c, filtered(c.den, setting.step, m.y + error), m, setting.u)
-            for c, m in zip(chains, made, strict=True)
-        ]
-    )
     size = np.linalg.norm(nuisance, axis=0)
-    constant = float(np.linalg.lstsq(nuisance / size, raw, rcond=1e-8)[0][0] / size[0])
+    weights = np.linalg.lstsq(nuisance / size, raw, rcond=1e-8)[0] / size
+    Z_parts, Phi_parts, first = list[Array](), list[Array](), 1
+    for c, m in zip(chains, made, strict=True):
+        free = nuisance[:, first : first + c.degree] @ weights[first : first + c.degree]
+        first += c.degree
+        Z_parts.append(_columns(c, m.of_output + filtered(c.den, setting.step, free), m, setting.u))
+        Phi_parts.append(_columns(c, filtered(c.den, setting.step, m.y + free + error), m, setting.u))
+    Z, Phi, constant = np.hstack(Z_parts), np.hstack(Phi_parts), float(weights[0])
     all_columns = np.column_stack([error, Z, Phi])
     if noise.order:
         from scipy.signal import lfilter
