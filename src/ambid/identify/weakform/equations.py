@@ -10,7 +10,7 @@ Gauss-Newton: the regressors of a step are moments of the signals freed from the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 40
 _SETTLED = 1e-7  # step in standard deviations
-_SAME_NOISE = 1.5  # factor within which supports agree on the noise
+_SAME_NOISE = 1.05  # factor on the noise within which the shortest support does not contradict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -130,6 +130,8 @@ class Solution:
     condition : float
         Of the scaled regressors.
     converged : bool
+    contradiction : float
+        Noise that the shortest support finds with these parameters, over that of their own; about 1 where all is well.
     """
 
     theta: Mapping[str, float]
@@ -139,6 +141,7 @@ class Solution:
     rows: int
     condition: float
     converged: bool
+    contradiction: float = 1.0
 
 
 def solve(system: System, bump: Bump, start: Mapping[str, float] | None = None) -> Solution:
@@ -197,11 +200,13 @@ def solve(system: System, bump: Bump, start: Mapping[str, float] | None = None) 
     )
 
 
-def best_support(system: System, halves: Sequence[int], degree: int) -> tuple[Solution, list[dict[str, float]]]:
+def best_support(
+    system: System, halves: Sequence[int], degree: int, shortest: int
+) -> tuple[Solution, list[dict[str, float]]]:
     """Solve from long supports to short, from the one before or anew; keep the one that predicts least variance.
 
-    Long supports average most, short ones use more of the band; those that find much more noise than others have missed
-    the plant and do not count.
+    Long supports average most but see low frequencies alone, where a wrong plant may fit as well; short ones see all.
+    So every solution is also held against the shortest support, and those that it contradicts do not count.
 
     Parameters
     ----------
@@ -210,12 +215,15 @@ def best_support(system: System, halves: Sequence[int], degree: int) -> tuple[So
         Half supports in samples.
     degree : int
         Of the bumps.
+    shortest : int
+        Half support against which solutions are held.
 
     Returns
     -------
     best : Solution
+        Its `contradiction` tells what the shortest support makes of it.
     tried : list of dict
-        Half support, noise scale and log determinant of the covariance of every support that led to a result.
+        Half support, noise scale, log determinant of the covariance and contradiction of every one with a result.
 
     Raises
     ------
@@ -224,22 +232,29 @@ def best_support(system: System, halves: Sequence[int], degree: int) -> tuple[So
     """
     found: Solution | None = None
     results, tried, why = list[tuple[float, Solution]](), list[dict[str, float]](), "the record is too short"
+    judge = _Rows(system, Bump(half=shortest, degree=degree, dt=system.dt))
     for half in sorted(halves, reverse=True):
         try:
             found = solve(system, Bump(half=half, degree=degree, dt=system.dt), None if found is None else found.theta)
+            all_band = judge.at(np.array([found.theta[k] for k in system.names]))
         except EstimationError as error:
             why = str(error)
             continue
         sd = np.sqrt(np.diag(found.covariance))
         sign, size = np.linalg.slogdet(found.covariance / np.outer(sd, sd))
         size = float(size + 2 * np.sum(np.log(sd))) if sign > 0 else np.inf
-        tried.append({"half_width_samples": float(half), "noise_sd": found.scale, "log_det_covariance": size})
+        found = replace(found, contradiction=float(np.sqrt(all_band.cost / max(all_band.r.size - sd.size, 1))))
         results.append((size, found))
+        tried.append({
+            "half_width_samples": float(half), "noise_sd": found.scale, "log_det_covariance": size,
+            "noise_sd_all_band": found.contradiction,
+        })  # fmt: skip
     if not results:
         raise EstimationError(f"weak form: no support of the test functions gives a result ({why}). Record longer")
     settled = [r for r in results if r[1].converged] or results
-    noise = min(r[1].scale for r in settled)  # a support that finds much more noise than another has missed the plant
-    return min((r for r in settled if r[1].scale <= _SAME_NOISE * noise), key=lambda r: r[0])[1], tried
+    noise = min(r[1].contradiction for r in settled)
+    chosen = min((r for r in settled if r[1].contradiction <= _SAME_NOISE * noise), key=lambda r: r[0])[1]
+    return replace(chosen, contradiction=chosen.contradiction / max(chosen.scale, 1e-300)), tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)

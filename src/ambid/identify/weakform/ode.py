@@ -8,7 +8,7 @@ leaves a bias.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from ambid.identify.weakform.equations import Kink, Signal, Solution, System, Te
 Array = NDArray[np.float64]
 Orders = Mapping[str, int | tuple[int, ...]]
 
+_CONTRADICTED = 1.3  # ratio of noise from which a support is too long
 _SHORTEST, _LONGEST = 10, 2560  # half supports tried, samples
 
 
@@ -67,7 +68,10 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     u_sd, y_sd = data.u.std(axis=0), data.y.std(axis=0)
     u, y = (data.u - u_mean) / u_sd, (data.y - y_mean) / y_sd
     with one_thread():
-        found = [best_support(_system(y[:, o], u, n, nb, nk, data.dt), halves, n + 5) for o in range(data.n_outputs)]
+        found = [
+            best_support(_system(y[:, o], u, n, nb, nk, data.dt), halves, n + 5, min([_SHORTEST, *halves]))
+            for o in range(data.n_outputs)
+        ]
     solutions = [f[0] for f in found]
     model, covariance = _model(solutions, n, nb, nk, data.dt, u_sd, y_sd)
     noise = np.diag([(s.scale * sd) ** 2 for s, sd in zip(solutions, y_sd, strict=True)])
@@ -81,6 +85,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
         offsets=_offsets(solutions, u_mean, y_mean, u_sd, y_sd),
         noise_covariance=noise,
         status="converged" if all(s.converged for s in solutions) else "stalled",
+        warnings=contradictions([s.contradiction for s in solutions]),
         details={
             "half_width_s": [s.half * data.dt for s in solutions],
             "rows": [s.rows for s in solutions],
@@ -119,6 +124,27 @@ def supports(n_samples: int, half_width_s: float | None, dt: float) -> list[int]
         return [half]
     halves = [_SHORTEST * 2**k for k in range(12) if _SHORTEST * 2**k <= min(_LONGEST, n_samples // 8)]
     return halves or [_SHORTEST // 2]
+
+
+def contradictions(found: Sequence[float]) -> list[str]:
+    """Return a warning where test functions with the shortest support contradict the result.
+
+    Parameters
+    ----------
+    found : sequence of float
+        Ratios of noise by output, see `Solution.contradiction`.
+
+    Returns
+    -------
+    list of str
+    """
+    worst = max(found)
+    if worst < _CONTRADICTED:
+        return []
+    return [
+        f"over the whole band the weak form leaves {worst:.2g} times the noise that its own test functions show: they "
+        "are too long to see the plant, or the model or the whiteness of the noise is wrong. Give a shorter half_width_s"
+    ]
 
 
 def kink(u: Array, delay: float, dt: float) -> Array:

@@ -17,7 +17,7 @@ from ambid.errors import EstimationError
 from ambid.identify.scaling import noise_floor
 from ambid.identify.threads import one_thread
 from ambid.identify.weakform.equations import Kink, Signal, System, Term, best_support
-from ambid.identify.weakform.ode import kink, supports
+from ambid.identify.weakform.ode import contradictions, kink, supports
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
@@ -56,6 +56,7 @@ class WeakFit:
     half_width_s : float
         Half the support of the test functions.
     converged : bool
+    warnings : tuple of str
     """
 
     values: Mapping[str, float]
@@ -64,6 +65,7 @@ class WeakFit:
     noise_sd: Mapping[str, float]
     half_width_s: float
     converged: bool
+    warnings: tuple[str, ...] = ()
 
     @property
     def sd(self) -> Mapping[str, float]:
@@ -146,7 +148,8 @@ def weak_parameters(
         kinks=tuple(kinks),
     )
     with one_thread():
-        best, _ = best_support(system, supports(y.shape[0] - int(delay), half_width_s, dt), _DEGREE)
+        halves = supports(y.shape[0] - int(delay), half_width_s, dt)
+        best, _ = best_support(system, halves, _DEGREE, min([10, *halves]))
     return WeakFit(
         values={p.name: fixed[p.name] if p.name in fixed else best.theta[p.name] for p in model.parameters},
         names=names,
@@ -154,6 +157,7 @@ def weak_parameters(
         noise_sd={role: best.scale * level[role] for role in model.outputs},
         half_width_s=best.half * dt,
         converged=best.converged,
+        warnings=tuple(contradictions([best.contradiction])),
     )
 
 
