@@ -9,8 +9,9 @@ from ambid.identify.blackbox.data import IOData
 from ambid.identify.instrumental import srivc
 from ambid.identify.weakform import weak_parameters, weakform
 from ambid.identify.weakform.bumps import Bump, moments_at, spread_out
-from ambid.identify.weakform.equations import Signal, System, Term, solve
+from ambid.identify.weakform.equations import solve
 from ambid.identify.weakform.ode import kink
+from ambid.identify.weakform.system import Signal, System, Term
 from tests.identify.benches import parameters, run
 
 
@@ -63,10 +64,10 @@ def test_the_gradient_is_exact():
     # half the gradient of the criterion is Z^T r, with noise in every regressor and kinks in the output
     data = record([3.0, 20.0], [1.0, 8.0, 400.0], 0.01, 600, 0.02, 0)
     from ambid.identify.weakform import ode
-    from ambid.identify.weakform.equations import _Rows
+    from ambid.identify.weakform._rows import Rows
 
     y = data.y[:, 0] - data.y.mean()
-    rows = _Rows(ode._system(y, data.u, 2, (2,), (0,), 0.01), Bump(half=15, degree=7, dt=0.01))
+    rows = Rows(ode._system(y, data.u, 2, (2,), (0,), 0.01), Bump(half=15, degree=7, dt=0.01))
     theta = np.array([390.0, 9.0, 21.0, 2.8, 0.1])
     state = rows.at(theta)
     gradient = 2 * state.Z.T @ state.r

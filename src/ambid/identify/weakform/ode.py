@@ -21,7 +21,8 @@ from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.instrumental.orders import known_orders, long_enough, per_input, single
 from ambid.identify.threads import one_thread
-from ambid.identify.weakform.equations import Kink, Signal, Solution, System, Term, best_support
+from ambid.identify.weakform.equations import Solution, best_support
+from ambid.identify.weakform.system import Kink, Signal, System, Term
 
 Array = NDArray[np.float64]
 Orders = Mapping[str, int | tuple[int, ...]]
@@ -142,8 +143,9 @@ def contradictions(found: Sequence[float]) -> list[str]:
     if worst < _CONTRADICTED:
         return []
     return [
-        f"over the whole band the weak form leaves {worst:.2g} times the noise that its own test functions show: they "
-        "are too long to see the plant, or the model or the whiteness of the noise is wrong. Give a shorter half_width_s"
+        f"over the whole band the weak form leaves {worst:.2g} times the noise that its own test functions show: "
+        "they are too long to see the plant, or the model or the whiteness of the noise is wrong. Give a "
+        "shorter half_width_s"
     ]
 
 

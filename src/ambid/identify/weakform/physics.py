@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.scaling import noise_floor
 from ambid.identify.threads import one_thread
-from ambid.identify.weakform.equations import Kink, Signal, System, Term, best_support
+from ambid.identify.weakform.equations import best_support
 from ambid.identify.weakform.ode import contradictions, kink, supports
+from ambid.identify.weakform.system import Kink, Signal, System, Term
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
