@@ -16,7 +16,7 @@ from ambid.report._drawing import BOUND, MEASURED, PREDICTED, grid, magnitude_ax
 from ambid.report._panels import Traces, residuals_panel, signals_panel
 from ambid.report.fit_text import pole_lines
 from ambid.report.response import Pole, Response
-from ambid.validate.blackbox.predictor import innovations_form
+from ambid.validate.blackbox.predictor import innovations_form, plant_form
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,7 +78,7 @@ def traces_of(fit: BlackBoxFit, data: IOData) -> Traces:
         units=tuple(fit.units[o] for o in data.outputs),
         measured=data.y,
         predicted=one_step(model, data.u, data.y, fit.offsets),
-        simulated=simulation(model, data.u, data.y, fit.offsets),
+        simulated=simulation(plant_form(fit), data.u, data.y, fit.offsets),
         innovation_sd=np.sqrt(np.diag(fit.noise_covariance)),
     )
 

@@ -22,7 +22,8 @@ _OWN = {
     "bj": {"nd": 2},
     "ararx": {"nd": 5},
     "arma": {},
-    "srivc": {"nk": 0},
+    "srivc": {"nk": 0},  # what is sampled with a hold comes a sample later
+    "clsrivc": {"nk": 0},
     "weakform": {"na": 2, "nb": 2, "nk": 0},
 }
 

@@ -170,7 +170,10 @@ def _state_space(A: Any, B: Any, C: Any, D: Any, dt: float | None) -> StateSpace
 
 
 def _transfer(num: Any, den: Any, dt: float | None) -> TransferModel:
-    monic = [[(np.asarray(n) / d[0], np.asarray(d) / d[0]) for n, d in zip(*r, strict=True)] for r in zip(num, den, strict=True)]
+    monic = [
+        [(np.asarray(n) / d[0], np.asarray(d) / d[0]) for n, d in zip(*r, strict=True)]
+        for r in zip(num, den, strict=True)
+    ]
     return TransferModel(
         num=tuple(tuple(n for n, _ in row) for row in monic),
         den=tuple(tuple(d for _, d in row) for row in monic),

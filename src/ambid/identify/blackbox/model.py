@@ -118,6 +118,16 @@ class BlackBoxModel(Protocol):
         """
         ...
 
+    def plant(self) -> StateSpaceModel:
+        """Return G alone, without the states of the noise.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+        """
+        ...
+
     def state_space(self) -> StateSpaceModel:
         """Return the model in innovations form."""
         ...

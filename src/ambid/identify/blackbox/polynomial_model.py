@@ -237,6 +237,20 @@ class PolynomialModel:
         B, D = (np.vstack([part[k] for part in parts]) for k in (1, 3))
         return StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=self.dt)
 
+    def plant(self) -> StateSpaceModel:
+        """Return G alone, without the states of the noise.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+        """
+        silent = PolynomialModel(
+            outputs=tuple(Polynomials(A=p.A, B=p.B, C=[1.0], D=[1.0], F=p.F) for p in self.outputs),  # type: ignore[arg-type]
+            dt=self.dt,
+        ).state_space()
+        return silent.plant()
+
     def _pole_letters(self) -> str:
         return "AF" if self.n_inputs else "AD"
 

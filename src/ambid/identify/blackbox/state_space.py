@@ -74,6 +74,16 @@ class StateSpaceModel:
         """Return the model itself."""
         return self
 
+    def plant(self) -> StateSpaceModel:
+        """Return G alone.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+        """
+        return StateSpaceModel(A=self.A, B=self.B, C=self.C, D=self.D, K=np.zeros_like(self.K), dt=self.dt)
+
     def poles(self) -> Complex:
         """Return the eigenvalues of A, largest magnitude first (discrete) or largest real part first (continuous).
 

@@ -159,6 +159,21 @@ class TransferModel:
         """
         return self._roots("num")[1]
 
+    def plant(self) -> StateSpaceModel:
+        """Return G as a state space.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+
+        Raises
+        ------
+        ModelError
+            As `state_space`.
+        """
+        return self.state_space()
+
     def state_space(self) -> StateSpaceModel:
         """Return an innovations form with K = 0; delays of a discrete model become states.
 

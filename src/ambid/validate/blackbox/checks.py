@@ -11,7 +11,7 @@ from ambid.identify.estimate import Check
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.residual_tests import ResidualTests
 from ambid.validate.checks import residual_check
-from ambid.validate.residuals import P_LEAST, ResidualTest
+from ambid.validate.residuals import P_LEAST
 
 
 def stable_predictor(found: Errors) -> Check:
@@ -65,24 +65,33 @@ def residual_verdicts(fit: BlackBoxFit, data: IOData, found: Errors, tests: Resi
         of = f" of {tests.uncorrelated_output}" if data.n_outputs > 1 else ""
         checks["residuals_uncorrelated"] = residual_check(tests.uncorrelated, f"residuals{of} against past inputs")
     if tests.feedback is not None:
-        checks["feedback"] = _feedback(fit, tests.feedback, tests.feedback_input)
+        checks["feedback"] = _feedback(fit, tests)
     return checks
 
 
-def _feedback(fit: BlackBoxFit, test: ResidualTest, name: str) -> Check:
-    seen, biased = test.p < P_LEAST, structure(fit.structure).feedback == "biased"
+def _feedback(fit: BlackBoxFit, tests: ResidualTests) -> Check:
+    test, biased = tests.feedback, structure(fit.structure).feedback == "biased"
+    assert test is not None
+    seen, told = test.p < P_LEAST, f"input {tests.feedback_input!r} depends on past residuals"
     if not seen:
         detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
+    elif _explained_by_inputs(tests):
+        detail = f"{told}, which hold what inputs explain: there is feedback, or a nonlinearity that looks like it"
     elif biased:
-        detail = f"input {name} depends on past residuals: there is feedback, and {fit.structure} is biased by it"
+        detail = f"{told}: there is feedback, and {fit.structure} is biased by it"
     else:
-        detail = f"input {name} depends on past residuals: there is feedback, which {fit.structure} allows for"
+        detail = f"{told}: there is feedback, which {fit.structure} allows for"
     return Check(
         passed=not (seen and biased),
         p=test.p,
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
         detail=f"{detail} (p = {test.p:.2g})",
     )
+
+
+def _explained_by_inputs(tests: ResidualTests) -> bool:
+    """Whether residuals hold a function of past inputs: then inputs depend on them without any feedback."""
+    return tests.uncorrelated is not None and tests.uncorrelated.p < P_LEAST
 
 
 def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> list[str]:
@@ -100,8 +109,10 @@ def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> li
     """
     if tests.feedback is None or tests.feedback.p >= P_LEAST:
         return []
-    evidence = f"input {tests.feedback_input} depends on past residuals (p = {tests.feedback.p:.2g})"
+    evidence = f"input {tests.feedback_input!r} depends on past residuals (p = {tests.feedback.p:.2g})"
     if structure(fit.structure).feedback == "biased":
+        if _explained_by_inputs(tests):
+            return [f"{evidence}: feedback, by which {fit.structure} is biased, or a nonlinearity that looks like it"]
         return [
             f"there is feedback in this record: {evidence}; {fit.structure} is biased by it. Use bj, armax or pbsid"
         ]

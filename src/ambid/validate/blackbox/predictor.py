@@ -31,6 +31,8 @@ class Errors:
     ----------
     model : StateSpaceModel
         Discrete innovations form that was used.
+    plant : StateSpaceModel
+        Its part from inputs to outputs: noise that wanders without bound does not keep a stable plant from simulation.
     one_step : ndarray, shape (n_samples, n_outputs)
         Output minus its prediction from all samples before; not a number where an unstable predictor runs away.
     simulation : ndarray, shape (n_samples, n_outputs), or None
@@ -38,6 +40,7 @@ class Errors:
     """
 
     model: StateSpaceModel
+    plant: StateSpaceModel
     one_step: Array
     simulation: Array | None
 
@@ -75,10 +78,11 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
             f"the data have {data.n_inputs} inputs and {data.n_outputs} outputs, the fit {len(fit.inputs)} and "
             f"{len(fit.outputs)}; they have to agree. Name the same channels"
         )
-    model = innovations_form(fit)
+    model, plant = innovations_form(fit), plant_form(fit)
     e = _one_step_error(model, data, data.y, fit)
-    simulated = simulation(model, data.u, data.y, fit.offsets)
-    return Errors(model=model, one_step=e, simulation=None if simulated is None else data.y - simulated)
+    simulated = simulation(plant, data.u, data.y, fit.offsets)
+    simulated = None if simulated is None else data.y - simulated
+    return Errors(model=model, plant=plant, one_step=e, simulation=simulated)
 
 
 def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
@@ -114,10 +118,11 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
         if simulated is not None:
             shifted += simulated[late].mean(axis=0)
             y = data.y - shifted
-            again = simulation(m, data.u, y, fit.offsets)
+            again = simulation(found.plant, data.u, y, fit.offsets)
             simulated = None if again is None else y - again
     return Errors(
         model=m,
+        plant=found.plant,
         one_step=e - e.mean(axis=0),
         simulation=None if simulated is None else simulated - simulated.mean(axis=0),
     )
@@ -149,6 +154,21 @@ def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
     if isinstance(model, TransferModel):
         return held_transfer(model, fit.dt)
     return held(model.state_space(), fit.dt)
+
+
+def plant_form(fit: BlackBoxFit) -> StateSpaceModel:
+    """Return the way from inputs to outputs as a discrete state space, without the states of the noise.
+
+    Parameters
+    ----------
+    fit : BlackBoxFit
+
+    Returns
+    -------
+    StateSpaceModel
+        With K = 0.
+    """
+    return innovations_form(fit).plant() if fit.model.dt is None else fit.model.plant()
 
 
 def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
