@@ -5,8 +5,11 @@ import pytest
 from scipy.signal import ss2tf
 
 from ambid.errors import EstimationError
+from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.instrumental import cliv, clsrivc, iv4, two_stage
 from ambid.identify.instrumental.clsrivc import sampled_coefficients
+from ambid.signals import multisine
+from tests.identify.benches import SETTINGS, run
 from tests.identify.instrumental.records import in_loop, io_data, monte_carlo, second_order
 
 DT = 1e-3
@@ -119,3 +122,17 @@ def test_units_do_not_matter():
     one = clsrivc(d, {"nb": 1, "nf": 2})
     other = clsrivc(io_data(1e3 * d.u, 1e-6 * d.y, reference=7 * d.reference, dt=1e-3), {"nb": 1, "nf": 2})
     np.testing.assert_allclose(other.model.theta, one.model.theta * [1e-9, 1, 1, 1], rtol=1e-6, atol=1e-5)
+
+
+def test_fast_sampling_and_a_reference_of_narrow_band():
+    # a bearing at 20 kHz, its poles near 110 rad/s: one sample is 1/180 of the fastest of them
+    bench, s = run("bearing", 20_000, 1), SETTINGS["bearing"]
+    r = multisine(20_000, s.rate_hz, amplitude=s.rms, band=s.band, seed=1, amplitude_is="rms", shape="flat")
+    position = bench.model.outputs.index("position")
+    d = io_data(bench.signals.u, bench.signals.y[:, position], reference=r, dt=1 / s.rate_hz)
+    fit = clsrivc(d, {"nb": 1, "nf": 3, "nk": int(bench.delay)})
+    truth = np.linalg.eigvals(bench.model.matrices(bench.truth).A)
+    error = np.sort_complex(fit.model.poles()) - np.sort_complex(truth)
+    spread = pole_covariance(fit.model, fit.covariance)[np.argsort(fit.model.poles())]
+    np.testing.assert_array_less(np.abs(error), 3 * np.sqrt(np.trace(spread, axis1=1, axis2=2)))
+    assert np.max(np.abs(error)) < 0.2 * np.max(np.abs(truth))

@@ -20,6 +20,9 @@ from ambid.identify.instrumental.solve import Solution, solve
 Array = NDArray[np.float64]
 
 _NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
+_NO_AVERAGE = np.ones(1)
+_SETTLED = 1e-4  # change of the filtered output by a round, relative to the innovations
+_INSIDE = 0.9999  # radius to which poles on the unit circle are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,9 +77,11 @@ class ArxEstimate:
     constant : float
         Of the equation, for the signals as given.
     noise : Autoregression
-        Of the equation error: A y = B u + constant + w/D.
+        Of the equation error: A y = B u + constant + C w/D.
+    C : ndarray, shape (n + 1,)
+        1, or A with the poles outside the unit circle mirrored: noise that enters at the output.
     solution : Solution
-        Last step; its unknowns are a_1 ..., b of every input, and the constant times D(1).
+        Last step; its unknowns are a_1 ..., b of every input, and the constant.
     innovations : ndarray, shape (n_rows,)
         Ending with the last sample.
     """
@@ -85,6 +90,7 @@ class ArxEstimate:
     B: tuple[Array, ...]
     constant: float
     noise: Autoregression
+    C: Array
     solution: Solution
     innovations: Array
 
@@ -110,9 +116,14 @@ def regressors(signals: Signals, orders: ArxOrders, first: int) -> Array:
 
 
 def step(
-    who: str, data: Signals, instruments: Signals, orders: ArxOrders, noise: Autoregression = _NO_NOISE_MODEL
+    who: str,
+    data: Signals,
+    instruments: Signals,
+    orders: ArxOrders,
+    noise: Autoregression = _NO_NOISE_MODEL,
+    C: Array = _NO_AVERAGE,
 ) -> Solution:
-    """Make one instrumental variable step; with `noise` all signals are filtered by its D.
+    """Make one instrumental variable step; all columns are filtered by D/C.
 
     Parameters
     ----------
@@ -121,15 +132,19 @@ def step(
     data, instruments : Signals
     orders : ArxOrders
     noise : Autoregression, optional
+    C : ndarray, shape (n + 1,), optional
 
     Returns
     -------
     Solution
     """
-    first = orders.first + noise.order
-    filtered = _filtered(data, noise.D)
-    rows = regressors(filtered, orders, first)
-    return solve(regressors(_filtered(instruments, noise.D), orders, first), rows, filtered.y[first:], who=who)
+    first, p = orders.first, noise.order
+    rows, Z, target = regressors(data, orders, first), regressors(instruments, orders, first), data.y[first:]
+    if p or C.size > 1:
+        from scipy.signal import lfilter
+
+        rows, Z, target = (lfilter(noise.D, C, x, axis=0)[p:] for x in (rows, Z, target))
+    return solve(Z, rows, target, who=who)
 
 
 def least_squares(who: str, data: Signals, orders: ArxOrders) -> Array:
@@ -170,6 +185,10 @@ def optimal(
 ) -> ArxEstimate:
     """Model the noise of the equation at `theta` and make the filtered, optimal step (Ljung 1999, eq. 15.25-15.29).
 
+    The noise is modelled twice, as 1/D and as C/D with C the stable counterpart of A, and the sharper model is taken.
+    The second is that of noise on the output: sampled fast, it has zeros next to the unit circle, which no
+    autoregression of moderate order holds. For an unstable plant C mirrors its poles: noise spectra do not tell them.
+
     Parameters
     ----------
     who : str
@@ -184,22 +203,74 @@ def optimal(
     -------
     ArxEstimate
     """
-    noise = autoregression(equation_error(data, theta, orders), highest)
-    solution = step(who, data, instruments, orders, noise)
+    from scipy.signal import lfilter
+
+    error = equation_error(data, theta, orders)
+    noise, C = autoregression(error, highest), _NO_AVERAGE
+    mirrored = _mirrored(np.concatenate([[1.0], theta[: orders.na]]))
+    at_output = autoregression(np.asarray(lfilter([1.0], mirrored, error)), highest)
+    if _cost(at_output, error.size) < _cost(noise, error.size):
+        noise, C = at_output, mirrored
+    solution = step(who, data, instruments, orders, noise, C)
     found = solution.theta
-    constant = float(found[-1] / noise.D.sum())
     A = np.concatenate([[1.0], found[: orders.na]])
     B, first = list[Array](), orders.na
     for nb, nk in zip(orders.nb, orders.nk, strict=True):
         B.append(np.concatenate([np.zeros(nk), found[first : first + nb]]))
         first += nb
     return ArxEstimate(
-        A=A, B=tuple(B), constant=constant, noise=noise, solution=solution, innovations=solution.residual
+        A=A,
+        B=tuple(B),
+        constant=float(found[-1]),
+        noise=noise,
+        C=C,
+        solution=solution,
+        innovations=solution.residual,
     )
 
 
+def refined(
+    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int, rounds: int
+) -> ArxEstimate:
+    """Repeat `optimal` until noise model and estimate agree.
+
+    Parameters
+    ----------
+    who : str
+    data, instruments : Signals
+    orders : ArxOrders
+    theta : ndarray, shape (n_coefficients + 1,)
+    highest : int
+    rounds : int
+        At most.
+
+    Returns
+    -------
+    ArxEstimate
+    """
+    for _ in range(rounds):
+        found = optimal(who, data, instruments, orders, theta, highest)
+        before, theta = theta, found.solution.theta
+        moved = np.linalg.pinv(found.solution.inverse) @ (theta - before)
+        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
+            break
+    return found
+
+
+def _mirrored(A: Array) -> Array:
+    roots = np.roots(A)
+    size = np.maximum(np.abs(roots), 1e-300)
+    roots = np.where(size > 1, roots / size**2, roots)
+    size = np.abs(roots)
+    return np.asarray(np.poly(np.where(size > _INSIDE, roots * _INSIDE / np.maximum(size, 1e-300), roots)).real)
+
+
+def _cost(noise: Autoregression, n: int) -> float:
+    return float(n * np.log(noise.variance + 1e-300) + 2 * noise.order)
+
+
 def polynomials(found: ArxEstimate) -> Polynomials:
-    """Return A, B and, as the noise model, 1/D.
+    """Return A, B and, as the noise model, C/D.
 
     Parameters
     ----------
@@ -209,14 +280,14 @@ def polynomials(found: ArxEstimate) -> Polynomials:
     -------
     Polynomials
     """
-    return Polynomials(A=found.A, B=found.B, C=np.ones(1), D=found.noise.D, F=tuple(np.ones(1) for _ in found.B))
+    return Polynomials(A=found.A, B=found.B, C=found.C, D=found.noise.D, F=tuple(np.ones(1) for _ in found.B))
 
 
 def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
     """Return the covariance of all coefficients of `polynomials`, leading ones and zeros included.
 
-    The noise of the filtered equation is modelled once more, so that a noise model of too low an order costs efficiency
-    but does not make the standard deviations too small.
+    C follows from A and has zeros. The noise of the filtered equation is modelled once more, so that a noise model of
+    too low an order costs efficiency but does not make the standard deviations too small.
 
     Parameters
     ----------
@@ -231,7 +302,7 @@ def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
     left = autoregression(found.innovations, 10)
     spare = rows / max(rows - orders.size - 1, 1)
     inner = found.solution.covariance(left)[:-1, :-1] * spare
-    sizes = [found.A.size, *(b.size for b in found.B), 1, found.noise.D.size, *(1 for _ in found.B)]
+    sizes = [found.A.size, *(b.size for b in found.B), found.C.size, found.noise.D.size, *(1 for _ in found.B)]
     free = [slice(1, found.A.size)]
     start = found.A.size
     for b, nk in zip(found.B, orders.nk, strict=True):
@@ -240,7 +311,7 @@ def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
     places = np.concatenate([np.arange(s.start, s.stop) for s in free])
     out = np.zeros((sum(sizes), sum(sizes)))
     out[np.ix_(places, places)] = inner
-    d = slice(start + 1, start + 1 + found.noise.D.size)
+    d = slice(start + found.C.size, start + found.C.size + found.noise.D.size)
     out[d, d] = noise_covariance(found.noise, rows)
     return out
 
@@ -268,12 +339,3 @@ def operating_point(found: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd
         rows[o, n_y:] = -np.array([b.sum() for b in f.B]) * u_sd
     move = np.linalg.lstsq(rows, np.array([f.constant for f in found]), rcond=None)[0]
     return Offsets(u=u_mean + move[n_y:] * u_sd, y=y_mean + move[:n_y] * y_sd)
-
-
-def _filtered(signals: Signals, D: Array) -> Signals:
-    """Signals through D; the first order(D) samples are not usable."""
-    if D.size == 1:
-        return signals
-    from scipy.signal import lfilter
-
-    return Signals(y=lfilter(D, [1.0], signals.y), u=lfilter(D, [1.0], signals.u, axis=0))

@@ -45,7 +45,7 @@ def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
     Returns
     -------
     BlackBoxFit
-        PolynomialModel with A, B and 1/D, an autoregressive model of the equation's noise, as noise model.
+        PolynomialModel with A, B and the noise model C/D; C is 1, or the stable counterpart of A.
 
     Raises
     ------

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 _HIGHEST = 16  # lags of the autoregression that are looked at
 _FORGOTTEN = 1e-6  # of an impulse response, where it is cut
+_SMALL = 1e-3  # weight of that, relative to signals of unit spread
 _ROUNDING = 1e-12  # variance, relative to the signal's, that counts as none: a controller without noise is exact
 
 
@@ -93,7 +94,11 @@ def reference_part(who: str, data: IOData) -> ReferencePart:
     R, width = _triangle(w, r, highest), n_w + n_r
     for p in _by_criterion(R, n - highest, n_w, n_r, highest):
         size = 1 + n_r + p * width
-        theta = np.asarray(np.linalg.lstsq(R[:size, :size], R[:size, -n_w:], rcond=None)[0][1:], dtype=np.float64)
+        # a reference of narrow band leaves its own lags open: keep their coefficients small
+        small = np.sqrt(n) * _SMALL * np.diag(_of_reference(n_w, n_r, p).astype(np.float64))
+        rows = np.vstack([R[:size, :size], small])
+        target = np.vstack([R[:size, -n_w:], np.zeros((size, n_w))])
+        theta = np.asarray(np.linalg.lstsq(rows, target, rcond=None)[0][1:], dtype=np.float64)
         found = _impulse(theta, n_w, n_r, p, n)
         if found is not None:
             from scipy.signal import oaconvolve
@@ -125,6 +130,12 @@ def _by_criterion(R: Array, rows: int, n_w: int, n_r: int, highest: int) -> list
         _, logdet = np.linalg.slogdet(left.T @ left / rows + _ROUNDING * np.eye(n_w))
         score.append(rows * logdet + 2 * size * n_w)
     return [int(k) + 1 for k in np.argsort(score, kind="stable")]
+
+
+def _of_reference(n_w: int, n_r: int, p: int) -> NDArray[np.bool_]:
+    """Which coefficients, constant first, belong to the reference."""
+    lag = [False] * n_w + [True] * n_r
+    return np.array([False] + [True] * n_r + lag * p)
 
 
 def _impulse(theta: Array, n_w: int, n_r: int, p: int, n: int) -> Array | None:
