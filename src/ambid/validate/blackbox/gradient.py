@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.identify.blackbox.response import states
+from ambid.identify.blackbox.response import stable, states
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox.predictor import Errors, held_transfer
 
@@ -66,7 +66,7 @@ def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
             places.append(own + first)
             first += every.shape[1]
         return Gradient(rows=tuple(rows), theta=tuple(places))
-    if isinstance(model, TransferModel):
+    if isinstance(model, TransferModel) and stable(found.plant):
         return Gradient(
             rows=tuple(_transfer_gradient(model, fit.dt, o, u, y, found) for o in range(model.n_outputs)), theta=None
         )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.response import one_step, simulation
+from ambid.identify.blackbox.response import one_step, simulation, stable
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
 
@@ -37,17 +37,16 @@ class Errors:
         Output minus its prediction from all samples before; not a number where an unstable predictor runs away.
     simulation : ndarray, shape (n_samples, n_outputs), or None
         Output minus its simulation from the inputs alone; None for an unstable model, or without inputs.
+    claims_noise : bool
+        Whether the fit describes the noise; an output-error model (K = 0) does not.
     """
 
     model: StateSpaceModel
     plant: StateSpaceModel
     one_step: Array
     simulation: Array | None
+    claims_noise: bool
 
-    @property
-    def claims_noise(self) -> bool:
-        """Whether the model describes the noise; an output-error model (K = 0) does not."""
-        return bool(np.any(self.model.K)) or not self.model.n_inputs
 
 
 def errors(fit: BlackBoxFit, data: IOData) -> Errors:
@@ -79,10 +78,13 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
             f"{len(fit.outputs)}; they have to agree. Name the same channels"
         )
     model, plant = innovations_form(fit), plant_form(fit)
+    claims_noise = bool(np.any(model.K)) or not model.n_inputs
+    if not claims_noise and not stable(model):
+        model = _mirrored(model, fit.noise_covariance)
     e = _one_step_error(model, data, data.y, fit)
     simulated = simulation(plant, data.u, data.y, fit.offsets)
     simulated = None if simulated is None else data.y - simulated
-    return Errors(model=model, plant=plant, one_step=e, simulation=simulated)
+    return Errors(model=model, plant=plant, one_step=e, simulation=simulated, claims_noise=claims_noise)
 
 
 def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
@@ -125,7 +127,26 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
         plant=found.plant,
         one_step=e - e.mean(axis=0),
         simulation=None if simulated is None else simulated - simulated.mean(axis=0),
+        claims_noise=found.claims_noise,
     )
+
+
+def _mirrored(model: StateSpaceModel, noise: Array) -> StateSpaceModel:
+    """Return an unstable output-error model with the gain of its best predictor under white output noise.
+
+    It mirrors the unstable poles at the unit circle: the stabilising Riccati solution without process noise (Anderson
+    and Moore 1979, sec. 4.4). Without one, the model comes back as it was.
+    """
+    from scipy.linalg import LinAlgError, solve_discrete_are
+
+    try:
+        R = noise if np.all(np.linalg.eigvalsh(noise) > 0) else np.eye(model.n_outputs)
+        P = solve_discrete_are(model.A.T, model.C.T, np.zeros_like(model.A), R / np.trace(R))
+    except (LinAlgError, ValueError):
+        return model
+    S = model.C @ P @ model.C.T + R / np.trace(R)
+    K = np.linalg.solve(S, model.C @ P @ model.A.T).T
+    return StateSpaceModel(A=model.A, B=model.B, C=model.C, D=model.D, K=K, dt=model.dt)
 
 
 def _one_step_error(model: StateSpaceModel, data: IOData, y: Array, fit: BlackBoxFit) -> Array:
