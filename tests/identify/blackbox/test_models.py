@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.identify.blackbox.model import root_derivative
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets, one_step, simulation
 from ambid.identify.blackbox.state_space import StateSpaceModel
@@ -122,3 +123,26 @@ def test_unstable_models_are_not_simulated() -> None:
     model = StateSpaceModel(A=[[1.1]], B=[[1.0]], C=[[1.0]], D=[[0.0]], K=[[0.9]], dt=DT)
     u = np.ones((10, 1))
     assert simulation(model, u, u, Offsets(u=np.zeros(1), y=np.zeros(1))) is None
+
+
+def test_roots_of_long_fir_models_have_finite_derivatives() -> None:
+    """r^200 overflows for a root far outside the unit circle; its derivative does not. Euler's identities hold."""
+    rng = np.random.default_rng(0)
+    taps = 0.97 ** np.arange(200) * rng.standard_normal(200)
+    taps[0] = 1e-6  # a first tap that is nearly zero: a root near 1e5
+    model = PolynomialModel(outputs=(Polynomials(A=[1.0], B=(taps,), C=[1.0], D=[1.0], F=([1.0],)),), dt=DT)
+    zeros, place = model.zeros(), slice(1, 201)
+    slope = model.zero_derivative()[:, place]
+    assert np.max(np.abs(zeros)) > 1e5
+    assert np.all(np.isfinite(slope))
+    size = np.max(np.abs(slope * taps), axis=1)
+    assert np.max(np.abs(slope @ taps) / size) < 1e-9  # all coefficients times a number: the roots stay
+    assert np.max(np.abs(slope @ (np.arange(200) * taps) - zeros) / np.abs(zeros)) < 1e-9  # p_k g^k: roots times g
+
+
+def test_root_derivatives_inside_and_outside_the_unit_circle_agree_with_the_formula() -> None:
+    c = np.array([1.0, -3.1, 2.9, -0.8, 0.2])
+    roots = np.roots(c).astype(complex)
+    assert np.min(np.abs(roots)) < 1 < np.max(np.abs(roots))
+    expected = -(roots[:, None] ** np.arange(4, -1, -1)) / np.polyval(np.polyder(c), roots)[:, None]
+    assert root_derivative(c, roots) == pytest.approx(expected, rel=1e-12)
