@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ambid.errors import EstimationError
+
+if TYPE_CHECKING:
+    from ambid.identify.blackbox.orders import Orders
 
 Inputs = Annotated[
     list[str] | None,
@@ -32,7 +35,7 @@ SecondRecord = Annotated[
 ]
 
 
-def orders_of(text: str) -> dict[str, int | str | tuple[int, ...]] | None:
+def orders_of(text: str) -> Orders | None:
     """Read orders as they are written on the command line.
 
     Parameters

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.structures import Structure, structure
 from ambid.record import Record, read_record
 from ambid.signals.samples import cut
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from ambid.validate.comparison import Comparison
 
 Tick = Callable[[str], None]
-Orders = Mapping[str, "int | str | tuple[int, ...]"]
 
 
 def fit(

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.structures import Orders, Structure
+from ambid.identify.blackbox.orders import UsedOrders, shown
+from ambid.identify.blackbox.structures import Structure
 from ambid.validate.arx_orders import ArxCandidate, arx_candidates
 
 Point = tuple[int, ...]
@@ -73,7 +74,7 @@ def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]
     return Start(bounds=bounds, nk=best.nk, arx=found)
 
 
-def searched_orders(of: Structure, start: Start, n_inputs: int, score: Callable[[Orders], float]) -> None:
+def searched_orders(of: Structure, start: Start, n_inputs: int, score: Callable[[UsedOrders], float]) -> None:
     """Fit candidates, each once, until none of those around the best is better or the budget is spent.
 
     Parameters
@@ -108,15 +109,14 @@ def searched_orders(of: Structure, start: Start, n_inputs: int, score: Callable[
         best = there
 
 
-def _finalists(of: Structure, start: Start) -> Iterator[Orders]:
+def _finalists(of: Structure, start: Start) -> Iterator[UsedOrders]:
     """The ARX models that AIC or BIC puts first, and with them every other criterion."""
     chosen = list[ArxCandidate]()
     for penalty in (2.0, float(np.log(start.arx[0].n_rows))):
         ranked = sorted(start.arx, key=lambda c: c.n_rows * c.log_det + penalty * c.n_estimated)
         chosen += [c for c in ranked[: _FINALISTS // 2] if c not in chosen]
     for c in chosen:
-        nk: int | tuple[int, ...] = c.nk[0] if len(set(c.nk)) == 1 else c.nk
-        full: dict[str, int | tuple[int, ...]] = {"na": c.na, "nb": c.nb, "nk": nk}
+        full: UsedOrders = {"na": c.na, "nb": c.nb, "nk": shown(c.nk)}
         yield {k: full[k] for k in of.orders}
 
 
@@ -128,11 +128,10 @@ def _coordinates(of: Structure, n_inputs: int) -> tuple[Coordinate, ...]:
     return tuple((key, i) for key in of.orders for i in (range(n_inputs) if key in ("nb", "nf", "nk") else (None,)))
 
 
-def _orders(keys: tuple[Coordinate, ...], point: Point) -> Orders:
+def _orders(keys: tuple[Coordinate, ...], point: Point) -> UsedOrders:
     out = dict[str, int | tuple[int, ...]]()
     for key in dict.fromkeys(k for k, _ in keys):
-        values = tuple(v for (k, _), v in zip(keys, point, strict=True) if k == key)
-        out[key] = values[0] if len(set(values)) == 1 else values
+        out[key] = shown(tuple(v for (k, _), v in zip(keys, point, strict=True) if k == key))
     return out
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.structures import Orders, structure
+from ambid.identify.blackbox.orders import Orders
+from ambid.identify.blackbox.structures import structure
 from ambid.validate.blackbox import judged
 from ambid.validate.holdout import HELD_OUT, hold_out
 from ambid.validate.selection import select
@@ -26,7 +27,7 @@ class Entry:
     ----------
     structure : str
     orders : Mapping[str, int or tuple of int]
-        Empty where it could not be fitted and none were given.
+        As used; as asked for, or empty, where it could not be fitted.
     fit : BlackBoxFit or None
         Judged, with its validation; None where the estimator refused.
     one_step, simulation : float or None

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError, nearest
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.structures import Orders, Structure, structure
+from ambid.identify.blackbox.orders import UsedOrders
+from ambid.identify.blackbox.structures import Structure, structure
 from ambid.validate._order_search import first_size, searched_orders
 from ambid.validate.blackbox.criteria import criteria, skipped
 from ambid.validate.blackbox.predictor import errors
@@ -46,7 +47,7 @@ class Candidate:
         made white by an autoregression.
     """
 
-    orders: Orders
+    orders: UsedOrders
     n_estimated: int
     scores: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -70,7 +71,7 @@ class Selection:
 
     structure: str
     criterion: Criterion
-    orders: Orders
+    orders: UsedOrders
     candidates: tuple[Candidate, ...]
     why: str
     samples: int
@@ -176,7 +177,7 @@ class _Trial:
         if criterion in ("holdout", "kfold"):
             self.parts = (hold_out(data),) if criterion == "holdout" else folds(data)
 
-    def score(self, orders: Orders) -> float:
+    def score(self, orders: UsedOrders) -> float:
         """Fit, and return the score to search by; infinite where the estimator refuses."""
         self._say(orders)
         try:
@@ -216,7 +217,7 @@ class _Trial:
         more: dict[str, float] = {self.criterion: error} if np.isfinite(error) else {}
         return replace(candidate, scores={**candidate.scores, **more})
 
-    def _say(self, orders: Orders) -> None:
+    def _say(self, orders: UsedOrders) -> None:
         if self.tick is not None:
             self.tick(", ".join(f"{k}={v}" for k, v in orders.items()))
 

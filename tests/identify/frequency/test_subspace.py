@@ -78,7 +78,7 @@ def test_the_operator_is_what_makes_it_work():
 
 def test_order_by_itself():
     frf = noisy(F, plant("unstable-bearing", F), 0.01, 2)
-    fit = frf_subspace(frf, "auto", max_order=5)
+    fit = frf_subspace(frf, {"n": "auto"}, max_order=5)
     assert fit.orders == {"n": 3}
     assert list(fit.details["bic_by_order"]) == ["1", "2", "3"]
 
@@ -130,7 +130,7 @@ def test_units_do_not_matter():
     ("orders", "options", "message"),
     [
         ({"n": 0}, {}, "at least 1"),
-        ({"na": 2}, {}, "takes n"),
+        ({"na": 2}, {}, "it takes n. Did you mean"),
         ({"n": 3}, {"domain": "z"}, "held"),
         ({"n": 3}, {"delay": -1.0}, "delay"),
         ({"n": 3}, {"p": -5.0}, "positive"),

@@ -206,12 +206,12 @@ def test_all_orders_from_one_factorisation(name):
 @pytest.mark.parametrize(
     ("orders", "options", "says"),
     [
-        ({"n": 0}, {}, "n = 0; it must be an integer"),
+        ({"n": 0}, {}, "n = 0; it must be a whole number of at least 1"),
         ({"n": 2.5}, {}, "n = 2.5"),
         ({"n": True}, {}, "n = True"),
         ({"na": 2}, {}, "order 'na' is not known"),
         ({"n": 2, "nk": 0}, {}, "say feedthrough"),
-        ({"n": 2, "nk": (1, 1)}, {}, "2 delays nk for 1 inputs"),
+        ({"n": 2, "nk": (1, 1)}, {}, "nk has 2 numbers for 1 input"),
         ({"n": 9}, {"horizon": 5}, "shows at most 4 states"),
         ({"n": 2}, {"past": 1}, "past = 1 samples"),
         ({"n": 2}, {"horizon": 300}, "longer record"),

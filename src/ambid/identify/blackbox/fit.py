@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.model import BlackBoxModel
+from ambid.identify.blackbox.orders import UsedOrders
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.estimate import Check, OutputFit
 
@@ -56,7 +57,7 @@ class BlackBoxFit:
     """
 
     structure: str
-    orders: Mapping[str, int | tuple[int, ...]]
+    orders: UsedOrders
     model: BlackBoxModel
     covariance: Array | None
     n_estimated: int

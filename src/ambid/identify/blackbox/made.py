@@ -12,6 +12,7 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.model import BlackBoxModel
+from ambid.identify.blackbox.orders import UsedOrders
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.structures import structure
 
@@ -22,7 +23,7 @@ def made(
     name: str,
     data: IOData,
     *,
-    orders: Mapping[str, int | tuple[int, ...]],
+    orders: UsedOrders,
     model: BlackBoxModel,
     covariance: Array | None,
     n_estimated: int,

@@ -14,8 +14,6 @@ from typing import Literal
 from ambid.errors import EstimationError, nearest
 from ambid.identify.blackbox.fit import BlackBoxFit
 
-Orders = Mapping[str, int | tuple[int, ...]]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:

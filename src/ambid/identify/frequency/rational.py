@@ -8,7 +8,6 @@ well-conditioned at any order; coefficients of powers and their covariance follo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders, known_orders, left_open, per_input, shown, single
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.frequency.basis import orthogonal_polynomials
@@ -73,7 +73,7 @@ class _Form:
 
 def frf_ml(
     frf: FrequencyResponse,
-    orders: Mapping[str, int | tuple[int, ...]],
+    orders: Orders,
     *,
     domain: Literal["s", "z"] | None = None,
     delay: float | Literal["auto"] = 0.0,
@@ -120,7 +120,7 @@ def frf_ml(
         raise EstimationError(f"a delay of {delay} s is no whole number of samples of {period} s. Use domain 's'")
     with one_thread():
         best = _fitted(form, delay, domain)
-    return _result(frf, orders, best, domain)
+    return _result(frf, best, domain)
 
 
 def _fitted(
@@ -143,22 +143,20 @@ def _fitted(
     return best
 
 
-def _form(
-    frf: FrequencyResponse, orders: Mapping[str, int | tuple[int, ...]], domain: Literal["s", "z"], common: bool
-) -> _Form:
+def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"], common: bool) -> _Form:
     """Check the orders and lay the coefficients out."""
     m = int(np.prod(np.shape(frf.G)[1:]))
-    unknown = set(orders) - {"nb", "nf"}
-    if unknown or "nf" not in orders:
-        raise EstimationError(f"orders {dict(orders)}; frf-ml takes nf and nb. Give nf=2, nb=2 and so on")
-    nf = orders["nf"] if isinstance(orders["nf"], tuple) else (orders["nf"],) * (1 if common else m)
-    group = (0,) * m if len(nf) == 1 and common else tuple(range(m))
-    if len(nf) != max(group) + 1 or min(nf) < 0:
-        raise EstimationError(f"order nf = {nf} for {m} entries; give one degree, or one for each entry, from 0 up")
-    given = orders.get("nb", tuple(max(nf[g], 1) for g in group))
-    nb = given if isinstance(given, tuple) else (given,) * m
-    if len(nb) != m or any(not 1 <= n <= nf[g] + 1 for n, g in zip(nb, group, strict=True)):
-        raise EstimationError(f"order nb = {nb} with nf = {nf}; each entry has 1 to nf + 1 numerator coefficients")
+    who, pair = "frf-ml", "input-output pair"
+    known_orders(who, orders, ("nb", "nf"), ("nf",))
+    shared = common and not (isinstance(orders["nf"], tuple) and len(orders["nf"]) > 1)
+    group = (0,) * m if shared else tuple(range(m))
+    nf = (single(who, orders, "nf", 0),) if shared else per_input(who, orders, "nf", 0, m, of=pair)
+    usual = tuple(max(nf[g], 1) for g in group)
+    nb = usual if left_open(orders, "nb") else per_input(who, orders, "nb", 1, m, of=pair)
+    if any(n > nf[g] + 1 for n, g in zip(nb, group, strict=True)):
+        raise EstimationError(
+            f"{who}: order nb = {nb} with nf = {nf}; a numerator has at most nf + 1 coefficients. Lower nb"
+        )
     checked = lines(frf, sum(nb) + sum(nf))
     size = float(np.median(checked.omega)) if domain == "s" else 1.0
     dt = None if domain == "s" else checked.dt
@@ -300,7 +298,6 @@ def _search(at: _Form, vector: Array, lag: float) -> tuple[float, Array, bool]:
 
 def _result(
     frf: FrequencyResponse,
-    orders: Mapping[str, int | tuple[int, ...]],
     best: tuple[float, _Form, Array, float, bool],
     domain: Literal["s", "z"],
 ) -> BlackBoxFit:
@@ -320,7 +317,7 @@ def _result(
         "frf-ml",
         frf,
         at.lines,
-        orders={"nb": at.nb, "nf": at.nf, **{k: v for k, v in orders.items() if isinstance(v, int)}},
+        orders={"nb": shown(at.nb), "nf": shown(at.nf)},
         model=model,
         covariance=M @ covariance @ M.T,
         cost=cost,

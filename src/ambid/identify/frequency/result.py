@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.model import BlackBoxModel
+from ambid.identify.blackbox.orders import UsedOrders
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.frequency.lines import Lines
 from ambid.signals.frf import FrequencyResponse
@@ -22,7 +23,7 @@ def made_from_lines(
     frf: FrequencyResponse,
     checked: Lines,
     *,
-    orders: Mapping[str, int | tuple[int, ...]],
+    orders: UsedOrders,
     model: BlackBoxModel,
     covariance: Array,
     cost: float,

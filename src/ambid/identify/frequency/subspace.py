@@ -9,7 +9,6 @@ several inputs and outputs, stable or not. A held input is exact too: sampled li
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders, known_orders, left_open, single
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.frequency.laguerre import best_conditioned, block_rows_condition, laguerre_operator
@@ -43,7 +43,7 @@ class _Trial:
 
 def frf_subspace(
     frf: FrequencyResponse,
-    orders: Mapping[str, int] | Literal["auto"],
+    orders: Orders | Literal["auto"],
     *,
     p: float | None = None,
     block_rows: int | None = None,
@@ -59,8 +59,9 @@ def frf_subspace(
     Parameters
     ----------
     frf : FrequencyResponse
-    orders : Mapping[str, int] or "auto"
-        ``n``. "auto": the lowest order whose refined cost noise explains; the one of least BIC where none does.
+    orders : Mapping[str, int or "auto"], or "auto"
+        ``n``. "auto", or left out: the lowest order whose refined cost noise explains; the one of least BIC where
+        none does.
     p : float, optional, rad/s
         Of the Laguerre operator; default the one of least mean square error on a grid over the band.
     block_rows : int, optional
@@ -90,11 +91,11 @@ def frf_subspace(
     EstimationError
         If orders, options or lines break a rule.
     """
-    _checked(frf, orders, delay, domain, max_order)
+    n = _order(frf, orders, delay, domain, max_order)
     with one_thread():
-        if orders == "auto":
+        if n is None:
             return _chosen(frf, p, block_rows, delay, feedthrough, domain, refine, max_order, resamples)
-        return _of_order(frf, orders["n"], p, block_rows, delay, feedthrough, domain, refine, resamples)
+        return _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
 
 
 def _of_order(
@@ -161,22 +162,25 @@ def _of_order(
     )
 
 
-def _checked(
+def _order(
     frf: FrequencyResponse,
-    orders: Mapping[str, int] | Literal["auto"],
+    orders: Orders | Literal["auto"],
     delay: float,
     domain: str,
     max_order: int,
-) -> None:
+) -> int | None:
+    """Return the order, None where it is to be chosen; refuse what breaks a rule."""
     if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
         raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
     if not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive. Correct it")
-    if orders == "auto":
-        if max_order < 1:
-            raise EstimationError(f"max_order is {max_order}; it must be at least 1. Raise it")
-    elif set(orders) != {"n"} or orders["n"] < 1:
-        raise EstimationError(f"orders {dict(orders)}; frf-subspace takes n, at least 1. Give n=3 and so on")
+    asked = {} if isinstance(orders, str) and orders == "auto" else orders
+    known_orders("frf-subspace", asked, ("n",))
+    if not left_open(asked, "n"):
+        return single("frf-subspace", asked, "n", 1)
+    if max_order < 1:
+        raise EstimationError(f"max_order is {max_order}; it must be at least 1. Raise it")
+    return None
 
 
 def _chosen(

@@ -11,9 +11,9 @@ import numpy as np
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals, refined, step
 from ambid.identify.instrumental.iv4 import arx_fit, arx_orders, centred
-from ambid.identify.instrumental.orders import Orders
 from ambid.identify.instrumental.reference import reference_part, wants_reference
 
 _NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it

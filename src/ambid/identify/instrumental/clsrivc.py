@@ -18,13 +18,13 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, long_enough
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals, operating_point
 from ambid.identify.instrumental.cliv import in_loop
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression, score_covariance
-from ambid.identify.instrumental.orders import Orders, long_enough
 from ambid.identify.instrumental.reference import reference_part, wants_reference
 from ambid.identify.instrumental.srivc import TransferOrders, transfer_orders
 from ambid.identify.threads import one_thread

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input, single
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
 from ambid.identify.instrumental.arx_form import (
     ArxEstimate,
@@ -24,7 +25,6 @@ from ambid.identify.instrumental.arx_form import (
     polynomials,
     step,
 )
-from ambid.identify.instrumental.orders import Orders, known_orders, long_enough, per_input, single
 
 Array = NDArray[np.float64]
 

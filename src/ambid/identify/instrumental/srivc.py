@@ -18,11 +18,11 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, known_orders, left_open, long_enough, per_input
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression
-from ambid.identify.instrumental.orders import Orders, known_orders, long_enough, per_input
 from ambid.identify.instrumental.output_error import Found, search
 from ambid.identify.threads import one_thread
 
@@ -132,7 +132,7 @@ def transfer_orders(who: str, data: IOData, orders: Orders) -> TransferOrders:
                 f"{who}: {b} numerator coefficients over a denominator of degree {f}; a plant that can be sampled has "
                 f"at most {f + 1}. Lower nb, or raise nf"
             )
-    nk = per_input(who, orders, "nk", 0, n_u) if "nk" in orders else None
+    nk = None if left_open(orders, "nk") else per_input(who, orders, "nk", 0, n_u)
     return TransferOrders(nb=nb, nf=nf, nk=nk, common=not isinstance(orders["nf"], tuple) or n_u == 1)
 
 

@@ -18,13 +18,13 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.instrumental.cliv import cliv
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression
-from ambid.identify.instrumental.orders import Orders, known_orders, long_enough, per_input
 from ambid.identify.instrumental.reference import reference_part, wants_reference
 from ambid.identify.instrumental.solve import Solution, solve, span
 from ambid.identify.threads import one_thread

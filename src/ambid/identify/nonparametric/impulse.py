@@ -19,16 +19,15 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input, shown
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
-from ambid.identify.instrumental.orders import known_orders, long_enough, per_input
 from ambid.identify.nonparametric.autoregression import predictor_taps, responses
 from ambid.identify.nonparametric.bayes import Posterior, posterior, triangle, with_outputs
 from ambid.identify.nonparametric.kernels import Kernel
 from ambid.identify.threads import one_thread
 
 Array = NDArray[np.float64]
-Orders = Mapping[str, int | tuple[int, ...]]
 
 _ALL: tuple[Kernel, ...] = ("tc", "dc", "ss")
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
@@ -138,7 +137,7 @@ def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = _ALL, zero
     return made(
         "rfir",
         data,
-        orders={"nb": nb if len(set(nb)) > 1 else nb[0], "nk": nk if len(set(nk)) > 1 else nk[0]},
+        orders={"nb": shown(nb), "nk": shown(nk)},
         model=model,
         covariance=covariance,
         n_estimated=int(np.ceil(sum(f.freedom for f in found))),

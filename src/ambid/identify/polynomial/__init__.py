@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.polynomial.orders import Orders
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.polynomial.polynomial import estimate
 
 __all__ = ["ararmax", "ararx", "arma", "armax", "arx", "bj", "fir", "oe"]

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError, nearest
 from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.orders import Orders, UsedOrders, known_orders, left_open, per_input, shown, single
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.structures import structure
 
 Array = NDArray[np.float64]
 Key = tuple[str, int | None]
-Orders = Mapping[str, int | tuple[int, ...]]
 
 _PER_INPUT = ("nb", "nk", "nf")
 
@@ -155,22 +155,15 @@ def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tupl
     """
     known = structure(name).orders
     _check_inputs(name, data)
-    for key in orders:
-        if key not in known:
-            raise EstimationError(
-                f"{name}: order {key!r} is not one of {', '.join(known)}.{nearest(key, list(known))} Leave it out"
-            )
+    known_orders(name, orders, known, [key for key in known if key != "nk"])
     found: dict[str, int | tuple[int, ...] | None] = {}
     for key in known:
-        value: object = orders.get(key)
-        if key == "nk" and (value is None or (isinstance(value, str) and value == "auto")):
+        if key == "nk" and left_open(orders, key):
             found[key] = None
-        elif value is None:
-            raise EstimationError(f"{name}: order {key} is missing; it needs {', '.join(known)}. Give {key}=1, say")
         elif key in _PER_INPUT:
-            found[key] = _per_input(name, key, value, data.n_inputs)
+            found[key] = per_input(name, orders, key, 1 if key == "nb" else 0, data.n_inputs)
         else:
-            found[key] = _whole(name, key, value, 0)
+            found[key] = single(name, orders, key, 0)
     if not any(found[key] for key in known if key != "nk"):
         raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
     return found
@@ -203,7 +196,7 @@ def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int)
     )  # fixed: see `fixed_places`
 
 
-def shown_orders(name: str, layout: Layout) -> dict[str, int | tuple[int, ...]]:
+def shown_orders(name: str, layout: Layout) -> UsedOrders:
     """Return the orders as a result prints them: a number where all inputs agree.
 
     Parameters
@@ -218,7 +211,7 @@ def shown_orders(name: str, layout: Layout) -> dict[str, int | tuple[int, ...]]:
     out: dict[str, int | tuple[int, ...]] = {}
     for key in structure(name).orders:
         value = getattr(layout, key)
-        out[key] = value[0] if isinstance(value, tuple) and len(set(value)) == 1 else value
+        out[key] = shown(value) if isinstance(value, tuple) else value
     return out
 
 
@@ -275,18 +268,3 @@ def _check_inputs(name: str, data: IOData) -> None:
             f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Leave them out, or "
             "use armax"
         )
-
-
-def _per_input(name: str, key: str, value: object, n_inputs: int) -> tuple[int, ...]:
-    values = tuple(value) if isinstance(value, tuple | list) else (value,) * n_inputs
-    if len(values) != n_inputs:
-        raise EstimationError(
-            f"{name}: {key} has {len(values)} numbers for {n_inputs} input(s). Give one number, or one for each input"
-        )
-    return tuple(_whole(name, key, v, 1 if key == "nb" else 0) for v in values)
-
-
-def _whole(name: str, key: str, value: object, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise EstimationError(f"{name}: {key} = {value!r} is no whole number of at least {least}. Correct it")
-    return int(value)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.polynomial.delay import long_delays
-from ambid.identify.polynomial.orders import Layout, Orders, fixed_places, layout_of, read_orders
+from ambid.identify.polynomial.orders import Layout, fixed_places, layout_of, read_orders
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.result import result
 from ambid.identify.polynomial.scaled import Scaled, liveliest, scaled_data, unit

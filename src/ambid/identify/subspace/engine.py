@@ -12,11 +12,12 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.subspace.classical import Projection, classical_columns, projected, realised
 from ambid.identify.subspace.compress import each_left_out, triangular
 from ambid.identify.subspace.jackknife import jackknife
 from ambid.identify.subspace.order import state_criterion
-from ambid.identify.subspace.plan import Method, Orders, Plan, planned
+from ambid.identify.subspace.plan import Method, Plan, planned
 from ambid.identify.subspace.predictor_based import Prediction, Prior, predicted, predictor_columns, prior, regressed
 from ambid.identify.subspace.realisation import Realisation
 from ambid.identify.subspace.units import embedded, offsets, with_units

@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders
 from ambid.identify.subspace.engine import fitted
-from ambid.identify.subspace.plan import Orders
 
 Tick = Callable[[], None] | None
 

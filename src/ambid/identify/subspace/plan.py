@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.orders import Orders, known_orders, left_open, per_input, single
 from ambid.identify.subspace.compress import Channels, Factors, channels, compress, merged, triangular
 from ambid.identify.subspace.order import autoregression_criterion
 
 Array = NDArray[np.float64]
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
-Orders = Mapping[str, int | str | tuple[int, ...]]
 
 _GROUPS = 20  # of time, for the jackknife: its standard deviations are good to 1 / sqrt(2 * 19)
 _AUTO_MAX = 10  # largest order tried where none is given
@@ -138,27 +138,10 @@ def planned(
 
 def _orders(method: str, data: IOData, orders: Orders) -> tuple[int | None, tuple[int, ...]]:
     """Return n (None for automatic) and nk for each input."""
-    for name in orders:
-        if name not in ("n", "nk"):
-            raise EstimationError(f"{method}: order {name!r} is not known; it takes n.{nearest(name, ['n', 'nk'])}")
-    n = orders.get("n", "auto")
-    if isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 1:
-        order: int | None = int(n)
-    elif n == "auto":
-        order = None
-    else:
-        raise EstimationError(f"{method}: n = {n!r}; it must be an integer of at least 1, or 'auto'. Correct it")
-    nk = orders.get("nk", 1)
-    each = tuple(nk) if isinstance(nk, tuple) else (nk,) * data.n_inputs
-    if len(each) != data.n_inputs:
-        raise EstimationError(f"{method}: {len(each)} delays nk for {data.n_inputs} inputs. Give one, or one for each")
-    for k in each:
-        if not isinstance(k, (int, np.integer)) or isinstance(k, bool) or k < 1:
-            raise EstimationError(
-                f"{method}: nk = {k!r}; it must be an integer of at least 1. For an input that acts at once say "
-                "feedthrough"
-            )
-    return order, tuple(int(k) for k in each)
+    known_orders(method, orders, ("n", "nk"))
+    n = None if left_open(orders, "n") else single(method, orders, "n", 1, remedy="Correct it, or say 'auto'")
+    least, remedy = 1, "For an input that acts at once say feedthrough"
+    return n, per_input(method, {"nk": least, **orders}, "nk", least, data.n_inputs, remedy=remedy)
 
 
 def _numbers(data: IOData) -> None:

@@ -8,7 +8,7 @@ leaves a bias.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +17,14 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
+from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input, shown, single
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
-from ambid.identify.instrumental.orders import known_orders, long_enough, per_input, single
 from ambid.identify.threads import one_thread
 from ambid.identify.weakform.equations import Solution, best_support
 from ambid.identify.weakform.system import Kink, Signal, System, Term
 
 Array = NDArray[np.float64]
-Orders = Mapping[str, int | tuple[int, ...]]
 
 _CONTRADICTED = 1.3  # ratio of noise from which a support is too long
 _SHORTEST, _LONGEST = 10, 2560  # half supports tried, samples
@@ -79,7 +78,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     return made(
         "weakform",
         data,
-        orders={"nb": nb if len(set(nb)) > 1 else nb[0], "nf": n, "nk": nk if len(set(nk)) > 1 else nk[0]},
+        orders={"nb": shown(nb), "nf": n, "nk": shown(nk)},
         model=model,
         covariance=covariance,
         n_estimated=data.n_outputs * (n + sum(nb)),
