@@ -75,7 +75,7 @@ def _instrumental(
     )
 
 
-def _subspace(name: str, feedback: Literal["biased", "consistent"], summary: str) -> Structure:
+def _subspace(name: str, feedback: Literal["biased", "consistent", "with noise model"], summary: str) -> Structure:
     return Structure(
         name=name,
         summary=summary,
@@ -107,6 +107,7 @@ STRUCTURES: Mapping[str, Structure] = {
         _subspace("moesp", "biased", "the same, past without future inputs"),
         _subspace("cva", "biased", "the same, canonical variates"),
         _subspace("pbsid", "consistent", "the same from a long autoregression: feedback does not disturb it"),
+        _subspace("sspem", "with noise model", "the same by prediction error, started from pbsid: the sharpest"),
         Structure(
             name="rfir",
             summary="y = B u + e, many taps with a fading prior",
@@ -128,9 +129,61 @@ STRUCTURES: Mapping[str, Structure] = {
     )
 }
 
+# Fitted to a measured frequency response (`FrequencyResponse`) instead of to inputs and outputs: their estimators take
+# one in the place of the data, so they are kept apart from those that `fit` and `compare` can call.
+RESPONSE_STRUCTURES: Mapping[str, Structure] = {
+    s.name: s
+    for s in (
+        Structure(
+            name="frf-ml",
+            summary="G = N/D exp(-s delay), in s or z, by maximum likelihood",
+            orders=("nb", "nf"),
+            home="ambid.identify.frequency.rational:frf_ml",
+            inputs=True,
+            feedback="consistent",  # as far as the response is; that says itself where it is not
+            kind="transfer function",
+        ),
+        Structure(
+            name="frf-subspace",
+            summary="x' = A x + B u by subspace with the Laguerre operator, then maximum likelihood",
+            orders=("n",),
+            home="ambid.identify.frequency.subspace:frf_subspace",
+            inputs=True,
+            feedback="consistent",
+            kind="state space",
+        ),
+    )
+}
+
 
 def structure(name: str) -> Structure:
-    """Return a structure by name.
+    """Return a structure that is fitted to inputs and outputs, by name.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    Structure
+
+    Raises
+    ------
+    EstimationError
+        If there is none; names the nearest. If it is one for frequency responses; says where those are fitted.
+    """
+    if name in RESPONSE_STRUCTURES:
+        raise EstimationError(
+            f"structure {name} is fitted to a frequency response, not to inputs and outputs. Use 'ambid frf'"
+        )
+    if name not in STRUCTURES:
+        known = ", ".join(STRUCTURES)
+        raise EstimationError(f"structure {name!r} is not known; known: {known}.{nearest(name, list(STRUCTURES))}")
+    return STRUCTURES[name]
+
+
+def any_structure(name: str) -> Structure:
+    """Return a structure by name, whatever it is fitted to: for those who read a finished fit.
 
     Parameters
     ----------
@@ -145,7 +198,4 @@ def structure(name: str) -> Structure:
     EstimationError
         If there is none; names the nearest.
     """
-    if name not in STRUCTURES:
-        known = ", ".join(STRUCTURES)
-        raise EstimationError(f"structure {name!r} is not known; known: {known}.{nearest(name, list(STRUCTURES))}")
-    return STRUCTURES[name]
+    return RESPONSE_STRUCTURES[name] if name in RESPONSE_STRUCTURES else structure(name)

@@ -2,5 +2,6 @@
 
 from ambid.identify.subspace.estimate import cva, moesp, n4sid, pbsid
 from ambid.identify.subspace.family import OrderModel, subspace_models
+from ambid.identify.subspace.refined import sspem
 
-__all__ = ["OrderModel", "cva", "moesp", "n4sid", "pbsid", "subspace_models"]
+__all__ = ["OrderModel", "cva", "moesp", "n4sid", "pbsid", "sspem", "subspace_models"]

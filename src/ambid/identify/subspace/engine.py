@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,30 @@ Array = NDArray[np.float64]
 Tick = Callable[[], None] | None
 
 _HORIZONS = (4, 6, 8, 11, 15, 20)  # samples of future that are tried
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FirstModel:
+    """An estimate without covariance, and what it came from.
+
+    Attributes
+    ----------
+    plan : Plan
+    given : Prior or None
+        Of the autoregression, where there is one.
+    found : Projection or Prediction
+        States of all orders.
+    full : Realisation
+        Scaled channels.
+    criterion : ndarray, shape (n_states + 1,), or None
+        By which the order was chosen; None where it was given.
+    """
+
+    plan: Plan
+    given: Prior | None
+    found: Projection | Prediction
+    full: Realisation
+    criterion: Array | None
 
 
 def fitted(
@@ -60,24 +84,58 @@ def fitted(
         If orders or horizons break a rule, a channel is constant, or the record is too short.
     """
     with one_thread():
-        plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
-        criterion = None if plan.n else order_criterion(plan)
-        n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
-        if method != "pbsid" and horizon is None:
-            plan = _with_horizons(plan, n, keep_past=past is not None)
-        given, found = decomposition(plan)
-        if n > found.values.size:
-            raise EstimationError(
-                f"{method}: the record shows {found.values.size} states, not {n}. Lower n, or excite the plant more"
-            )
-        full = model_of(plan, found, n)
-        others = []
+        first = first_model(method, data, orders, horizon, past, feedthrough, tick)
+        plan, given, found, full, criterion = first.plan, first.given, first.found, first.full, first.criterion
+        n, others = full.A.shape[0], []
         for factor in each_left_out(plan.factors.arranged(_columns(plan))):
             if tick is not None:
                 tick()
             others.append(model_of(plan, _decomposed(plan, factor, given), n))
         covariance = jackknife(full, others, plan.future, with_bias=method != "pbsid")
     return _result(method, data, plan, found, given, full, covariance, criterion)
+
+
+def first_model(
+    method: Method,
+    data: IOData,
+    orders: Orders,
+    horizon: int | None,
+    past: int | None,
+    feedthrough: bool | None,
+    tick: Tick,
+) -> FirstModel:
+    """Compress, decompose, choose the order, regress.
+
+    Parameters
+    ----------
+    method : {"n4sid", "moesp", "cva", "pbsid"}
+    data : IOData
+    orders : Mapping
+    horizon, past : int or None
+        Samples.
+    feedthrough : bool or None
+    tick : callable or None
+
+    Returns
+    -------
+    FirstModel
+
+    Raises
+    ------
+    EstimationError
+        As `fitted`.
+    """
+    plan = planned(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
+    criterion = None if plan.n else order_criterion(plan)
+    n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
+    if method != "pbsid" and horizon is None:
+        plan = _with_horizons(plan, n, keep_past=past is not None)
+    given, found = decomposition(plan)
+    if n > found.values.size:
+        raise EstimationError(
+            f"{method}: the record shows {found.values.size} states, not {n}. Lower n, or excite the plant more"
+        )
+    return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
 
 
 def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
@@ -225,6 +283,7 @@ def _result(
             "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
             "order_criterion": None if criterion is None else criterion.tolist(),
             "feedthrough": plan.feedthrough,
+            "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
             "condition_number": _condition(plan),
             "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
             "Q": full.Q.tolist(),

@@ -107,8 +107,7 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
     -------
     Offsets
     """
-    f, given, s = plan.factors, plan.channels, scaled
-    n, n_u = s.A.shape[0], f.n_inputs
+    f, s = plan.factors, scaled
     mean = plan.total[0] / plan.total[0, 0]
     now = f.length - 1
     error = mean[f.columns("y", now, now + 1)] - s.D @ mean[f.columns("u", now, now + 1)]
@@ -117,6 +116,26 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
     for k in range(now - 1, -1, -1):
         error = error - row @ (G @ mean[f.columns("z", k, k + 1)])
         row = row @ F
+    return operating_point(scaled, plan.channels, error)
+
+
+def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offsets:
+    """Return the shortest shift of the channels' means that takes a mean off the innovations.
+
+    Parameters
+    ----------
+    scaled : Realisation
+    given : Channels
+    error : ndarray, shape (n_outputs,)
+        Mean of the innovations of the centred, scaled channels.
+
+    Returns
+    -------
+    Offsets
+    """
+    s = scaled
+    n, n_u = s.A.shape[0], s.B.shape[1]
+    F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
     at_rest = s.C @ np.linalg.solve(np.eye(n) - F, G)
     by = np.hstack([np.eye(s.C.shape[0]) - at_rest[:, n_u:], -(s.D + at_rest[:, :n_u])])
     shift = np.linalg.lstsq(by, -error, rcond=1e-6)[0]

@@ -1,0 +1,233 @@
+"""Search for the innovations form with the smallest determinant of its one-step errors, from a model that is near.
+
+Solves: min log det (1/N) sum e e' over A, B, C, [D,] K, first states and a constant for every output, by
+Levenberg-Marquardt in local coordinates on QR-reduced rows whitened by the errors' covariance (Ljung 1999, sec. 7.4 and
+10.2). SciPy's least squares wants all rows of the Jacobian at once; here a record of any length takes one block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtpqrt
+
+from ambid.identify._kernels import state_scan
+from ambid.identify.blackbox.gradient import Sensitivities
+from ambid.identify.blackbox.state_space import StateSpaceModel
+from ambid.identify.subspace.local import balanced, moved, tangent
+from ambid.identify.subspace.realisation import radius
+
+Array = NDArray[np.float64]
+Tick = Callable[[], None] | None
+
+_BLOCK = 2048  # samples at once
+_PANEL = 32
+_STEPS = 100
+_NEAR = 1e-7  # fall of N log det that one more step promises, below which the search is done
+_ROUNDING = 1e-3  # the same, below which a step that does not succeed is rounding
+_SHORTEST = 2.0**-30  # part of a step below which no stable predictor lies that way
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Point:
+    """A model with what belongs to this record; scaled channels.
+
+    Attributes
+    ----------
+    model : StateSpaceModel
+    x0 : ndarray, shape (n,)
+        States at the first sample.
+    constant : ndarray, shape (n_outputs,)
+        Mean of the errors of the predictor that knows of no constant.
+    noise : ndarray, shape (n_outputs, n_outputs)
+        Covariance of the errors, no degrees of freedom taken off.
+    cost : float
+        N log det of it.
+    """
+
+    model: StateSpaceModel
+    x0: Array
+    constant: Array
+    noise: Array
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    point : Point
+    tangent : ndarray, shape (n_theta, n_directions)
+    information : ndarray, shape (n_directions, n_directions)
+        Triangular root of the information along the tangent, first states and constants projected out.
+    n_numbers : int
+        Directions, first states and constants.
+    iterations : int
+    converged : bool
+    promise : float
+        Fall of N log det that one more step promises.
+    """
+
+    point: Point
+    tangent: Array
+    information: Array
+    n_numbers: int
+    iterations: int
+    converged: bool
+    promise: float
+
+
+def started(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Point | None:
+    """Give a model the first states and constants that suit it best.
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+        Scaled.
+    noise : ndarray, shape (n_outputs, n_outputs)
+        Of the innovations, roughly.
+    u : ndarray, shape (n_samples, n_inputs)
+    y : ndarray, shape (n_samples, n_outputs)
+
+    Returns
+    -------
+    Point or None
+        None where the predictor is not stable, or leaves no errors.
+    """
+    if radius(model.A - model.K @ model.C) >= 1.0:
+        return None
+    n, n_y = model.order, model.n_outputs
+    rough = Point(model=model, x0=np.zeros(n), constant=np.zeros(n_y), noise=noise, cost=np.inf)
+    factor = _reduced(rough, np.zeros((model.theta.size, 0)), u, y)
+    change = np.asarray(
+        np.linalg.lstsq(factor[: n + n_y, :-1], factor[: n + n_y, -1], rcond=1e-10)[0], dtype=np.float64
+    )
+    return _judged(model, change[:n], change[n:], u, y)
+
+
+def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick = None) -> Found:
+    """Search from a start.
+
+    Parameters
+    ----------
+    start : Point
+    u : ndarray, shape (n_samples, n_inputs)
+        Scaled.
+    y : ndarray, shape (n_samples, n_outputs)
+    feedthrough : bool
+        Whether D is estimated.
+    tick : callable, optional
+        Called before each step.
+
+    Returns
+    -------
+    Found
+    """
+    point, damping, iterations = start, 1e-3, 0
+    k = start.model.order + start.model.n_outputs
+    while True:
+        if tick is not None:
+            tick()
+        model, x0 = balanced(point.model, point.x0, point.noise)
+        point = replace(point, model=model, x0=x0)
+        ways = tangent(model, feedthrough=feedthrough)
+        factor = _reduced(point, ways, u, y)
+        promise = float(np.sum(factor[:-1, -1] ** 2))
+        better = None
+        if promise > _NEAR and iterations < _STEPS:
+            better, damping = _step(point, ways, factor, damping, u, y)
+        if better is None:
+            break
+        point, iterations = better, iterations + 1
+    return Found(
+        point=point,
+        tangent=ways,
+        information=factor[k:-1, k:-1],
+        n_numbers=factor.shape[1] - 1,
+        iterations=iterations,
+        converged=promise < _ROUNDING,
+        promise=promise,
+    )
+
+
+def _step(point: Point, ways: Array, factor: Array, damping: float, u: Array, y: Array) -> tuple[Point | None, float]:
+    """Find a better point: more damping after failure, a shorter step where the predictor gets unstable."""
+    n, k = point.model.order, point.model.order + point.model.n_outputs
+    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
+    rows, right = factor[:-1, :-1] / size, factor[:-1, -1]
+    U, s, Vt = np.linalg.svd(rows)
+    s = np.maximum(s, 1e-300)
+    along = U.T @ right
+    while damping < 1e10:
+        scaled = Vt.T @ (along * s / (s**2 + damping))
+        change, part = scaled / size, 1.0
+        model = moved(point.model, ways @ change[k:])
+        while radius(model.A - model.K @ model.C) >= 1.0 and part > _SHORTEST:
+            part *= 0.5
+            model = moved(point.model, ways @ (part * change[k:]))
+        trial = None
+        if part > _SHORTEST:
+            trial = _judged(model, point.x0 + part * change[:n], point.constant + part * change[n:k], u, y)
+        left = right - part * rows @ scaled
+        promised = float(right @ right - left @ left)
+        if trial is not None and point.cost - trial.cost > 1e-3 * promised > 0:
+            good = point.cost - trial.cost > 0.5 * promised and part == 1.0
+            return trial, max(damping / 20, 1e-14) if good else damping
+        damping = max(damping, 1e-10) * 8
+    return None, damping
+
+
+def _judged(model: StateSpaceModel, x0: Array, constant: Array, u: Array, y: Array) -> Point | None:
+    """Run the record through; None where the errors are not finite, or do not span the outputs."""
+    triangle = np.zeros((y.shape[1], y.shape[1]))
+    for _, e in _blocks(model, x0, u, y):
+        if not np.all(np.isfinite(e)):
+            return None
+        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, e - constant]), mode="r"))
+    size = np.abs(np.diag(triangle))
+    if not np.all(size > 1e-12 * np.sqrt(y.shape[0])):
+        return None
+    noise = triangle.T @ triangle / y.shape[0]
+    cost = float(y.shape[0] * (2 * np.sum(np.log(size)) - size.size * np.log(y.shape[0])))
+    return Point(model=model, x0=x0, constant=constant, noise=noise, cost=cost)
+
+
+def _blocks(model: StateSpaceModel, x0: Array, u: Array, y: Array) -> Iterator[tuple[Array, Array]]:
+    """States and inputs, and errors without a constant taken off, block by block."""
+    n, n_u = model.order, model.n_inputs
+    step = np.ascontiguousarray(np.hstack([model.A - model.K @ model.C, model.B - model.K @ model.D, model.K]))
+    out, x = np.hstack([model.C, model.D]).T, np.array(x0)
+    for first in range(0, y.shape[0], _BLOCK):
+        part = slice(first, first + _BLOCK)
+        work = np.hstack([np.zeros((y[part].shape[0], n)), u[part], y[part]])
+        state_scan(step, work, x)
+        known = work[:, : n + n_u]
+        yield known, y[part] - known @ out
+
+
+def _reduced(point: Point, ways: Array, u: Array, y: Array) -> Array:
+    """Triangular factor of [first states, constants, directions, errors], rows whitened by the errors' covariance."""
+    model, n_y = point.model, y.shape[1]
+    d, n = ways.shape[1], model.order
+    root = np.linalg.cholesky(point.noise)
+    whiten = solve_triangular(root, np.eye(n_y), lower=True)
+    along = Sensitivities(model, ways, initial=True)
+    width = n + n_y + d + 1
+    factor = np.zeros((width, width), order="F")
+    for known, e in _blocks(model, point.x0, u, y):
+        slopes = along.block(np.hstack([known, e]))
+        m = e.shape[0]
+        rows = np.empty((n_y, m, width))
+        rows[:, :, :n] = slopes[:, :, d:]
+        rows[:, :, n : n + n_y] = np.eye(n_y)[:, None, :]
+        rows[:, :, n + n_y : -1] = slopes[:, :, :d]
+        rows[:, :, -1] = (e - point.constant).T
+        white = (whiten @ rows.reshape(n_y, m * width)).reshape(n_y * m, width)
+        factor, _, _, _ = dtpqrt(0, min(_PANEL, width), factor, np.asfortranarray(white), overwrite_a=1, overwrite_b=1)
+    return np.triu(factor)
