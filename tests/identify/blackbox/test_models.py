@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.identify.blackbox.model import root_derivative
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets, one_step, simulation
+from ambid.identify.blackbox.roots import root_derivative, roots_at
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
 
@@ -146,3 +146,12 @@ def test_root_derivatives_inside_and_outside_the_unit_circle_agree_with_the_form
     assert np.min(np.abs(roots)) < 1 < np.max(np.abs(roots))
     expected = -(roots[:, None] ** np.arange(4, -1, -1)) / np.polyval(np.polyder(c), roots)[:, None]
     assert root_derivative(c, roots) == pytest.approx(expected, rel=1e-12)
+
+
+def test_leading_zeros_of_a_polynomial_are_a_delay_and_have_no_roots() -> None:
+    theta = np.array([9.0, 0.0, 0.0, 2.0, -1.0, 9.0])
+    roots, slope = roots_at(theta, slice(1, 5))
+    assert roots == pytest.approx([0.5])
+    assert slope == pytest.approx(np.array([[0.0, 0.0, 0.0, -0.25, -0.5, 0.0]]))
+    none, empty = roots_at(np.zeros(4), slice(0, 4))
+    assert (none.shape, empty.shape) == ((0,), (0, 4))

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from ambid.errors import EstimationError
 from ambid.identify import polynomial
-from ambid.identify.polynomial.stability import reflected, stable
+from ambid.identify.blackbox.roots import reflected, stable
 from tests.identify.polynomial.systems import SYSTEMS, A, B, System, record, unstable_loop
 
 BOTH = {"nb": 2, "nf": 2}

@@ -131,30 +131,3 @@ class BlackBoxModel(Protocol):
     def state_space(self) -> StateSpaceModel:
         """Return the model in innovations form."""
         ...
-
-
-def root_derivative(coefficients: Array, roots: Complex) -> Complex:
-    """Return the derivative of polynomial roots by its coefficients.
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (n + 1,)
-        Of z^n ... z^0.
-    roots : ndarray, shape (n_roots,)
-
-    Returns
-    -------
-    ndarray, shape (n_roots, n + 1), complex
-        From P(r) = 0: dr/dp_k = -r^(n-k) / P'(r). Infinite at a multiple root.
-    """
-    n = coefficients.size - 1
-    if n < 1:
-        return np.zeros((roots.size, n + 1), dtype=np.complex128)
-    far = np.abs(roots) > 1.0  # there by powers of 1/r, numerator and slope both over r^(n-1), as r^n may overflow
-    x = np.where(far, 1.0 / np.where(far, roots, 1.0), roots)
-    falling = np.polynomial.polynomial.polyvander(x, n)  # 1, x ... x^n
-    inside, outside = falling[:, ::-1], np.column_stack([np.where(far, roots, 1.0), falling[:, :-1]])
-    slope_terms = np.arange(n, 0, -1) * coefficients[:-1]  # of z^(n-1) ... z^0
-    slope = np.where(far, falling[:, :-1] @ slope_terms, falling[:, :-1] @ slope_terms[::-1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(-np.where(far[:, None], outside, inside) / slope[:, None])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import ModelError
-from ambid.identify.blackbox.model import root_derivative
+from ambid.identify.blackbox.roots import roots_at, roots_of, used_part
 from ambid.identify.blackbox.state_space import StateSpaceModel
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ class PolynomialModel:
         -------
         ndarray, shape (n_poles,), complex
         """
-        return np.concatenate([r for _, r in self._roots(self._pole_letters())] or [np.empty(0, dtype=np.complex128)])
+        return self._roots(self._pole_letters())
 
     def pole_derivative(self) -> Complex:
         """Return the derivative of `poles` by `theta`.
@@ -216,8 +216,7 @@ class PolynomialModel:
         -------
         ndarray, shape (n_zeros,), complex
         """
-        letters = "B" if self.n_inputs else "C"
-        return np.concatenate([r for _, r in self._roots(letters)] or [np.empty(0, dtype=np.complex128)])
+        return self._roots("B" if self.n_inputs else "C")
 
     def zero_derivative(self) -> Complex:
         """Return the derivative of `zeros` by `theta`.
@@ -257,23 +256,15 @@ class PolynomialModel:
     def _delay(self, omega: Array) -> Complex:
         return np.asarray(np.exp(-1j * np.asarray(omega, dtype=np.float64) * self.dt), dtype=np.complex128)
 
-    def _roots(self, letters: str) -> Iterator[tuple[slice, Complex]]:
+    def _roots(self, letters: str) -> Complex:
         theta = self.theta
-        for _, letter, _, place in self.blocks():
-            if letter in letters:
-                c = theta[place]
-                used = np.nonzero(c)[0]
-                lead = int(used[0]) if used.size else c.size
-                yield slice(place.start + lead, place.stop), np.roots(c[lead:]).astype(np.complex128)
+        found = [roots_of(theta[used_part(theta, place)]) for _, letter, _, place in self.blocks() if letter in letters]
+        return np.concatenate(found or [np.empty(0, dtype=np.complex128)])
 
     def _derivative(self, letters: str) -> Complex:
-        theta, rows = self.theta, list[Complex]()
-        for place, roots in self._roots(letters):
-            block = np.zeros((roots.size, theta.size), dtype=np.complex128)
-            if roots.size:
-                block[:, place] = root_derivative(theta[place], roots)
-            rows.append(block)
-        return np.vstack(rows) if rows else np.zeros((0, theta.size), dtype=np.complex128)
+        theta = self.theta
+        rows = [roots_at(theta, place)[1] for _, letter, _, place in self.blocks() if letter in letters]
+        return np.vstack(rows or [np.zeros((0, theta.size), dtype=np.complex128)])
 
 
 def _at(p: Array, z: Complex) -> Complex:

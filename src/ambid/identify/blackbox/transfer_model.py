@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import ModelError
-from ambid.identify.blackbox.model import root_derivative
+from ambid.identify.blackbox.roots import roots_at
 from ambid.identify.blackbox.state_space import StateSpaceModel
 
 Array = NDArray[np.float64]
@@ -223,17 +223,8 @@ class TransferModel:
         return np.asarray(s, dtype=np.complex128), np.asarray(np.exp(-1j * np.outer(omega, self.delay)))
 
     def _roots(self, wanted: str) -> tuple[Complex, Complex]:
-        roots, rows, size = list[Complex](), list[Complex](), self.theta.size
-        for _, _, which, p, place in self.parts():
-            used = np.nonzero(p)[0]
-            if which != wanted or not used.size:
-                continue
-            found = np.roots(p).astype(np.complex128)
-            block = np.zeros((found.size, size), dtype=np.complex128)
-            if found.size:
-                block[:, place.start + int(used[0]) : place.stop] = root_derivative(p[used[0] :], found)
-            roots.append(found)
-            rows.append(block)
-        if not roots:
-            return np.empty(0, dtype=np.complex128), np.zeros((0, size), dtype=np.complex128)
-        return np.concatenate(roots), np.vstack(rows)
+        theta = self.theta
+        found = [roots_at(theta, place) for _, _, which, _, place in self.parts() if which == wanted]
+        if not found:
+            return np.empty(0, dtype=np.complex128), np.zeros((0, theta.size), dtype=np.complex128)
+        return np.concatenate([r for r, _ in found]), np.vstack([d for _, d in found])

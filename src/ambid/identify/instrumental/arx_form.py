@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.polynomial_model import Polynomials
 from ambid.identify.blackbox.response import Offsets
+from ambid.identify.blackbox.roots import reflected
 from ambid.identify.instrumental.noise import Autoregression, autoregression, noise_covariance
 from ambid.identify.instrumental.solve import Solution, solve
 
@@ -207,7 +208,7 @@ def optimal(
 
     error = equation_error(data, theta, orders)
     noise, C = autoregression(error, highest), _NO_AVERAGE
-    mirrored = _mirrored(np.concatenate([[1.0], theta[: orders.na]]))
+    mirrored = reflected(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE)
     at_output = autoregression(np.asarray(lfilter([1.0], mirrored, error)), highest)
     if _cost(at_output, error.size) < _cost(noise, error.size):
         noise, C = at_output, mirrored
@@ -255,14 +256,6 @@ def refined(
         if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
             break
     return found
-
-
-def _mirrored(A: Array) -> Array:
-    roots = np.roots(A)
-    size = np.maximum(np.abs(roots), 1e-300)
-    roots = np.where(size > 1, roots / size**2, roots)
-    size = np.abs(roots)
-    return np.asarray(np.poly(np.where(size > _INSIDE, roots * _INSIDE / np.maximum(size, 1e-300), roots)).real)
 
 
 def _cost(noise: Autoregression, n: int) -> float:

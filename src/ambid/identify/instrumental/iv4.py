@@ -14,6 +14,7 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input, single
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.blackbox.roots import reflected
 from ambid.identify.instrumental.arx_form import (
     ArxEstimate,
     ArxOrders,
@@ -167,10 +168,7 @@ def _simulated(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
     """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
     from scipy.signal import lfilter
 
-    roots = np.roots(np.concatenate([[1.0], theta[: orders.na]]))
-    size = np.abs(roots)
-    inside = np.where(size > _INSIDE, roots / np.maximum(size, 1.0) ** 2 * np.minimum(1.0, _INSIDE), roots)
-    A = np.poly(inside).real
+    A = reflected(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE)
     y, first = np.zeros(signals.y.size), orders.na
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
         y += lfilter(np.concatenate([np.zeros(nk), theta[first : first + nb]]), A, signals.u[:, i])

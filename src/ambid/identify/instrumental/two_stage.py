@@ -21,6 +21,7 @@ from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
+from ambid.identify.blackbox.roots import stable
 from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.instrumental.cliv import cliv
 from ambid.identify.instrumental.iv4 import centred
@@ -100,7 +101,7 @@ def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
         rest = data.part(lags, data.n_samples)
         second = oe(replace(rest, u=clean), {"nb": nb, "nf": nf, "nk": nk})
         assert isinstance(second.model, PolynomialModel)
-        if any(np.max(np.abs(np.roots(f)), initial=0.0) >= 1 for p in second.model.outputs for f in p.F):
+        if not all(stable(f) for p in second.model.outputs for f in p.F):
             raise EstimationError(_UNSTABLE.format(poles="the second stage found poles outside the unit circle"))
         mean = rest.u.mean(axis=0)
         found = [
@@ -189,7 +190,7 @@ def _refined(p: Polynomials, clean: Array, u: Array, y: Array, nk: tuple[int, ..
         if settled:
             return here
         moved = _moved(p, step.theta, nk)
-        if any(np.max(np.abs(np.roots(f)), initial=0.0) >= 1 for f in moved.F):
+        if not all(stable(f) for f in moved.F):
             return here
         settled = bool(np.linalg.norm(instruments @ step.theta) <= _SETTLED * np.linalg.norm(noise))
         p = moved

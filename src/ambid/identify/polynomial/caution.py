@@ -7,13 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.model import root_derivative
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.blackbox.roots import root_derivative, roots_at, roots_of
 from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.scaled import Scaled
 from ambid.identify.polynomial.search import BLIND, Fitted, searched
-from ambid.identify.polynomial.stability import roots_of
 from ambid.identify.polynomial.starts import starts
 
 Array = NDArray[np.float64]
@@ -68,7 +67,7 @@ def unstable_plant(layouts: Sequence[Layout], scaled: Scaled) -> list[str]:
         theta = fit.theta[armax.places["A", None]]
         if not n or not np.all(np.isfinite(theta)):
             continue
-        roots = np.roots(theta).astype(np.complex128)
+        roots = roots_of(theta)
         k = int(np.argmax(np.abs(roots)))
         scale = np.maximum(np.linalg.norm(fit.triangle, axis=0), 1e-150)
         row = np.zeros(armax.n_theta, dtype=np.complex128)
@@ -90,19 +89,11 @@ def _roots(model: PolynomialModel, o: int) -> dict[str, tuple[Complex, Complex]]
     theta, several, out = model.theta, model.n_inputs > 1, {}
     n_c = model.outputs[o].C.size
     for output, letter, i, place in model.blocks():
-        c = theta[place]
-        used = np.nonzero(c)[0]
-        if output != o or not used.size:
+        if output != o or not np.any(theta[place]):
             continue
-        lead = int(used[0])
         if letter == "B" and not (model.outputs[o].F[i or 0].size > 1 or min(model.outputs[o].A.size, n_c) > 1):
             continue  # nothing that it could cancel, and there may be hundreds
-        roots = roots_of(c[lead:])
-        rows = np.zeros((roots.size, theta.size), dtype=np.complex128)
-        if roots.size:
-            with np.errstate(over="ignore", invalid="ignore"):  # roots far away; what is not finite is left out below
-                rows[:, place.start + lead : place.stop] = root_derivative(c[lead:], roots)
-        out[letter + (f".{i}" if several and i is not None else "")] = roots, rows
+        out[letter + (f".{i}" if several and i is not None else "")] = roots_at(theta, place)
     return out
 
 

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.identify.blackbox.roots import reflected
 from ambid.identify.polynomial._kernels import filtered
 from ambid.identify.polynomial.orders import Layout
 from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.scaled import liveliest
 from ambid.identify.polynomial.search import searched
-from ambid.identify.polynomial.stability import reflected, solved
+from ambid.identify.polynomial.stability import solved
 
 Array = NDArray[np.float64]
 

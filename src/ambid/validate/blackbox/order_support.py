@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.model import root_derivative
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.blackbox.roots import roots_at
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.estimate import Check
@@ -137,7 +137,7 @@ def _families(fit: BlackBoxFit) -> Iterator[tuple[str, Roots, Roots]]:
         theta = model.theta
         parts = {(o, i, which): place for o, i, which, _, place in model.parts()}
         for o, i in np.ndindex(model.n_outputs, model.n_inputs):
-            den, num = (_roots(theta, parts[o, i, which]) for which in ("den", "num"))
+            den, num = (roots_at(theta, parts[o, i, which]) for which in ("den", "num"))
             yield "num and den", den, num
     elif isinstance(model, StateSpaceModel) and model.n_inputs == model.n_outputs and not np.any(model.K):
         # with a gain, a state that no input reaches may be one of the noise
@@ -151,12 +151,12 @@ def _polynomial_families(model: PolynomialModel) -> Iterator[tuple[str, Roots, R
         name = f", output {o + 1}" if several else ""
         for i, f in enumerate(p.F):
             if f.size > 1:
-                yield f"B and F{name}", _roots(theta, places[o, "F", i]), _roots(theta, places[o, "B", i])
+                yield f"B and F{name}", roots_at(theta, places[o, "F", i]), roots_at(theta, places[o, "B", i])
         if p.D.size > 1 and p.C.size > 1:
-            yield f"C and D{name}", _roots(theta, places[o, "D", None]), _roots(theta, places[o, "C", None])
+            yield f"C and D{name}", roots_at(theta, places[o, "D", None]), roots_at(theta, places[o, "C", None])
         if p.A.size > 1 and p.C.size > 1 and p.D.size == 1:
             if not model.n_inputs:
-                yield f"A and C{name}", _roots(theta, places[o, "A", None]), _roots(theta, places[o, "C", None])
+                yield f"A and C{name}", roots_at(theta, places[o, "A", None]), roots_at(theta, places[o, "C", None])
             elif model.n_inputs == 1:
                 yield from _common(theta, places, o, name)
 
@@ -165,7 +165,7 @@ def _common(
     theta: Array, places: dict[tuple[int, str, int | None], slice], o: int, name: str
 ) -> Iterator[tuple[str, Roots, Roots]]:
     """A with B, as far as C has the factor too: poles that are a root of B are compared with C."""
-    A, B, C = (_roots(theta, places[o, letter, i]) for letter, i in (("A", None), ("B", 0), ("C", None)))
+    A, B, C = (roots_at(theta, places[o, letter, i]) for letter, i in (("A", None), ("B", 0), ("C", None)))
     if not B[0].size or not C[0].size:
         return
     # the zero of C nearest to each pole, judged with the zero of B nearest to it: both must be there
@@ -176,17 +176,6 @@ def _common(
         gap_b, gap_c = abs(A[0][k] - middle[0][k]), abs(A[0][k] - C[0][nearest_c[k]])
         far = middle if gap_b > gap_c else (C[0][nearest_c], C[1][nearest_c])
         yield f"A with B and C{name}", (A[0][k : k + 1], A[1][k : k + 1]), (far[0][k : k + 1], far[1][k : k + 1])
-
-
-def _roots(theta: Array, place: slice) -> Roots:
-    c = theta[place]
-    used = np.nonzero(c)[0]
-    lead = int(used[0]) if used.size else c.size
-    roots = np.roots(c[lead:]).astype(np.complex128)
-    block = np.zeros((roots.size, theta.size), dtype=np.complex128)
-    if roots.size:
-        block[:, place.start + lead : place.stop] = root_derivative(c[lead:], roots)
-    return roots, block
 
 
 def _idle_order(fit: BlackBoxFit) -> tuple[list[str], float | None]:
