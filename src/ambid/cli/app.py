@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli import compare, demo, fit, identify, info, init, models, simulate, validate
+from ambid.cli import compare, demo, fit, frf, identify, info, init, models, simulate, validate
 from ambid.cli.terminal import plain_where_needed
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app = typer.Typer(
 app.command("demo", short_help="the main job on the embedded record, beside the truth")(demo.command)
 app.command("identify", short_help="physical parameters with uncertainty from a record")(identify.command)
 app.command("fit", short_help="a black-box model from a record")(fit.command)
+app.command("frf", short_help="a frequency response, and models from it")(frf.command)
 app.command("compare", short_help="several black-box structures side by side")(compare.command)
 app.command("init", short_help="a first rig file, guessed from a record")(init.command)
 app.command("simulate", short_help="a record from the physics")(simulate.command)

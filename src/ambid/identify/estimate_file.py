@@ -54,7 +54,7 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
         "status": estimate.status,
         "record": dict(estimate.record),
         "model": estimate.model,
-        "parameters": {p.name: _parameter_json(p) for p in estimate.parameters},
+        "parameters": {p.name: parameter_json(p) for p in estimate.parameters},
         "covariance": {
             "names": list(estimate.covariance_names),
             "matrix": estimate.covariance.tolist(),
@@ -99,7 +99,18 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
     return {name: plain_json(value) for name, value in document.items()}
 
 
-def _parameter_json(p: EstimatedParameter) -> dict[str, Any]:
+def parameter_json(p: EstimatedParameter) -> dict[str, Any]:
+    """Return an estimated parameter in the form of schema ``ambid.estimate/1``.
+
+    Parameters
+    ----------
+    p : EstimatedParameter
+
+    Returns
+    -------
+    dict
+        ``value``, ``sd``, ``ci95``, ``unit``, ``role``, ``identifiable``; for a prior also ``data_share``.
+    """
     share = {} if p.data_share is None else {"data_share": p.data_share}
     return {
         "value": p.value,

@@ -62,23 +62,35 @@ def autocorrelation(e: Array, n_lags: int) -> Array:
     return np.array([1.0, *(float(e[k:] @ e[:-k]) / power for k in lags)])
 
 
-def magnitude_axis(axes: Axes, r: Response) -> None:
+def magnitude_axis(
+    axes: Axes,
+    r: Response,
+    *,
+    label: str = "identified plant",
+    band_label: str | None = None,
+    colors: tuple[str, str] = (PREDICTED, BAND),
+) -> None:
     size = np.abs(r.value)
     spread = np.exp(np.minimum(NORMAL_95 * r.log_sd, 20.0))
-    label = f"95 % band (median ± {100 * (float(np.median(spread)) - 1):.2g} %)"
-    axes.fill_between(r.frequency_hz, size / spread, size * spread, color=BAND, label=label, linewidth=0)
-    axes.loglog(r.frequency_hz, size, color=PREDICTED, linewidth=1.4, label="identified plant")
+    about = band_label or f"95 % band (median ± {100 * (float(np.median(spread)) - 1):.2g} %)"
+    axes.fill_between(r.frequency_hz, size / spread, size * spread, color=colors[1], label=about, linewidth=0)
+    axes.loglog(r.frequency_hz, size, color=colors[0], linewidth=1.4, label=label)
     axes.set_xlim(r.frequency_hz[0], r.frequency_hz[-1])
     axes.set_ylim(0.5 * size.min(), 2 * size.max())
 
 
-def phase_axis(axes: Axes, r: Response) -> None:
-    angle = np.unwrap(np.angle(r.value))
-    angle -= 2 * np.pi * np.round(angle[0] / (2 * np.pi))
+def unwrapped(value: NDArray[np.complex128], near: float = 0.0) -> Array:
+    """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`."""
+    angle = np.unwrap(np.angle(value))
+    return np.asarray(angle - 2 * np.pi * np.round((angle[0] - near) / (2 * np.pi)))
+
+
+def phase_axis(axes: Axes, r: Response, *, near: float = 0.0, colors: tuple[str, str] = (PREDICTED, BAND)) -> None:
+    angle = unwrapped(r.value, near)
     spread = np.minimum(NORMAL_95 * r.phase_sd, np.pi)
     low, high = np.rad2deg(angle - spread), np.rad2deg(angle + spread)
-    axes.fill_between(r.frequency_hz, low, high, color=BAND, linewidth=0)
-    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=PREDICTED, linewidth=1.4)
+    axes.fill_between(r.frequency_hz, low, high, color=colors[1], linewidth=0)
+    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=colors[0], linewidth=1.4)
     middle = np.rad2deg(angle)
     first, last = 45 * np.floor(middle.min() / 45 - 0.3), 45 * np.ceil(middle.max() / 45 + 0.3)
     step = 90 if last - first > 180 else 45

@@ -81,7 +81,7 @@ def coefficient_lines(fit: BlackBoxFit) -> list[str]:
     rows = [
         (
             fit.model.names[k],
-            quantity(float(theta[k]), 0.0 if sd is None else float(sd[k]), "1").text.removesuffix(" 1"),
+            _coefficient(float(theta[k]), 0.0 if sd is None else float(sd[k])),
         )
         for k in free[:_SHOWN]
     ]
@@ -92,6 +92,15 @@ def coefficient_lines(fit: BlackBoxFit) -> list[str]:
     head = ("", "value ± sd" if sd is not None else "value", *(("", "value ± sd") if right else ()))
     rest = [f"… and {free.size - _SHOWN} more; --json has them all"] if free.size > _SHOWN else []
     return [*columns([head, *table]), *rest] if rows else []
+
+
+def _coefficient(value: float, sd: float) -> str:
+    """Value ± sd; in a power of ten where decimals would be too many to read, or cut off."""
+    exponent = int(np.floor(np.log10(max(abs(value), sd)))) if value or sd else 0
+    if -4 <= exponent < 7:
+        return quantity(value, sd, "1").text.removesuffix(" 1")
+    scale = 10.0**exponent
+    return f"({quantity(value / scale, sd / scale, '1').text.removesuffix(' 1')})e{exponent}"
 
 
 def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.identify.estimate import Check, Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.numbers import Quantity, quantity, sized
+
+if TYPE_CHECKING:
+    from ambid.identify.frequency.physical_estimate import FrequencyEstimate
 
 Style = Literal["good", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
@@ -90,12 +93,12 @@ def header_line(estimate: Estimate, paint: Paint = plain) -> str:
     )
 
 
-def parameter_lines(estimate: Estimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+def parameter_lines(estimate: Estimate | FrequencyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write the table of the parameters.
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : Estimate or FrequencyEstimate
         Any.
     width : int
         Columns of the terminal; where they are too few, the column of SI values is left out.

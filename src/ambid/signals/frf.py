@@ -259,7 +259,7 @@ def frequency_response(
 
     several = not isinstance(u, np.ndarray)
     if method == "auto":
-        periodic = several or "period" in options or "lines" in options or _repeats(u if r is None else r)
+        periodic = several or "period" in options or "lines" in options or repeats(u if r is None else r)
         method = "periodic" if periodic else "local"
     if method == "periodic":
         return frf_periodic(u, y, rate_hz, r=r, **options)  # type: ignore[arg-type]
@@ -273,12 +273,22 @@ def frequency_response(
     return taken(u, y, rate_hz, r=r, **options)  # type: ignore[arg-type]
 
 
-def _repeats(x: object) -> bool:
-    """Tell whether one excitation repeats at least twice."""
+def repeats(x: object) -> bool:
+    """Tell whether one excitation repeats at least twice.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,) or (n_samples, 1), any unit
+        More than one column never does, nor does a constant.
+
+    Returns
+    -------
+    bool
+    """
     from ambid.signals._periodicity import find_period
 
     excitation = np.asarray(x, dtype=np.float64)
-    if excitation.ndim == 2 and excitation.shape[1] > 1:
+    if (excitation.ndim == 2 and excitation.shape[1] > 1) or np.ptp(excitation) == 0.0:
         return False
     try:
         return bool(2 * find_period(excitation) <= excitation.shape[0])

@@ -16,7 +16,7 @@ from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomial
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.blackbox.structures import structure
+from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, any_structure
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.estimate import OutputFit
 from ambid.identify.json_values import check_from_json, check_json, plain_json
@@ -24,6 +24,9 @@ from ambid.identify.json_values import check_from_json, check_json, plain_json
 Array = NDArray[np.float64]
 
 SCHEMA = "ambid.fit/1"
+NO_INNOVATIONS = (
+    "none: a frequency response has no innovations, and its noise stands in the covariance of the coefficients"
+)
 
 
 def fit_text(fit: BlackBoxFit) -> str:
@@ -45,7 +48,8 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
 
     With one input, B and F are lists of coefficients, with several a list of such lists; with several outputs
     ``polynomials`` and ``sd`` have one entry for each output. ``fit`` and ``validation`` have an entry for each output,
-    and with one output ``one_step`` and ``simulation`` beside it.
+    and with one output ``one_step`` and ``simulation`` beside it. A fit to a frequency response has no innovations:
+    ``noise_variance`` and ``noise_covariance`` are null, and ``noise`` says why.
 
     Parameters
     ----------
@@ -58,6 +62,8 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
     """
     kind, values = _model_json(fit.model, fit.model.theta, fit.outputs)
     sd = None if fit.sd is None else _model_json(fit.model, fit.sd, fit.outputs)[1]
+    of_response = fit.structure in RESPONSE_STRUCTURES
+    noise = None if of_response else fit.noise_covariance
     document = {
         "schema": SCHEMA,
         "structure": fit.structure,
@@ -65,7 +71,7 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
         "orders": {k: list(v) if isinstance(v, tuple) else v for k, v in fit.orders.items()},
         kind: values,
         "sd": sd,
-        "noise_variance": fit.noise_covariance[0, 0] if len(fit.outputs) == 1 else fit.noise_covariance,
+        "noise_variance": noise if noise is None or len(fit.outputs) > 1 else noise[0, 0],
         "fit": _by_output({o: _fit_json(f) for o, f in fit.fit.items()}),
         "criteria": fit.criteria,
         "rate_hz": 1.0 / fit.dt,
@@ -80,7 +86,8 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
             "inputs": dict(zip(fit.inputs, fit.offsets.u.tolist(), strict=True)),
             "outputs": dict(zip(fit.outputs, fit.offsets.y.tolist(), strict=True)),
         },
-        "noise_covariance": fit.noise_covariance,
+        "noise_covariance": noise,
+        **({"noise": NO_INNOVATIONS} if of_response else {}),
         "covariance": None if fit.covariance is None else {"names": fit.model.names, "matrix": fit.covariance},
         "n_estimated": fit.n_estimated,
         "continuous_time": fit.model.dt is None,
@@ -183,9 +190,10 @@ def fit_from_json(document: Mapping[str, Any], where: str) -> BlackBoxFit:
 def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
     outputs, inputs = tuple(d["outputs"]), tuple(d["inputs"])
     model = _model_from_json(d, inputs, outputs)
-    structure(d["structure"])
+    any_structure(d["structure"])
     covariance = None if d["covariance"] is None else np.array(d["covariance"]["matrix"], dtype=np.float64)
-    noise = np.array(d["noise_covariance"], dtype=np.float64)
+    silent = d["noise_covariance"] is None and d["structure"] in RESPONSE_STRUCTURES
+    noise = np.zeros((len(outputs),) * 2) if silent else np.array(d["noise_covariance"], dtype=np.float64)
     if (model.n_inputs, model.n_outputs) != (len(inputs), len(outputs)) or noise.shape != (len(outputs),) * 2:
         raise ValueError("inputs, outputs, noise and model are not of the same size")
     if covariance is not None and covariance.shape != (model.theta.size,) * 2:

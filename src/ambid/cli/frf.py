@@ -1,0 +1,181 @@
+"""``ambid frf``: a frequency response from one record, and models fitted to it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from ambid.cli.blackbox_options import Inputs, OpenLoop, References, orders_of
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter, progress
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.identify.blackbox.orders import Orders
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+
+
+def command(
+    record: RecordFile,
+    inputs: Inputs = None,
+    output: Annotated[
+        list[str] | None,
+        typer.Option("--output", metavar="COL", help="Output column; repeat for several.", show_default=False),
+    ] = None,
+    reference: References = None,
+    open_loop: OpenLoop = False,
+    method: Annotated[
+        Literal["auto", "periodic", "random", "local"],
+        typer.Option(
+            "--method", help="How to measure: averages over periods, averaged spectra, local polynomials, or what fits."
+        ),
+    ] = "auto",
+    band: Annotated[
+        str | None,
+        typer.Option("--band", metavar="LO:HI", help="Lines that are used, in Hz.", show_default="all"),
+    ] = None,
+    hold: Annotated[
+        Literal["zoh", "band-limited"],
+        typer.Option("--hold", help="What the input does between samples: held, or without power above half the rate."),
+    ] = "zoh",
+    orders: Annotated[
+        str | None,
+        typer.Option(
+            "--orders",
+            metavar="nf=2,nb=1",
+            help="Fit transfer functions by maximum likelihood: degree of the denominator, numerator coefficients.",
+            show_default=False,
+        ),
+    ] = None,
+    state_space: Annotated[
+        str | None,
+        typer.Option(
+            "--state-space",
+            metavar="n=3|auto",
+            help="Fit a state space by subspace with the Laguerre operator.",
+            show_default=False,
+        ),
+    ] = None,
+    domain: Annotated[
+        Literal["s", "z"] | None,
+        typer.Option(
+            "--domain",
+            help="Of that model: continuous or discrete time.",
+            show_default="z for --orders of a held input, else s",
+        ),
+    ] = None,
+    delay: Annotated[
+        str | None,
+        typer.Option(
+            "--delay",
+            metavar="S|auto",
+            help="Delay of the inputs in s, for the models.",
+            show_default="0; with --rig as the rig says",
+        ),
+    ] = None,
+    rig: RigFile = None,
+    from_s: From = None,
+    to_s: To = None,
+    rate: Rate = None,
+    gaps: Gaps = None,
+    json: JsonFile = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", metavar="FILE.png", help="Draw response, levels and models.", show_default=False),
+    ] = None,
+    strict: Strict = False,
+) -> None:
+    """Measure a frequency response with its noise and distortion, and fit models to it.
+
+    With --reference (the loop's outer excitation) feedback does not bias it. With --rig, physical parameters come out,
+    and inputs and outputs are the rig's.
+    """
+    from ambid.identify.frequency.measured_file import measured_text
+    from ambid.job import frf
+    from ambid.report.frf_text import frf_text
+
+    with Outputs(record, rig) as outputs:
+        outputs.claim(json_path(json), "--json")
+        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+        between, wanted, n, late = _band(band), _orders(orders), _order(state_space), _delay(delay)
+        with progress("measure") as tick:
+            found = frf(
+                record,
+                inputs=inputs or (),
+                outputs=output or (),
+                references=reference or (),
+                open_loop=open_loop,
+                method=method,
+                hold=hold,
+                band=between,
+                orders=wanted,
+                state_space=n,
+                domain=domain,
+                delay=late,
+                rig=rig,
+                from_s=from_s,
+                to_s=to_s,
+                rate_hz=rate,
+                gaps=gaps,
+                tick=tick,
+            )
+            if plot is not None:
+                from ambid.report.figures import save
+                from ambid.report.frf_figure import figure
+
+                tick("draw")
+                page = figure(found)
+                outputs.stage(plot, lambda path: save(page, path))
+        path = json_path(json)
+        if path is not None:
+            outputs.stage_text(path, measured_text(found))
+        elif json == "-":
+            typer.echo(measured_text(found), nl=False)
+    if json != "-":
+        typer.echo(frf_text(found, paint=painter()))
+    if strict and not found.passed:
+        raise typer.Exit(FAILED_CHECK)
+
+
+def _orders(text: str | None) -> Orders | None:
+    found = None if text is None else orders_of(text)
+    if text is not None and found is None:
+        raise AmbidError("--orders auto: a transfer function wants its degree. Give nf=2, or use --state-space auto")
+    return found
+
+
+def _order(text: str | None) -> int | Literal["auto"] | None:
+    if text is None or text.strip() == "auto":
+        return None if text is None else "auto"
+    number = text.strip().removeprefix("n=")
+    if not number.isdecimal() or len(number) > 3:
+        raise AmbidError(f"--state-space is {text!r}; it is an order, or auto. Give n=3 and so on")
+    return int(number)
+
+
+def _delay(text: str | None) -> float | Literal["auto"] | None:
+    if text is None or text.strip() == "auto":
+        return None if text is None else "auto"
+    try:
+        return float(text)
+    except ValueError:
+        raise AmbidError(f"--delay is {text!r}; it is a time in s, or auto. Give e.g. --delay 1e-4") from None
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    try:
+        found = (float(low), float(high))
+    except ValueError:
+        found = (0.0, 0.0)
+    if not 0.0 <= found[0] < found[1] < float("inf"):
+        raise AmbidError(
+            f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000"
+        )
+    return found

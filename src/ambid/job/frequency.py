@@ -1,0 +1,283 @@
+"""The frequency-domain job: one record in, one measured frequency response out, with a model fitted to it if wanted.
+
+Read -> cut -> measure -> fit -> Measured. With a rig, columns are its roles and physical parameters come out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ambid.errors import EstimationError, RecordError
+from ambid.identify.blackbox.data import IOData, io_data
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.orders import Orders
+from ambid.identify.blackbox.response import Offsets
+from ambid.identify.frequency.measured import Measured
+from ambid.identify.frequency.physical_estimate import FrequencyEstimate
+from ambid.job.blackbox import Tick, read_data
+from ambid.physics.models import model
+from ambid.record import Record, read_record
+from ambid.rig import Rig, bench_record, load_rig, mat_variables
+from ambid.signals.frf import FrequencyResponse, Hold, Method, frequency_response, repeats
+from ambid.signals.samples import cut
+from ambid.units import UNKNOWN
+
+Delay = float | Literal["auto"]
+
+
+def frf(
+    record: Record | str | Path,
+    *,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    references: Sequence[str] = (),
+    open_loop: bool = False,
+    method: Method = "auto",
+    hold: Hold = "zoh",
+    band: tuple[float, float] | None = None,
+    orders: Orders | None = None,
+    state_space: int | Literal["auto"] | None = None,
+    domain: Literal["s", "z"] | None = None,
+    delay: Delay | None = None,
+    rig: Rig | str | Path | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+    tick: Tick | None = None,
+) -> Measured:
+    """Measure a frequency response from one record, and fit models to it.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+        With a rig: a file in the rig's columns, or a record whose channels are named by role.
+    inputs, outputs : sequence of str
+        Channel names; with a rig, roles or columns of it, by default all of its model.
+    references : sequence of str, optional
+        Channels of the loop's outer excitation: then the joint method is used, which feedback does not bias.
+    open_loop : bool, optional
+        Say that no feedback was at work.
+    method : {"auto", "periodic", "random", "local"}, optional
+        As in `ambid.signals.frequency_response`. Periodic: leading periods with a transient are left out, and said so.
+    hold : {"zoh", "band-limited"}, optional
+        What the inputs do between samples.
+    band : (float, float), optional
+        Lines that are kept, in Hz.
+    orders : Mapping[str, int, "auto" or tuple of int], optional
+        ``nf`` and ``nb`` of transfer functions, fitted by maximum likelihood.
+    state_space : int or "auto", optional
+        Order of a state space, fitted by subspace with the Laguerre operator. Not together with `orders`.
+    domain : {"s", "z"}, optional
+        Of that model; default z for transfer functions of a held input, else s.
+    delay : float or "auto", s, optional
+        Of the inputs. Default: 0 for the black-box models, the rig's for physical parameters. "auto" estimates it (not
+        for a state space).
+    rig : Rig, str or Path, optional
+        Physical parameters of its model are estimated.
+    from_s, to_s : float, optional
+        Part of the record to use, in s.
+    rate_hz : float, optional
+        Sampling rate for a file without a time column.
+    gaps : {"error", "interpolate", "cut"}, optional
+        What to do about gaps in a file.
+    tick : callable, optional
+        Called with the name of the present stage; may raise to interrupt.
+
+    Returns
+    -------
+    Measured
+
+    Raises
+    ------
+    AmbidError
+        If record, rig, channels or orders break a rule.
+    EstimationError
+        If the response cannot be measured, or a model not be fitted to it.
+    """
+    say = tick or _silent
+    _agree(orders, state_space, domain, delay, rig)
+    laps, last = dict[str, float](), time.perf_counter()
+    rig = load_rig(rig) if isinstance(rig, str | Path) else rig
+    part = (from_s, to_s)
+    if rig is None:
+        if not inputs:
+            raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
+        data = read_data(
+            record, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
+        )
+    else:
+        data = _bench_data(record, rig, inputs, outputs, references, open_loop, part, rate_hz, gaps)
+    laps["read"], last = time.perf_counter() - last, time.perf_counter()
+    say("measure")
+    response = _measured(data, method, hold, band)
+    laps["measure"], last = time.perf_counter() - last, time.perf_counter()
+    found: BlackBoxFit | None = None
+    estimate: FrequencyEstimate | None = None
+    if orders is not None or state_space is not None:
+        say("fit")
+        found = _fitted(response, data, orders, state_space, domain, 0.0 if delay is None else delay)
+        laps["fit"], last = time.perf_counter() - last, time.perf_counter()
+    if rig is not None:
+        say("identify")
+        estimate = _physical(response, rig, delay)
+        laps["identify"] = time.perf_counter() - last
+    return Measured(
+        response=response,
+        references=data.references,
+        open_loop=data.open_loop,
+        fit=found,
+        estimate=estimate,
+        record=data.record,
+        timing_s=laps,
+    )
+
+
+def _agree(orders: object, state_space: int | str | None, domain: str | None, delay: Delay | None, rig: object) -> None:
+    """Refuse what contradicts itself before the record is read."""
+    if orders is not None and state_space is not None:
+        raise EstimationError(
+            "a transfer function and a state space are both asked for. Give --orders or --state-space"
+        )
+    if state_space is not None and state_space != "auto" and (not isinstance(state_space, int) or state_space < 1):
+        raise EstimationError(f"a state space of order {state_space}; it must be at least 1, or 'auto'. Correct it")
+    if orders is None and state_space is None and domain is not None:
+        raise EstimationError("--domain is for --orders and --state-space; neither is given. Leave it out")
+    if state_space is not None and delay == "auto":
+        raise EstimationError(
+            "a state space takes a delay that is known, not 'auto'. Give --delay S; --orders or --rig can find it"
+        )
+    if delay is not None and orders is None and state_space is None and rig is None:
+        raise EstimationError("--delay is for a model; none is asked for. Give --orders, --state-space or --rig too")
+    if isinstance(delay, float | int) and not (np.isfinite(delay) and delay >= 0):
+        raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
+
+
+def _bench_data(
+    record: Record | str | Path,
+    rig: Rig,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str],
+    open_loop: bool,
+    part: tuple[float | None, float | None],
+    rate_hz: float | None,
+    gaps: str | None,
+) -> IOData:
+    """Inputs and outputs by role, calibrated; references as they stand in the file, or by role."""
+    plant = model(rig.model)
+    if isinstance(record, Record):
+        bench, raw = record, record
+    else:
+        mat = Path(record).suffix.lower() == ".mat"
+        variables = {**{x: (x, UNKNOWN) for x in references}, **mat_variables(rig)} if mat else None
+        raw = read_record(
+            record,
+            rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz,
+            gaps=gaps or rig.record.gaps or "error",  # type: ignore[arg-type]
+            variables=variables,
+        )
+        bench = bench_record(raw, rig)
+    beside = []
+    for name in references:
+        if name not in bench.names and name not in raw.names:
+            raise RecordError(
+                f"the record has no column {name!r} for the reference; it has {', '.join(raw.names)}. Correct "
+                "--reference"
+            )
+        if name not in bench.names:
+            beside.append(raw.channel(name))
+    bench = replace(bench, channels=(*bench.channels, *beside))
+    first, last = (a if a is not None else b for a, b in zip(part, (rig.record.from_s, rig.record.to_s), strict=True))
+    if first is not None or last is not None:
+        bench = cut(bench, first, last)
+    ins = [_role(x, rig, plant.inputs, "input") for x in inputs] or list(plant.inputs)
+    outs = [_role(x, rig, plant.outputs, "output") for x in outputs] or list(plant.outputs)
+    return io_data(bench, ins, outs, references=references, open_loop=open_loop or rig.open_loop)
+
+
+def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
+    found = next((c.role for c in rig.channels if name in (c.role, c.column) and c.role in roles), None)
+    if found is None:
+        raise EstimationError(
+            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or leave "
+            f"--{what} out for all"
+        )
+    return found
+
+
+def _measured(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
+    """Measure the response by the wanted method, in the wanted band."""
+    from ambid.identify.threads import one_thread
+
+    r = data.reference if data.references else None
+    if method == "auto":
+        method = "periodic" if repeats(data.u if r is None else r) else "local"
+    options: dict[str, object] = {}
+    if method == "periodic":
+        options["drop_periods"] = "auto"
+    elif method == "local" and band is not None:
+        options["band"] = band
+    with one_thread():
+        found = frequency_response(
+            data.u,
+            data.y,
+            1.0 / data.dt,
+            r=r,
+            method=method,
+            open_loop=data.open_loop,
+            hold=hold,
+            inputs=data.inputs,
+            outputs=data.outputs,
+            units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
+            **options,
+        )
+    return found if band is None else found.between(*band)
+
+
+def _fitted(
+    response: FrequencyResponse,
+    data: IOData,
+    orders: Orders | None,
+    state_space: int | Literal["auto"] | None,
+    domain: Literal["s", "z"] | None,
+    delay: Delay,
+) -> BlackBoxFit:
+    """Fit the black-box model; its operating point is that of the record, which a response does not show."""
+    from ambid.identify.frequency.rational import frf_ml
+    from ambid.identify.frequency.subspace import frf_subspace
+
+    if orders is not None:
+        found = frf_ml(response, orders, domain=domain, delay=delay)
+    else:
+        assert state_space is not None
+        assert delay != "auto"
+        found = frf_subspace(response, {"n": state_space}, domain=domain or "s", delay=delay)
+    return replace(
+        found,
+        offsets=Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0)),
+        record={**data.record, **found.record},
+        details={**found.details, "offsets": "means of the record: a frequency response does not show them"},
+    )
+
+
+def _physical(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
+    """Estimate the rig's parameters; a delay in s is so many samples."""
+    from ambid.identify.frequency.greybox import greybox_frf
+
+    plant = model(rig.model)
+    known: Delay = rig.channel(plant.inputs[0]).delay if delay is None else delay
+    if delay is not None and known != "auto":
+        known = float(known) * response.rate_hz
+    return greybox_frf(response, plant, rig.parameters, delay=known)
+
+
+def _silent(stage: str) -> None:
+    """Report no progress."""
+    del stage
