@@ -20,9 +20,9 @@ BEFORE = (
     " state and offset known): 1 is the best that can be, and 100 runs tell it to 7 %. Simulation error: mean of"
     " |y0 - G u| / |y0| without noise, from rest, on the input of the record. Times: median of one fit. All programs"
     " see the same records; `models` counts the stable models, and the others are left out of the row. `From rest`: the"
-    " record starts at rest at zero, which the peers always take for granted; ambid estimates initial state and offset"
-    " here too. `In operation`: the record is cut out of a longer run about an operating point, as measured records"
-    " are; the peers get it with the means taken off."
+    " record starts at rest at zero, which the peers always take for granted and ambid is told (`at_rest`). `In"
+    " operation`: the record is cut out of a longer run about an operating point, as measured records are; ambid"
+    " estimates initial state and offset, the peers get the record with the means taken off."
 )
 
 
@@ -78,14 +78,18 @@ def run(experiment: Experiment, children: Bench, runs: int = RUNS) -> tuple[dict
     information = np.zeros((len(experiment.coefficients),) * 2)
     for way in tallies:  # once before, unwatched: whatever is compiled or loaded then is not measured
         u, y, _ = experiment.record(SAMPLES, seed=10**6)
-        children.answer(way, experiment.structure, experiment.orders, *given(way, experiment, u, y))
+        _answer(children, way, experiment, u, y)
     for k in range(runs):
         u, y, sensitivity = experiment.record(SAMPLES, seed=k)
         information += sensitivity.T @ sensitivity / experiment.sd**2 / runs
         for way, tally in tallies.items():
-            found = children.answer(way, experiment.structure, experiment.orders, *given(way, experiment, u, y))
-            tally.add(k, experiment, found, u)
+            tally.add(k, experiment, _answer(children, way, experiment, u, y), u)
     return tallies, np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+def _answer(children: Bench, way: Way, experiment: Experiment, u: Array, y: Array) -> Answer:
+    u, y = given(way, experiment, u, y)
+    return children.answer(way, experiment.structure, experiment.orders, u, y, at_rest=experiment.at_rest)
 
 
 def given(way: Way, experiment: Experiment, u: Array, y: Array) -> tuple[Array, Array]:

@@ -81,11 +81,11 @@ class Bench:
 
     def answer(
         self, way: Way, structure: str, orders: Mapping[str, int], u: Array, y: Array, *, limit_s: float = 60.0,
-        open_loop: bool = True,
+        open_loop: bool = True, at_rest: bool = False,
     ) -> Answer:  # fmt: skip
-        """Fit one record, u and y of shape (n_samples,)."""
+        """Fit one record, u and y of shape (n_samples,); the peers take for granted that it begins at rest."""
         if way.program == "ambid":
-            return _ambid(structure, orders, u, y, open_loop)
+            return _ambid(structure, orders, u, y, open_loop, at_rest)
         data = self.folder / "record.npz"
         np.savez(data, u=u, y=y)
         job = {"structure": structure, "orders": dict(orders), "mode": way.mode, "data": str(data)}
@@ -165,11 +165,12 @@ def io_data(u: Array, y: Array, dt: float = 1.0, *, open_loop: bool = True) -> I
     )  # fmt: skip
 
 
-def _ambid(structure: str, orders: Mapping[str, int], u: Array, y: Array, open_loop: bool) -> Answer:
+def _ambid(structure: str, orders: Mapping[str, int], u: Array, y: Array, open_loop: bool, at_rest: bool) -> Answer:
     data = io_data(u, y, open_loop=open_loop)
     estimator = registered(structure).estimator
     options: dict[str, Any] = {k: orders["horizon"] for k in ("horizon", "past") if "horizon" in orders}
     options |= {"feedthrough": True} if "feedthrough" in orders else {}
+    options |= {"at_rest": True} if at_rest else {}
     orders = {k: v for k, v in orders.items() if k not in ("horizon", "feedthrough")}
     before = time.perf_counter()
     try:

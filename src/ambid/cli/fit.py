@@ -40,6 +40,13 @@ def command(
     ] = None,
     reference: References = None,
     open_loop: OpenLoop = False,
+    at_rest: Annotated[
+        bool,
+        typer.Option(
+            "--at-rest",
+            help="Say that all was zero before the first sample: estimate no offsets and initial states (polynomial).",
+        ),
+    ] = False,
     from_s: From = None,
     to_s: To = None,
     rate: Rate = None,
@@ -83,6 +90,7 @@ def command(
                 orders=wanted,
                 criterion=criterion,
                 fixed=known or None,
+                at_rest=at_rest,
                 references=reference or (),
                 open_loop=open_loop,
                 from_s=from_s,

@@ -15,7 +15,7 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
-from ambid.identify.blackbox.structures import Structure, structure
+from ambid.identify.blackbox.structures import STRUCTURES, Structure, structure
 from ambid.record import Record, read_record
 from ambid.signals.samples import cut
 
@@ -34,6 +34,7 @@ def fit(
     orders: Orders | None = None,
     criterion: str = "bic",
     fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
     references: Sequence[str] = (),
     open_loop: bool = False,
     from_s: float | None = None,
@@ -60,6 +61,9 @@ def fit(
         For the choice of orders, see `ambid.validate.selection`.
     fixed : Mapping[str, float], optional
         Coefficients that are known, for polynomial structures, by name (``a1``, ``b2``).
+    at_rest : bool, optional
+        Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
+        are estimated. For polynomial structures; a record that contradicts it is warned of.
     references : sequence of str, optional
         Channels of the loop's outer excitation, for the methods that want it.
     open_loop : bool, optional
@@ -93,7 +97,7 @@ def fit(
 
     say = tick or _silent
     of = structure(structure_name)
-    _check_use(of, inputs, fixed)
+    _check_use(of, inputs, fixed, at_rest=at_rest)
     laps, last = dict[str, float](), time.perf_counter()
     data = read_data(
         record, inputs, outputs, references, open_loop=open_loop, part=(from_s, to_s), rate_hz=rate_hz, gaps=gaps
@@ -115,7 +119,8 @@ def fit(
             orders, chosen = choice.orders, {"selection": choice.summary()}
             laps["orders"], last = time.perf_counter() - last, time.perf_counter()
         say("fit")
-        options = {"fixed": dict(fixed)} if fixed else {}
+        options: dict[str, object] = {"fixed": dict(fixed)} if fixed else {}
+        options |= {"at_rest": True} if at_rest else {}
         found = of.estimator(data, orders, **options)
         laps["fit"], last = time.perf_counter() - last, time.perf_counter()
         say("check")
@@ -226,7 +231,9 @@ def read_data(
     return io_data(record, inputs, outputs, references=references, open_loop=open_loop)
 
 
-def _check_use(of: Structure, inputs: Sequence[str], fixed: Mapping[str, float] | None) -> None:
+def _check_use(
+    of: Structure, inputs: Sequence[str], fixed: Mapping[str, float] | None, *, at_rest: bool = False
+) -> None:
     if inputs and not of.inputs:
         raise EstimationError(
             f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Leave --input out"
@@ -235,6 +242,11 @@ def _check_use(of: Structure, inputs: Sequence[str], fixed: Mapping[str, float] 
         raise EstimationError(f"structure {of.name} needs an input. Give --input COLUMN, or use arma")
     if fixed and of.kind != "polynomial":
         raise EstimationError(f"structure {of.name} has no coefficients that can be fixed. Use a polynomial structure")
+    if at_rest and not of.takes_at_rest:
+        some = ", ".join(x.name for x in STRUCTURES.values() if x.takes_at_rest)
+        raise EstimationError(
+            f"structure {of.name} cannot be told that a record begins at rest; {some} can. Leave --at-rest out"
+        )
 
 
 def _silent(stage: str) -> None:

@@ -42,6 +42,11 @@ class Structure:
     kind: Literal["polynomial", "state space", "transfer function"]
 
     @property
+    def takes_at_rest(self) -> bool:
+        """Whether its estimator can be told that the record begins at rest at zero."""
+        return self.home.startswith("ambid.identify.polynomial:")
+
+    @property
     def estimator(self) -> Callable[..., BlackBoxFit]:
         """The function that fits it."""
         module, function = self.home.split(":")

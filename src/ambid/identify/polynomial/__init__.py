@@ -17,7 +17,12 @@ __all__ = ["ararmax", "ararx", "arma", "armax", "arx", "bj", "fir", "oe"]
 
 
 def fir(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """Finite impulse response y = B u + e, by QR (Ljung 1999, sec. 4.2).
 
@@ -28,6 +33,8 @@ def fir(
         nb, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -35,11 +42,16 @@ def fir(
     -------
     BlackBoxFit
     """
-    return estimate("fir", data, orders, fixed, tick)
+    return estimate("fir", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def arx(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """A y = B u + e, by QR (Ljung 1999, sec. 4.2).
 
@@ -50,6 +62,8 @@ def arx(
         na, nb, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -57,11 +71,16 @@ def arx(
     -------
     BlackBoxFit
     """
-    return estimate("arx", data, orders, fixed, tick)
+    return estimate("arx", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def armax(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """A y = B u + C e (Ljung 1999, sec. 4.2).
 
@@ -72,6 +91,8 @@ def armax(
         na, nb, nc, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -79,11 +100,16 @@ def armax(
     -------
     BlackBoxFit
     """
-    return estimate("armax", data, orders, fixed, tick)
+    return estimate("armax", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def arma(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """Time series A y = C e (Ljung 1999, sec. 4.2).
 
@@ -94,6 +120,8 @@ def arma(
         na, nc.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -101,11 +129,16 @@ def arma(
     -------
     BlackBoxFit
     """
-    return estimate("arma", data, orders, fixed, tick)
+    return estimate("arma", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def ararx(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """A y = B u + (1/D) e (Ljung 1999, sec. 4.2).
 
@@ -116,6 +149,8 @@ def ararx(
         na, nb, nd, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -123,11 +158,16 @@ def ararx(
     -------
     BlackBoxFit
     """
-    return estimate("ararx", data, orders, fixed, tick)
+    return estimate("ararx", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def ararmax(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """A y = B u + (C/D) e (Ljung 1999, sec. 4.2).
 
@@ -138,6 +178,8 @@ def ararmax(
         na, nb, nc, nd, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -145,11 +187,16 @@ def ararmax(
     -------
     BlackBoxFit
     """
-    return estimate("ararmax", data, orders, fixed, tick)
+    return estimate("ararmax", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def oe(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """Output error y = (B/F) u + e (Ljung 1999, sec. 4.2).
 
@@ -160,6 +207,8 @@ def oe(
         nb, nf, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -167,11 +216,16 @@ def oe(
     -------
     BlackBoxFit
     """
-    return estimate("oe", data, orders, fixed, tick)
+    return estimate("oe", data, orders, fixed, tick, at_rest=at_rest)
 
 
 def bj(
-    data: IOData, orders: Orders, *, fixed: Mapping[str, float] | None = None, tick: Callable[[], None] | None = None
+    data: IOData,
+    orders: Orders,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """Box-Jenkins y = (B/F) u + (C/D) e (Ljung 1999, sec. 4.2).
 
@@ -182,6 +236,8 @@ def bj(
         nb, nc, nd, nf, nk; nb, nf and nk one number, or one for each input.
     fixed : Mapping[str, float], optional
         Known coefficients, by name (``a1``), SI.
+    at_rest : bool, optional
+        Say that the record begins at rest at zero, see `ambid.identify.polynomial.rest`.
     tick : callable, optional
         Called before each look at the data.
 
@@ -189,4 +245,4 @@ def bj(
     -------
     BlackBoxFit
     """
-    return estimate("bj", data, orders, fixed, tick)
+    return estimate("bj", data, orders, fixed, tick, at_rest=at_rest)

@@ -62,7 +62,7 @@ def unstable_plant(layouts: Sequence[Layout], scaled: Scaled) -> list[str]:
     found = []
     for o, x in enumerate(layouts):
         n = max(x.nf)
-        armax = Layout(na=n, nb=x.nb, nc=n, nd=0, nf=(0,) * x.n_inputs, nk=x.nk)
+        armax = Layout(na=n, nb=x.nb, nc=n, nd=0, nf=(0,) * x.n_inputs, nk=x.nk, at_rest=x.at_rest)
         fit = searched(predictor(armax), scaled.y[o], scaled.u, next(starts(armax, scaled.y[o], scaled.u)), most=20)
         theta = fit.theta[armax.places["A", None]]
         if not n or not np.all(np.isfinite(theta)):

@@ -18,7 +18,7 @@ LARGEST_DELAY = 20  # samples
 _HISTORY = 10  # past outputs, and inputs after the delay, of the long model
 
 
-def long_delays(name: str, y: Array, u: Array, least: int) -> tuple[int, ...]:
+def long_delays(name: str, y: Array, u: Array, least: int, *, at_rest: bool = False) -> tuple[int, ...]:
     """Return the delay of every input with the smallest BIC of a long ARX model.
 
     Parameters
@@ -31,6 +31,7 @@ def long_delays(name: str, y: Array, u: Array, least: int) -> tuple[int, ...]:
     least : int
         Smallest delay. Under feedback it must be 1: a controller without delay correlates u(t) with y(t), which
         looks like a direct path.
+    at_rest : bool, optional
 
     Returns
     -------
@@ -47,7 +48,7 @@ def long_delays(name: str, y: Array, u: Array, least: int) -> tuple[int, ...]:
     if history < 3 or largest < 5:
         raise EstimationError(f"{name}: {n} samples are too few to find the delay. Give nk")
     taps = largest + history
-    long = Layout(na=history, nb=(taps,) * n_u, nc=0, nd=0, nf=(0,) * n_u, nk=(least,) * n_u)
+    long = Layout(na=history, nb=(taps,) * n_u, nc=0, nd=0, nf=(0,) * n_u, nk=(least,) * n_u, at_rest=at_rest)
     p = predictor(long)
     R: Array = p.triangle(y, u, long.start(), np.zeros(p.n_nuisance))[p.n_nuisance :, p.n_nuisance :]
     rows = n - long.first_row

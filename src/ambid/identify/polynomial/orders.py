@@ -32,6 +32,8 @@ class Layout:
         One for each input.
     fixed : tuple of int
         Places of coefficients that the user fixed.
+    at_rest : bool
+        Everything was zero before the first sample: no initial states, no constant, and all samples count.
     """
 
     na: int
@@ -41,6 +43,7 @@ class Layout:
     nf: tuple[int, ...]
     nk: tuple[int, ...]
     fixed: tuple[int, ...] = ()
+    at_rest: bool = False
 
     @property
     def n_inputs(self) -> int:
@@ -59,7 +62,9 @@ class Layout:
 
     @property
     def first_row(self) -> int:
-        """First sample whose regressors lie in the record."""
+        """First sample whose regressors lie in the record, or are known to be zero."""
+        if self.at_rest:
+            return 0
         return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
 
     def free_lags(self, key: Key) -> tuple[int, ...]:
@@ -169,7 +174,7 @@ def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tupl
     return found
 
 
-def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int) -> Layout:
+def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int, *, at_rest: bool = False) -> Layout:
     """Return the layout of checked orders.
 
     Parameters
@@ -177,6 +182,7 @@ def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int)
     orders : Mapping[str, int, tuple of int or None]
         Of `read_orders`, nk a number for each input by now.
     n_inputs : int
+    at_rest : bool, optional
 
     Returns
     -------
@@ -192,7 +198,7 @@ def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int)
         return value if isinstance(value, tuple) else (0,) * n_inputs
 
     return Layout(
-        na=one("na"), nb=each("nb"), nc=one("nc"), nd=one("nd"), nf=each("nf"), nk=each("nk")
+        na=one("na"), nb=each("nb"), nc=one("nc"), nd=one("nd"), nf=each("nf"), nk=each("nk"), at_rest=at_rest
     )  # fixed: see `fixed_places`
 
 

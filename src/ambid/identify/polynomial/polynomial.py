@@ -39,6 +39,8 @@ def estimate(
     orders: Orders,
     fixed: Mapping[str, float] | None,
     tick: Callable[[], None] | None,
+    *,
+    at_rest: bool = False,
 ) -> BlackBoxFit:
     """Fit one of the eight structures.
 
@@ -51,6 +53,8 @@ def estimate(
         Known coefficients, by the names of `PolynomialModel.names`, in SI.
     tick : callable or None
         Called before each look at the data.
+    at_rest : bool, optional
+        The record begins at rest at zero.
 
     Returns
     -------
@@ -62,7 +66,7 @@ def estimate(
         If the orders break a rule, the record is too short, or a channel does not move.
     """
     read = read_orders(name, data, orders)
-    scaled = scaled_data(name, data)
+    scaled = scaled_data(name, data, at_rest=at_rest)
     with one_thread():
         layouts = _layouts(name, read, scaled, 0 if data.open_loop else 1, tick)
         known = fixed_places(name, tuple(layouts), {} if fixed is None else fixed)
@@ -81,14 +85,19 @@ def _layouts(
     """Orders of every output, delays estimated where none were given."""
     n_u, n_y = scaled.u.shape[0], scaled.y.shape[0]
     if "nk" not in read or read["nk"] is not None:
-        return [layout_of(read, n_u)] * n_y
+        return [layout_of(read, n_u, at_rest=scaled.at_rest)] * n_y
     piece = liveliest(scaled.u, _WINDOW)
-    part = replace(scaled, u=np.ascontiguousarray(scaled.u[:, piece]), y=np.ascontiguousarray(scaled.y[:, piece]))
+    part = replace(
+        scaled,
+        u=np.ascontiguousarray(scaled.u[:, piece]),
+        y=np.ascontiguousarray(scaled.y[:, piece]),
+        at_rest=scaled.at_rest and not piece.start,
+    )
     rows = part.y.shape[1]
     out: list[Layout] = []
     for o in range(n_y):
-        nk = long_delays(name, scaled.y[o], scaled.u, least)
-        layout = layout_of({**read, "nk": nk}, n_u)
+        nk = long_delays(name, scaled.y[o], scaled.u, least, at_rest=scaled.at_rest)
+        layout = layout_of({**read, "nk": nk}, n_u, at_rest=part.at_rest)
         loss = _loss(fit_output(name, layout, part, o, {}, tick))
         for i in range(n_u):  # the structure itself decides between neighbours, where they clearly differ
             for k in (nk[i] - 1, nk[i] + 1):
@@ -97,7 +106,7 @@ def _layouts(
                     found = _loss(fit_output(name, near, part, o, {}, tick))
                     if rows * np.log(found / loss) < -np.log(rows):
                         layout, loss = near, found
-        out.append(layout)
+        out.append(replace(layout, at_rest=scaled.at_rest))
     return out
 
 

@@ -4,7 +4,8 @@ Residual: e = (D/C) (A y - sum_i (B_i/F_i) u_i - kappa), kappa the constant that
 Gradients: all lags of one polynomial are one filtered signal, shifted: de/da_k = (D/C) y(t-k),
 de/db_k = -D/(C F) u(t-k), de/dc_k = -(1/C) e(t-k), de/dd_k = (1/C) v(t-k) with v = A y - (B/F) u - kappa,
 de/df_k = (D B)/(C F^2) u(t-k). Filters start at rest at sample 0; residuals count from `first_row` on, and what came
-before is replaced by impulses at that row whose sizes are estimated (as many as there are initial states).
+before is replaced by impulses at that row whose sizes are estimated (as many as there are initial states). From rest
+nothing came before: all residuals count, and there are neither impulses nor a constant.
 """
 
 from __future__ import annotations
@@ -206,20 +207,19 @@ class _Plan:
 
 
 @lru_cache(maxsize=256)
-def predictor(layout: Layout, *, constant: bool = True) -> Predictor:
+def predictor(layout: Layout) -> Predictor:
     """Write down the predictor of one output.
 
     Parameters
     ----------
     layout : Layout
-    constant : bool, optional
-        Estimate the constant that offsets leave.
+        At rest: without initial states and without the constant that offsets leave.
 
     Returns
     -------
     Predictor
     """
-    n_u = layout.n_inputs
+    n_u, free = layout.n_inputs, not layout.at_rest
     place = {key: slice(p.start + _THETA, p.stop + _THETA) for key, p in layout.places.items()}
     A, C, D = (place[x, None] for x in "ACD")
     one, impulse = 1 + n_u, 2 + n_u
@@ -239,28 +239,28 @@ def predictor(layout: Layout, *, constant: bool = True) -> Predictor:
     for i in range(n_u):
         b, f = place["B", i], place["F", i]
         terms = [(1 + i, b.start + layout.nk[i], layout.nb[i], layout.nk[i])]
-        if layout.nf[i]:
+        if layout.nf[i] and free:
             terms.append((impulse, states, layout.nf[i], 0))
             states += layout.nf[i]
         w.append(plan.filtered(terms, f))
         F.append(f)
         v_terms.append((w[i], _MINUS, 1, 0))
-    if constant:
+    if free:
         v_terms.append((one, _CONSTANT, 1, 0))
     v = plan.filtered(v_terms, nothing)
     e_terms = [(v, _ONE, 1, 0) if not layout.nd else (v, D.start, layout.nd + 1, 0)]
-    if n_noise:
+    if n_noise and free:
         e_terms.append((impulse, states, n_noise, 0))
     e = plan.filtered(e_terms, C)
     for i in range(n_u):
-        if layout.nf[i]:
+        if layout.nf[i] and free:
             row = plan.filtered([(through_noise(impulse, rings=True), _ONE, 1, 0)], F[i], impulse=True)
             initial += [(row, j, -1) for j in range(layout.nf[i])]
-    if n_noise:
+    if n_noise and free:
         row = plan.filtered([(impulse, _ONE, 1, 0)], C, impulse=True)
         initial += [(row, j, 1) for j in range(n_noise)]
     plan.columns += initial
-    if constant:
+    if free:
         plan.columns.append((through_noise(one), 0, -1))
     n_nuisance = len(plan.columns)
 

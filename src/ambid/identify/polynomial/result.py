@@ -21,6 +21,7 @@ from ambid.identify.polynomial.caution import cautions, unstable_plant
 from ambid.identify.polynomial.delay import LARGEST_DELAY
 from ambid.identify.polynomial.orders import Layout, shown_orders
 from ambid.identify.polynomial.predictor import predictor
+from ambid.identify.polynomial.rest import not_at_rest
 from ambid.identify.polynomial.scaled import Scaled, unit
 from ambid.identify.polynomial.search import BLIND, Fitted
 
@@ -65,12 +66,16 @@ def result(
     warnings = cautions(model, covariance, fits)
     if any(layouts[0].nf) and not data.open_loop:
         warnings += unstable_plant(layouts, scaled)
+    if scaled.at_rest:
+        warnings += not_at_rest(layouts, fits, scaled)
     if estimated_delay and any(k >= LARGEST_DELAY for x in layouts for k in x.nk):
         warnings.append(f"the delay was looked for up to {LARGEST_DELAY} samples and may be longer: give nk")
     details: dict[str, object] = {
         "iterations": [f.iterations for f in fits],
         "condition": [_condition(f.triangle) for f in fits],
     }
+    if scaled.at_rest:
+        details["at_rest"] = True
     if estimated_delay:
         details["nk"] = [list(x.nk) for x in layouts]
     return made(
@@ -174,7 +179,7 @@ def _offsets(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitted]) 
     y, rows, right = np.zeros(len(fits)), [], []
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
         p = x.polynomials(f.theta)
-        constant, level = float(f.nuisance[-1]), float(np.sum(p.A))
+        constant, level = float(f.nuisance[-1]) if f.nuisance.size else 0.0, float(np.sum(p.A))
         if abs(constant) <= _FAR * abs(level):
             y[o] = constant / level
         elif n_u:

@@ -1,4 +1,7 @@
-"""Data without means, in units of their standard deviations: results do not depend on the user's units."""
+"""Data without means, in units of their standard deviations: results do not depend on the user's units.
+
+Where a record begins at rest at zero, zero is its level: no mean is taken off, and the unit is the root mean square.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,8 @@ class Scaled:
     u, y : ndarray, shape (n_inputs, n_samples), (n_outputs, n_samples)
     u_mean, u_scale : ndarray, shape (n_inputs,)
     y_mean, y_scale : ndarray, shape (n_outputs,)
+    at_rest : bool
+        Whether the user says that everything was zero before the first sample.
     """
 
     u: Array
@@ -31,15 +36,17 @@ class Scaled:
     u_scale: Array
     y_mean: Array
     y_scale: Array
+    at_rest: bool = False
 
 
-def scaled_data(name: str, data: IOData) -> Scaled:
+def scaled_data(name: str, data: IOData, *, at_rest: bool = False) -> Scaled:
     """Take off means and divide by standard deviations.
 
     Parameters
     ----------
     name : str
     data : IOData
+    at_rest : bool, optional
 
     Returns
     -------
@@ -52,18 +59,18 @@ def scaled_data(name: str, data: IOData) -> Scaled:
     """
     out = []
     for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
-        mean = np.mean(values, axis=0)
+        mean = np.zeros(len(names)) if at_rest else np.mean(values, axis=0)
         centred = np.ascontiguousarray((values - mean).T)
         scale = np.sqrt(np.mean(centred**2, axis=1)) if values.size else np.ones(0)
         for k, channel in enumerate(names):
             if not scale[k] > 1e-13 * np.max(np.abs(values[:, k])):
                 raise EstimationError(
-                    f"{name}: {channel!r} does not move (constant at {mean[k]:g}); nothing can be learnt from it. "
+                    f"{name}: {channel!r} does not move (constant at {values[0, k]:g}); nothing can be learnt from it. "
                     "Excite it, or leave it out"
                 )
         out.append((np.asarray(centred / scale[:, None]), mean, scale))
     (u, u_mean, u_scale), (y, y_mean, y_scale) = out
-    return Scaled(u=u, y=y, u_mean=u_mean, u_scale=u_scale, y_mean=y_mean, y_scale=y_scale)
+    return Scaled(u=u, y=y, u_mean=u_mean, u_scale=u_scale, y_mean=y_mean, y_scale=y_scale, at_rest=at_rest)
 
 
 def unit(layout: Layout, scaled: Scaled, o: int) -> Array:

@@ -9,7 +9,7 @@ circle is reflected: this is a start, and the search decides.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,8 @@ def arx_coefficients(layout: Layout, y: Array, u: Array) -> Array:
 
 def _regression(layout: Layout, y: Array, u: Array, most_rows: int | None) -> tuple[Array, Array]:
     """Coefficients and the triangle of their regressors; of at most about so many rows, spread over the record."""
+    if most_rows is not None and y.size > most_rows:
+        layout = replace(layout, at_rest=False)  # pieces out of the middle are not
     p, theta = predictor(layout), layout.start()
     R: Array = np.zeros((p.columns.shape[0],) * 2)
     for part in _pieces(y.size, layout.first_row, most_rows):
@@ -95,7 +97,7 @@ def starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     if not (layout.nc or layout.nd or any(layout.nf)):
         yield layout.start()  # one step from anywhere
         return
-    free = Layout(na=layout.na, nb=layout.nb, nc=layout.nc, nd=layout.nd, nf=layout.nf, nk=layout.nk)
+    free = replace(layout, fixed=())
     if any(layout.nf):
         yield from _output_error(free, y, u)
     elif layout.nd:
@@ -114,8 +116,8 @@ def _pieces(n: int, history: int, most_rows: int | None) -> Iterator[slice]:
         yield slice(int(first), int(first) + _CHUNK + history)
 
 
-def _arx(na: int, nb: tuple[int, ...], nk: tuple[int, ...]) -> Layout:
-    return Layout(na=na, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=nk)
+def _arx(na: int, nb: tuple[int, ...], nk: tuple[int, ...], *, at_rest: bool) -> Layout:
+    return Layout(na=na, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=nk, at_rest=at_rest)
 
 
 def _set(theta: Array, layout: Layout, letter: str, i: int | None, values: Array) -> None:
@@ -125,7 +127,7 @@ def _set(theta: Array, layout: Layout, letter: str, i: int | None, values: Array
 def _least_squares(layout: Layout, y: Array, u: Array) -> Array:
     """A and B as if the noise went through 1/A; C = D = 1."""
     na = max([layout.na, *layout.nf])
-    arx = _arx(na, layout.nb, layout.nk)
+    arx = _arx(na, layout.nb, layout.nk, at_rest=layout.at_rest)
     found = arx_coefficients(arx, y, u)
     theta = layout.start()
     for i in range(layout.n_inputs):
@@ -144,7 +146,7 @@ def _long_order(layout: Layout, n_samples: int) -> int:
 
 def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
     n = _long_order(layout, y.size)
-    arx = _arx(n, (n,) * layout.n_inputs, layout.nk)
+    arx = _arx(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
     found, R = _regression(arx, y, u, _ROWS)
     Q = tuple(found[arx.places["B", i]] for i in range(layout.n_inputs))
     return LongModel(P=found[arx.places["A", None]], Q=Q, nk=layout.nk, triangle=R)
@@ -220,7 +222,7 @@ def _long_innovations(layout: Layout, y: Array, u: Array) -> Array:
 def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     """ARMAX and ARMA: the long model's innovations as one more input."""
     e = _long_innovations(layout, y, u)
-    arx = _arx(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1))
+    arx = _arx(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
     found = arx_coefficients(arx, y, np.vstack([u, e]))
     theta = layout.start()
     if layout.na:
@@ -255,7 +257,7 @@ def _generalised(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         _set(theta, layout, "B", i, b)
     plants = [theta, _least_squares(layout, y, u)]
     if layout.n_inputs == 1 and layout.na:
-        b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.na, layout.nk[0])
+        b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.na, layout.nk[0], at_rest=layout.at_rest)
         theta = layout.start()
         _set(theta, layout, "A", None, f)
         _set(theta, layout, "B", 0, b)
@@ -286,7 +288,7 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         _set_noise(theta, layout, y, u)
         yield theta
     if coloured:  # the plant searched for with white noise, then the noise
-        white = Layout(na=0, nb=layout.nb, nc=0, nd=0, nf=layout.nf, nk=layout.nk)
+        white = Layout(na=0, nb=layout.nb, nc=0, nd=0, nf=layout.nf, nk=layout.nk, at_rest=layout.at_rest)
         found = searched(predictor(white), y, u, ways[0](white, y, u), most=15).theta
         theta = layout.start()
         for i in range(layout.n_inputs):
@@ -298,7 +300,7 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
 
 def _from_data(layout: Layout, y: Array, u: Array) -> Array:
     theta = layout.start()
-    b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.nf[0], layout.nk[0])
+    b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.nf[0], layout.nk[0], at_rest=layout.at_rest)
     _set(theta, layout, "B", 0, b)
     _set(theta, layout, "F", 0, f)
     return theta
@@ -313,21 +315,22 @@ def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
     return theta
 
 
-def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int) -> tuple[Array, Array]:
+def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest: bool = False) -> tuple[Array, Array]:
     """Fit B/F by least squares on data filtered by the last 1/F (Steiglitz & McBride 1965).
 
     Parameters
     ----------
     y, u : ndarray, shape (n_samples,)
     nb, nf, nk : int
+    at_rest : bool, optional
 
     Returns
     -------
     tuple of ndarray, shape (nk + nb,) and (nf + 1,)
         B and a stable F.
     """
-    arx = Layout(na=nf, nb=(nb,), nc=0, nd=0, nf=(0,), nk=(nk,))
     part, F = liveliest(u[None, :], _WINDOW), np.ones(1)
+    arx = _arx(nf, (nb,), (nk,), at_rest=at_rest and not part.start)
     y, u = y[part], u[part]
     for _ in range(_SM_ITERATIONS if nf else 1):
         one = np.ones(1)
