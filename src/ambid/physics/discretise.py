@@ -38,6 +38,33 @@ class DiscreteSpace:
     C: Array
 
 
+def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
+    """Discretise x' = A x + B u exactly, u held over a sample.
+
+    exp([[A, B], [0, 0]] T) holds both (Van Loan 1978).
+
+    Parameters
+    ----------
+    A : ndarray, shape (n_states, n_states)
+        Complex for a complex step.
+    B : ndarray, shape (n_states, n_inputs)
+    period_s : float
+        Sampling period in s.
+
+    Returns
+    -------
+    A_d : ndarray, shape (n_states, n_states)
+    B_d : ndarray, shape (n_states, n_inputs)
+    """
+    from scipy.linalg import expm
+
+    n, n_u = B.shape
+    block = np.zeros((n + n_u, n + n_u), dtype=np.result_type(A, B))
+    block[:n, :n], block[:n, n:] = A, B
+    full = np.asarray(expm(block * period_s))
+    return full[:n, :n], full[:n, n:]
+
+
 def discretise(
     space: StateSpace, period_s: float, *, fraction: float | None = None, derivatives: Sequence[StateSpace] = ()
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:

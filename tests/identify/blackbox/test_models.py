@@ -45,16 +45,8 @@ def _models() -> dict[str, object]:
 
 
 def _moved(model: object, theta: np.ndarray) -> object:
-    if isinstance(model, PolynomialModel):
+    if isinstance(model, PolynomialModel | StateSpaceModel):
         return model.with_theta(theta)
-    if isinstance(model, StateSpaceModel):
-        parts, first = {}, 0
-        for m in "ABCDK":
-            shape = getattr(model, m).shape
-            size = shape[0] * shape[1]
-            parts[m] = theta[first : first + size].reshape(shape)
-            first += size
-        return StateSpaceModel(dt=model.dt, **parts)
     assert isinstance(model, TransferModel)
     num, den, first = [], [], 0
     for row_n, row_d in zip(model.num, model.den, strict=True):

@@ -70,6 +70,24 @@ class StateSpaceModel:
         """All coefficients in the order of `names`, shape (n_theta,)."""
         return np.concatenate([getattr(self, m).ravel() for m in "ABCDK"])
 
+    def with_theta(self, theta: Array) -> StateSpaceModel:
+        """Return the same structure with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        StateSpaceModel
+        """
+        parts, first = {}, 0
+        for m in "ABCDK":
+            rows, columns = getattr(self, m).shape
+            parts[m] = theta[first : first + rows * columns].reshape(rows, columns)
+            first += rows * columns
+        return StateSpaceModel(dt=self.dt, **parts)
+
     def state_space(self) -> StateSpaceModel:
         """Return the model itself."""
         return self

@@ -183,17 +183,8 @@ def _differences(model: StateSpaceModel, omega: Array, fit: BlackBoxFit) -> Comp
     root = _root(fit.covariance, model.theta.size)
     root = root[:, np.linalg.norm(root, axis=0) > 0]
     moved = [
-        (_sampled(_with(model, _STEP * way), omega, fit.dt) - _sampled(_with(model, -_STEP * way), omega, fit.dt))
+        sum(sign * _sampled(model.with_theta(model.theta + sign * _STEP * way), omega, fit.dt) for sign in (1, -1))
         / (2 * _STEP)
         for way in root.T
     ]
     return np.stack(moved, axis=-1) if moved else np.zeros((omega.size, *model.D.shape, 0), dtype=np.complex128)
-
-
-def _with(model: StateSpaceModel, change: Array) -> StateSpaceModel:
-    parts, first = {}, 0
-    for name in "ABCDK":
-        own = getattr(model, name)
-        parts[name] = own + change[first : first + own.size].reshape(own.shape)
-        first += own.size
-    return replace(model, **parts)

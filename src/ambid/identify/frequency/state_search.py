@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.frequency.lines import Lines
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import StateSpace
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -43,7 +45,7 @@ def refined(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[float
     def at(v: Array) -> StateSpaceModel:
         theta = here.theta.copy()
         theta[free] = v
-        return _with(here, theta)
+        return here.with_theta(theta)
 
     def residual(v: Array) -> Array:
         return ln.whitened(at(v).frequency_response(ln.omega) - ln.G)
@@ -126,7 +128,7 @@ def continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpaceMod
     (StateSpaceModel, ndarray, shape (n_theta, n_theta)) or None
         None where no real continuous model exists.
     """
-    from scipy.linalg import expm, logm
+    from scipy.linalg import logm
 
     assert model.dt is not None
     n, n_u = model.B.shape
@@ -137,15 +139,11 @@ def continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpaceMod
     whole[:n, :n], whole[:n, n:], whole[n:, n:] = model.A, model.B, np.eye(n_u)
     log = np.real(logm(whole)) / model.dt
     found = StateSpaceModel(A=log[:n, :n], B=log[:n, n:], C=model.C, D=model.D, K=model.K / model.dt, dt=None)
-    # d(A_d, B_d) by d(A, B): upper right blocks of exp([[M, dM], [0, M]] T) (Mathias 1996)
-    size, used = n + n_u, n * (n + n_u)
-    stack = np.zeros((used, 2 * size, 2 * size))
-    stack[:, :size, :size] = stack[:, size:, size:] = log
-    for j in range(used):
-        row, column = (j // n, j % n) if j < n * n else ((j - n * n) // n_u, n + (j - n * n) % n_u)
-        stack[j, row, size + column] = 1.0
-    blocks = np.asarray(expm(stack * model.dt))[:, :n, size:]
-    forward = np.concatenate([blocks[:, :, :n].reshape(used, -1), blocks[:, :, n:].reshape(used, -1)], axis=1).T
+    used, none = n * (n + n_u), np.zeros((n, 0))
+    one_each = [(x[: n * n].reshape(n, n), x[n * n :].reshape(n, n_u)) for x in np.eye(used)]
+    directions = [StateSpace(A=dA, B=dB, E=none, C=model.C) for dA, dB in one_each]
+    _, slopes = discretise(StateSpace(A=found.A, B=found.B, E=none, C=model.C), model.dt, derivatives=directions)
+    forward = np.stack([np.concatenate([d.A.ravel(), d.B.ravel()]) for d in slopes], axis=1)
     M = np.eye(model.theta.size)
     M[:used, :used] = np.linalg.inv(forward)
     return found, M @ covariance @ M.T
@@ -157,15 +155,6 @@ def _free(model: StateSpaceModel, feedthrough: bool) -> NDArray[np.bool_]:
     free = np.zeros(model.theta.size, dtype=np.bool_)
     free[: n * (n + n_u + n_y) + (n_y * n_u if feedthrough else 0)] = True
     return free
-
-
-def _with(model: StateSpaceModel, theta: Array) -> StateSpaceModel:
-    edge, parts = 0, {}
-    for name in "ABCDK":
-        shape = getattr(model, name).shape
-        parts[name] = theta[edge : edge + shape[0] * shape[1]].reshape(shape)
-        edge += shape[0] * shape[1]
-    return StateSpaceModel(dt=model.dt, **parts)
 
 
 def _turned(model: StateSpaceModel, T: Array) -> StateSpaceModel:

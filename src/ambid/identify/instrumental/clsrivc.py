@@ -9,7 +9,6 @@ equivalent is nearest in the metric of its information. As sharp as a direct sea
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,15 @@ from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals, operating_point
 from ambid.identify.instrumental.cliv import in_loop
+from ambid.identify.instrumental.continuous import Numbers, companion
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression, score_covariance
 from ambid.identify.instrumental.reference import reference_part, wants_reference
 from ambid.identify.instrumental.srivc import TransferOrders, transfer_orders
 from ambid.identify.threads import one_thread
+from ambid.physics.discretise import zero_order_hold
 
 Array = NDArray[np.float64]
-Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
 
 _UNLIKELY = 1e-4  # probability under which the sampled estimate is not that of the continuous structure
 _TINY = 1e-20  # complex step
@@ -126,17 +126,12 @@ def sampled_coefficients(theta: Numbers, n: int, nb: tuple[int, ...], step: floa
     -------
     ndarray, shape (n + n of each input (one more with feedthrough),)
     """
-    from scipy.linalg import expm
-
     den = np.concatenate([[1.0], theta[:n][::-1]])
-    M = np.zeros((n + 1, n + 1), dtype=theta.dtype)
-    M[:n, :n] = _companion(den) * step
-    M[n - 1, n] = step
-    E = expm(M)
-    a = _characteristic(E[:n, :n])
-    states = [E[:n, n]]
+    E, first_state = zero_order_hold(companion(den), np.eye(n)[:, -1:], step)
+    a = _characteristic(E)
+    states = [first_state[:, 0]]
     for _ in range(n - 1):
-        states.append(E[:n, :n] @ states[-1])
+        states.append(E @ states[-1])
     out, first = [a[1:]], n
     for b in nb:
         num = np.zeros(n + 1, dtype=theta.dtype)
@@ -147,13 +142,6 @@ def sampled_coefficients(theta: Numbers, n: int, nb: tuple[int, ...], step: floa
         full = np.convolve(a, response)[: n + 1]
         out.append(full if b == n + 1 else full[1:])
     return np.concatenate(out)
-
-
-def _companion(den: Numbers) -> Numbers:
-    n = den.size - 1
-    out = np.eye(n, k=1, dtype=den.dtype)
-    out[-1] = -den[:0:-1]
-    return out
 
 
 def _characteristic(A: Numbers) -> Numbers:

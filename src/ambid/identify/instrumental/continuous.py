@@ -8,29 +8,32 @@ p^k/F(p) is state k of the companion form of F; its matrix exponential is exact 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.sensitivity import run
+from ambid.physics.discretise import zero_order_hold
 
 Array = NDArray[np.float64]
+Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
 
 
-def companion(den: Array) -> Array:
+def companion(den: Numbers) -> Numbers:
     """Return the companion matrix whose state k is p^k/F(p) times the input, shape (n, n).
 
     Parameters
     ----------
     den : ndarray, shape (n + 1,)
-        F, highest power first, monic.
+        F, highest power first, monic; complex for a complex step.
 
     Returns
     -------
     ndarray, shape (n, n)
     """
     n = den.size - 1
-    out = np.eye(n, k=1)
+    out = np.eye(n, k=1, dtype=den.dtype)
     out[-1:] = -den[:0:-1]
     return out
 
@@ -119,8 +122,6 @@ def responses(den: Array, num: Array, step: float, u: Array) -> Responses:
     -------
     Responses
     """
-    from scipy.linalg import expm
-
     n, n_u = den.size - 1, u.shape[1]
     size = n * (n_u + 1)
     A, B, F = np.zeros((size, size)), np.zeros((size, n_u)), companion(den)
@@ -131,9 +132,7 @@ def responses(den: Array, num: Array, step: float, u: Array) -> Responses:
         A[-1, i * n : (i + 1) * n] = c[i]
         B[-1, i] = num[i, 0]
     A[-n:, -n:] = F
-    M = np.zeros((size + n_u,) * 2)
-    M[:size, :size], M[:size, size:] = A * step, B * step
-    states = run(np.ascontiguousarray(expm(M)[:size]), u, np.zeros(size))[:-1]
+    states = run(np.hstack(zero_order_hold(A, B, step)), u, np.zeros(size))[:-1]
     of_inputs = states[:, :-n].reshape(-1, n_u, n)
     y = np.einsum("tik,ik->t", of_inputs, c) + u @ num[:, 0]
     return Responses(y=y, of_inputs=of_inputs, of_output=states[:, -n:])

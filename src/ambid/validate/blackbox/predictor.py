@@ -17,6 +17,7 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.response import one_step, simulation, stable
 from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.physics.discretise import zero_order_hold
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,6 @@ class Errors:
     one_step: Array
     simulation: Array | None
     claims_noise: bool
-
 
 
 def errors(fit: BlackBoxFit, data: IOData) -> Errors:
@@ -205,20 +205,9 @@ def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
     -------
     StateSpaceModel
     """
-    A, B = _held(model.A, np.hstack([model.B, model.K]), dt)
+    A, B = zero_order_hold(model.A, np.hstack([model.B, model.K]), dt)
     n_u = model.n_inputs
     return StateSpaceModel(A=A, B=B[:, :n_u], C=model.C, D=model.D, K=B[:, n_u:], dt=dt)
-
-
-def _held(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    """Return exp(A dt) and its integral times B."""
-    from scipy.linalg import expm
-
-    n, m = B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = A, B
-    full = expm(block * dt)
-    return np.asarray(full[:n, :n]), np.asarray(full[:n, n:])
 
 
 def held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
@@ -245,12 +234,12 @@ def held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
     first = n + np.concatenate([[0], np.cumsum(length)]).astype(int)
     size = int(first[-1])
     A, B, C, D = np.zeros((size, size)), np.zeros((size, n_u)), np.zeros((model.n_outputs, size)), plain.D.copy()
-    A[:n, :n] = _held(plain.A, plain.B, dt)[0]
+    A[:n, :n] = zero_order_hold(plain.A, plain.B, dt)[0]
     C[:, :n] = plain.C
     for i in range(n_u):
         column = plain.B[:, i : i + 1]
-        now = _held(plain.A, column, (1 - part[i]) * dt)
-        late = now[0] @ _held(plain.A, column, part[i] * dt)[1]
+        now = zero_order_hold(plain.A, column, (1 - part[i]) * dt)
+        late = now[0] @ zero_order_hold(plain.A, column, part[i] * dt)[1]
         # chain: place 0 holds u[k-1], place j holds u[k-1-j]
         chain = slice(int(first[i]), int(first[i + 1]))
         if length[i]:
