@@ -1,6 +1,9 @@
 """``ambid frf``: exit codes, one line for bad input, JSON, figure, and nothing left behind on failure."""
 
 import json
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,3 +196,44 @@ def test_the_rig_s_columns_may_have_other_names(folder, ambid, loop_text, rig_te
     assert found["outputs"] == ["position", "current"]
     assert abs(found["estimate"]["parameters"]["m"]["value"] - TRUTH["m"]) < 0.1
     assert "excitation" in read_record(folder / "other.csv").names
+
+
+def test_the_commands_of_the_page_run_one_by_one(tmp_path, monkeypatch, ambid):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "frequency.md").read_text(encoding="utf-8")
+    lines = re.search(r"^```sh\n(.*?)^```$", page, re.DOTALL | re.MULTILINE).group(1).splitlines()
+    said = [ambid(*shlex.split(line)[1:]) for line in lines]
+    assert [x.code for x in said] == [0] * len(lines)
+    assert all("✗" not in x.out for x in said)
+    assert all("biased towards" not in " ".join(x.out.split()) for x in said)
+    assert sum(line.endswith(" identified") for line in said[-1].out.splitlines()) == 5
+    # then the piece of Python that follows
+    names: dict[str, object] = {}
+    exec(re.search(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE).group(1), names)
+    assert names["found"].estimate.parameter("k_i").value == pytest.approx(TRUTH["k_i"], rel=0.02)
+
+
+def test_simulate_repeats_and_logs_the_excitation(tmp_path, monkeypatch, ambid):
+    monkeypatch.chdir(tmp_path)
+    words = (
+        "simulate",
+        "unstable-bearing",
+        "-o",
+        "a.csv",
+        "--duration",
+        "0.4",
+        "--amplitude",
+        "5",
+        "--band",
+        "10:1000",
+    )
+    assert ambid(*words, "--periods", "4", "--log-excitation").code == 0
+    excitation = read_record(tmp_path / "a.csv")["excitation"].reshape(4, -1)
+    assert np.array_equal(excitation, np.broadcast_to(excitation[0], excitation.shape))
+    assert np.abs(excitation).max() == pytest.approx(5.0)
+    refused = ambid(*words, "--periods", "7", "-o", "b.csv")
+    assert refused.code == 2
+    assert "--periods" in refused.err
+    assert not (tmp_path / "b.csv").exists()
+    assert ambid(*words).code == 0
+    assert "excitation" not in read_record(tmp_path / "a.csv").names

@@ -10,7 +10,7 @@ import typer
 def command() -> None:
     """List models with their parameters and units, black-box structures, excitations and preset benches."""
     from ambid.cli.terminal import painter
-    from ambid.identify.blackbox.structures import STRUCTURES
+    from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
@@ -34,6 +34,10 @@ def command() -> None:
     wide = max(map(len, left)) + 2
     for start, x in zip(left, STRUCTURES.values(), strict=True):
         typer.echo(textwrap.fill(x.summary, 80, initial_indent=start.ljust(wide), subsequent_indent=" " * wide))
+    typer.echo(f"\n{paint('structures from a frequency response', 'strong')}  for 'ambid frf'")
+    for x in RESPONSE_STRUCTURES.values():
+        start = f"  {x.name.ljust(14)}{' '.join(x.orders)}  "
+        typer.echo(textwrap.fill(x.summary, 80, initial_indent=start, subsequent_indent=" " * len(start)))
     typer.echo()
     typer.echo(f"{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
     typer.echo(f"{paint('presets', 'strong')}  benches for 'ambid simulate'")

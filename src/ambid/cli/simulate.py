@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -63,6 +64,13 @@ def command(
             show_default="one period to a fifth of the rate",
         ),
     ] = None,
+    periods: Annotated[
+        int, typer.Option("--periods", metavar="N", help="How often the excitation repeats, for 'ambid frf'.", min=1)
+    ] = 1,
+    log_excitation: Annotated[
+        bool,
+        typer.Option("--log-excitation", help="A column 'excitation' too: the reference that 'ambid frf' wants."),
+    ] = False,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and noise.", min=0)] = 0,
     loop: Annotated[
         Literal["open", "closed"] | None,
@@ -73,7 +81,7 @@ def command(
     ] = False,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records."""
-    from ambid.record import write_record
+    from ambid.record import Channel, write_record
     from ambid.signals import excitation as make_excitation
 
     preset = _preset(rig)
@@ -86,9 +94,16 @@ def command(
             else _of_rig(Path(rig), rate, seed, closed, nonlinear)
         )
         n = _samples(duration, rate_hz)
-        shape = make_excitation(excitation, n, rate_hz, amplitude=1.0, band=_band(band), seed=seed)
+        shape = _repeated(
+            lambda part: make_excitation(excitation, part, rate_hz, amplitude=1.0, band=_band(band), seed=seed),
+            n,
+            periods,
+        )
         size = _largest(respond, shape, limits, point) if amplitude is None else amplitude
         done = respond(size * shape)
+        if log_excitation:
+            logged = Channel(name="excitation", unit="V", values=size * shape)
+            done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
         comments = () if record.suffix in (".h5", ".hdf5") else _comments(rig, excitation, size, band, seed, done)
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
     for warning in done.warnings:
@@ -149,6 +164,15 @@ def _samples(duration: float, rate_hz: float) -> int:
             f"--duration {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
         )
     return round(count)
+
+
+def _repeated(make: Callable[[int], Array], n: int, periods: int) -> Array:
+    """Lay equal periods one behind the other."""
+    import numpy as np
+
+    if n % periods:
+        raise AmbidError(f"--periods {periods}: {n} samples are no whole number each. Change --duration or --periods")
+    return np.tile(make(n // periods), periods)
 
 
 def _band(text: str | None) -> tuple[float, float] | None:

@@ -15,7 +15,7 @@ from ambid.identify.blackbox.structures import any_structure
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.frequency.measured import Measured
 from ambid.report.fit_text import coefficient_lines, pole_lines
-from ambid.report.numbers import prefixed, sized
+from ambid.report.numbers import prefixed, quantity, sized
 from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain
 from ambid.units import UNKNOWN
 
@@ -221,8 +221,8 @@ def _delay_lines(fit: BlackBoxFit) -> list[str]:
     if not delay and sd is None:
         return []
     value = float(str(delay))
-    spread = "" if sd is None else f" ± {sized(float(str(sd)), 's', 2)}"
-    return [f"delay {sized(value, 's', 4)}{spread} ({value / fit.dt:.3f} samples)"]
+    text = quantity(value, 0.0 if sd is None else float(str(sd)), "s").text
+    return [f"delay {text} ({value / fit.dt:.4g} samples)"]
 
 
 def _laguerre_lines(fit: BlackBoxFit, width: int) -> list[str]:
@@ -251,7 +251,7 @@ def _estimate_lines(estimate: FrequencyEstimate, width: int, paint: Paint) -> li
 
 
 def warnings_of(measured: Measured) -> list[str]:
-    """Return all warnings, each once, without those that only repeat a failed check.
+    """Return all warnings, each once, without what only repeats a failed check.
 
     Parameters
     ----------
@@ -263,12 +263,17 @@ def warnings_of(measured: Measured) -> list[str]:
         Those of the response first, as all that follows rests on it.
     """
     found = [*measured.response.warnings]
-    said = set()
     for x in (measured.fit, measured.estimate):
-        if x is not None:
-            found += x.warnings
-            said |= {f"{name}: {c.detail}" for name, c in x.checks.items()}
-    return [w for w in dict.fromkeys(found) if w not in said]
+        if x is None:
+            continue
+        said = [c.detail for c in x.checks.values() if not c.passed]
+        for whole in x.warnings:
+            warning = whole
+            for detail in said:  # it stands with the checks
+                warning = warning.replace(f"{detail}; ", "")
+            if not warning.endswith(tuple(said)):
+                found.append(warning)
+    return list(dict.fromkeys(found))
 
 
 def _warning_lines(measured: Measured, width: int, paint: Paint) -> list[str]:
