@@ -20,7 +20,11 @@ def one_thread() -> Iterator[None]:
     ------
     None
     """
-    with _controller().limit(limits=1, user_api="blas"):
+    libraries = _controller()
+    if all(x.num_threads == 1 for x in libraries.lib_controllers if x.user_api == "blas"):
+        yield  # so already, from the environment or a caller: setting it would take longer than a small fit's algebra
+        return
+    with libraries.limit(limits=1, user_api="blas"):
         yield
 
 

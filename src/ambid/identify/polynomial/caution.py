@@ -85,24 +85,28 @@ def unstable_plant(layouts: Sequence[Layout], scaled: Scaled) -> list[str]:
 
 
 def _roots(model: PolynomialModel, o: int) -> dict[str, tuple[Complex, Complex]]:
-    """Roots of each polynomial of one output, with their derivatives by all coefficients."""
-    theta, several, out = model.theta, model.n_inputs > 1, {}
-    n_c = model.outputs[o].C.size
+    """Roots of those polynomials of one output that have a partner or a border, with derivatives by all coefficients.
+
+    B is looked at beside F or A and C, A and D beside C alone; there may be hundreds of roots that need no look.
+    """
+    p, several, out = model.outputs[o], model.n_inputs > 1, {}
+    if p.C.size == 1 and all(f.size == 1 for f in p.F):
+        return {}
+    theta, noisy = model.theta, p.C.size > 1
     for output, letter, i, place in model.blocks():
         if output != o or not np.any(theta[place]):
             continue
-        if letter == "B" and not (model.outputs[o].F[i or 0].size > 1 or min(model.outputs[o].A.size, n_c) > 1):
-            continue  # nothing that it could cancel, and there may be hundreds
+        if letter in "AD" and not noisy:
+            continue
+        if letter == "B" and not (p.F[i or 0].size > 1 or (noisy and p.A.size > 1)):
+            continue
         out[letter + (f".{i}" if several and i is not None else "")] = roots_at(theta, place)
     return out
 
 
 def _blind(model: PolynomialModel, o: int, fit: Fitted) -> Iterator[str]:
-    R = fit.triangle
-    if not R.size:
-        return
-    _, s, Vt = np.linalg.svd(R / np.maximum(np.linalg.norm(R, axis=0), 1e-300))
-    if s[-1] * BLIND >= s[0]:
+    _, s, Vt, _ = fit.directions
+    if not s.size or s[-1] * BLIND >= s[0]:
         return
     names = [name for name, place in _free_names(model, o, fit)]
     large = np.abs(Vt[-1]) > 0.3 * np.max(np.abs(Vt[-1]))
@@ -121,13 +125,15 @@ def _free_names(model: PolynomialModel, o: int, fit: Fitted) -> Iterator[tuple[s
 
 def _cancelling(roots: dict[str, tuple[Complex, Complex]], covariance: Array) -> Iterator[str]:
     """Name roots that numerator and denominator share within their uncertainty."""
+    if not roots:
+        return
     nothing = (np.empty(0, dtype=np.complex128), np.empty((0, covariance.shape[0]), dtype=np.complex128))
     numerators = [x for x in roots if x.startswith("B")]
     for b in numerators:
         f = b.replace("B", "F")
         for r in _common(roots[b], roots.get(f, nothing), covariance):
             yield f"a zero of {b} and a pole of {f} near {_shown(r)} cancel within their uncertainty. Lower nb and nf"
-    for r in _common(roots["C"], roots["D"], covariance):
+    for r in _common(roots["C"], roots.get("D", nothing), covariance):
         yield f"roots of C and D near {_shown(r)} cancel within their uncertainty. Lower nc and nd"
     if roots["C"][0].size and roots["A"][0].size:
         shared = [_common(roots["A"], roots[x], covariance) for x in ("C", *numerators)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -34,6 +34,10 @@ class Layout:
         Places of coefficients that the user fixed.
     at_rest : bool
         Everything was zero before the first sample: no initial states, no constant, and all samples count.
+    places : Mapping[tuple, slice]
+        Where each polynomial stands among all coefficients, in the order of `PolynomialModel.theta`.
+    free : ndarray, shape (n_free,)
+        Places of the estimated coefficients.
     """
 
     na: int
@@ -44,16 +48,17 @@ class Layout:
     nk: tuple[int, ...]
     fixed: tuple[int, ...] = ()
     at_rest: bool = False
+    places: Mapping[Key, slice] = field(init=False, repr=False, compare=False)
+    free: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "places", _places(self))
+        object.__setattr__(self, "free", _free(self))
 
     @property
     def n_inputs(self) -> int:
         """Number of inputs."""
         return len(self.nb)
-
-    @property
-    def places(self) -> dict[Key, slice]:
-        """Where each polynomial stands among all coefficients, in the order of `PolynomialModel.theta`."""
-        return _places(self)
 
     @property
     def n_theta(self) -> int:
@@ -82,11 +87,6 @@ class Layout:
         place = self.places[key]
         first = self.nk[key[1]] if key[0] == "B" and key[1] is not None else 1
         return tuple(k for k in range(first, place.stop - place.start) if place.start + k not in self.fixed)
-
-    @property
-    def free(self) -> NDArray[np.int64]:
-        """Places of the estimated coefficients, shape (n_free,)."""
-        return _free(self)
 
     def start(self) -> Array:
         """Return coefficients of a model that is zero: leading ones alone, shape (n_theta,)."""
@@ -117,7 +117,6 @@ class Layout:
         )
 
 
-@lru_cache(maxsize=256)
 def _places(layout: Layout) -> dict[Key, slice]:
     sizes: list[tuple[Key, int]] = [(("A", None), layout.na + 1)]
     sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(layout.nb, layout.nk, strict=True))]
@@ -130,7 +129,6 @@ def _places(layout: Layout) -> dict[Key, slice]:
     return out
 
 
-@lru_cache(maxsize=256)
 def _free(layout: Layout) -> NDArray[np.int64]:
     lags = [p.start + k for key, p in layout.places.items() for k in layout.free_lags(key)]
     out = np.array(lags, dtype=np.int64)
@@ -197,9 +195,14 @@ def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int,
         value = orders.get(key)
         return value if isinstance(value, tuple) else (0,) * n_inputs
 
-    return Layout(
-        na=one("na"), nb=each("nb"), nc=one("nc"), nd=one("nd"), nf=each("nf"), nk=each("nk"), at_rest=at_rest
-    )  # fixed: see `fixed_places`
+    return _layout(one("na"), each("nb"), one("nc"), one("nd"), each("nf"), each("nk"), at_rest)
+
+
+@lru_cache(maxsize=256)
+def _layout(
+    na: int, nb: tuple[int, ...], nc: int, nd: int, nf: tuple[int, ...], nk: tuple[int, ...], at_rest: bool
+) -> Layout:
+    return Layout(na=na, nb=nb, nc=nc, nd=nd, nf=nf, nk=nk, at_rest=at_rest)  # fixed: see `fixed_places`
 
 
 def shown_orders(name: str, layout: Layout) -> UsedOrders:

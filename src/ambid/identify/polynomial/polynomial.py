@@ -70,7 +70,7 @@ def estimate(
     with one_thread():
         layouts = _layouts(name, read, scaled, 0 if data.open_loop else 1, tick)
         known = fixed_places(name, tuple(layouts), {} if fixed is None else fixed)
-        layouts = [replace(x, fixed=tuple(k)) for x, k in zip(layouts, known, strict=True)]
+        layouts = [replace(x, fixed=tuple(k)) if k else x for x, k in zip(layouts, known, strict=True)]
         fits = [fit_output(name, x, scaled, o, known[o], tick) for o, x in enumerate(layouts)]
         return result(name, data, scaled, layouts, fits, estimated_delay="nk" in read and read["nk"] is None)
 

@@ -62,7 +62,7 @@ def result(
     )
     noise, covariance = _covariances(scaled, layouts, fits)
     worth = np.concatenate(units)
-    covariance *= np.outer(worth, worth)
+    covariance *= worth[:, None] * worth
     warnings = cautions(model, covariance, fits)
     if any(layouts[0].nf) and not data.open_loop:
         warnings += unstable_plant(layouts, scaled)
@@ -72,7 +72,7 @@ def result(
         warnings.append(f"the delay was looked for up to {LARGEST_DELAY} samples and may be longer: give nk")
     details: dict[str, object] = {
         "iterations": [f.iterations for f in fits],
-        "condition": [_condition(f.triangle) for f in fits],
+        "condition": [_condition(f) for f in fits],
     }
     if scaled.at_rest:
         details["at_rest"] = True
@@ -93,11 +93,11 @@ def result(
     )
 
 
-def _condition(R: Array) -> float:
+def _condition(fit: Fitted) -> float:
     """Condition number of the gradients with columns of unit length."""
-    if not R.size:
+    s = fit.directions[1]
+    if not s.size:
         return 1.0
-    s = np.linalg.svd(R / np.maximum(np.linalg.norm(R, axis=0), 1e-300), compute_uv=False)
     return float(min(s[0] / max(s[-1], 1e-300), 1e300))
 
 
@@ -109,12 +109,14 @@ def _inverse(R: Array) -> Array:
 
 def _spread(fit: Fitted, variance: float) -> Array:
     """Covariance; as large as the coefficients themselves along directions that the data do not see."""
-    scale, _, s, Vt = _singular(fit.triangle)
+    _, s, Vt, scale = fit.directions
+    s = np.maximum(s, _LEAST_SEEN * max(float(s[0]) if s.size else 1.0, 1e-150))
     directions = Vt.T / scale[:, None]
     length = np.sqrt(variance) / s
     blind = s * BLIND < (s[0] if s.size else 0.0)
-    whole = max(1.0, float(np.linalg.norm(fit.theta[fit.free])))
-    length[blind] = np.maximum(length[blind], whole / np.linalg.norm(directions[:, blind], axis=0))
+    if blind.any():
+        whole = max(1.0, float(np.linalg.norm(fit.theta[fit.free])))
+        length[blind] = np.maximum(length[blind], whole / np.linalg.norm(directions[:, blind], axis=0))
     sides = directions * length
     return np.asarray(sides @ sides.T)
 
@@ -136,7 +138,7 @@ def _covariances(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitte
     places = [int(first) + x.free for first, x in zip(firsts, layouts, strict=False)]
     covariance = np.zeros((n, n))
     for o, fit in enumerate(fits):
-        covariance[np.ix_(places[o], places[o])] = _spread(fit, noise[o, o])
+        covariance[places[o][:, None], places[o]] = _spread(fit, noise[o, o])
     for o in range(len(fits)):
         for k in range(o):
             products, errors = _shared(scaled, layouts, fits, o, k)
@@ -178,11 +180,12 @@ def _offsets(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitted]) 
     n_u = scaled.u.shape[0]
     y, rows, right = np.zeros(len(fits)), [], []
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
-        p = x.polynomials(f.theta)
-        constant, level = float(f.nuisance[-1]) if f.nuisance.size else 0.0, float(np.sum(p.A))
+        constant = float(f.nuisance[-1]) if f.nuisance.size else 0.0
+        level = float(f.theta[x.places["A", None]].sum())
         if abs(constant) <= _FAR * abs(level):
             y[o] = constant / level
         elif n_u:
+            p = x.polynomials(f.theta)
             rows.append([-np.sum(b) / np.sum(a) for b, a in zip(p.B, p.F, strict=True)])
             right.append(constant)
     u = np.linalg.lstsq(np.array(rows), np.array(right), rcond=1e-10)[0] if rows else np.zeros(n_u)
@@ -190,5 +193,5 @@ def _offsets(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitted]) 
         if rows and y[o]:  # the shifted input moves the other outputs too
             p = x.polynomials(f.theta)
             gain = np.array([np.sum(b) / np.sum(a) for b, a in zip(p.B, p.F, strict=True)])
-            y[o] += float(gain @ u) / float(np.sum(p.A))
+            y[o] += float(gain @ u) / float(p.A.sum())
     return Offsets(u=scaled.u_mean + scaled.u_scale * u, y=scaled.y_mean + scaled.y_scale * y)

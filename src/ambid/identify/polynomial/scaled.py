@@ -60,15 +60,16 @@ def scaled_data(name: str, data: IOData, *, at_rest: bool = False) -> Scaled:
     out = []
     for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
         mean = np.zeros(len(names)) if at_rest else np.mean(values, axis=0)
-        centred = np.ascontiguousarray((values - mean).T)
-        scale = np.sqrt(np.mean(centred**2, axis=1)) if values.size else np.ones(0)
+        centred = np.subtract(values.T, mean[:, None], order="C")
+        scale = np.sqrt(np.array([x @ x for x in centred]) / max(values.shape[0], 1))
         for k, channel in enumerate(names):
-            if not scale[k] > 1e-13 * np.max(np.abs(values[:, k])):
+            if not scale[k] > 1e-13 * abs(mean[k]):
                 raise EstimationError(
                     f"{name}: {channel!r} does not move (constant at {values[0, k]:g}); nothing can be learnt from it. "
                     "Excite it, or leave it out"
                 )
-        out.append((np.asarray(centred / scale[:, None]), mean, scale))
+        centred /= scale[:, None]
+        out.append((centred, mean, scale))
     (u, u_mean, u_scale), (y, y_mean, y_scale) = out
     return Scaled(u=u, y=y, u_mean=u_mean, u_scale=u_scale, y_mean=y_mean, y_scale=y_scale, at_rest=at_rest)
 

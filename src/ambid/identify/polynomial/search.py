@@ -18,6 +18,7 @@ from ambid.identify.polynomial.predictor import Predictor
 from ambid.identify.polynomial.stability import solved, stable_predictor
 
 Array = NDArray[np.float64]
+Directions = tuple[Array, Array, Array, Array]
 
 _ENOUGH = 1e-6  # squared length of the last step in standard deviations
 _NOTHING_LEFT = 1e-24  # squared residual over squared output where the data are matched to rounding
@@ -40,6 +41,8 @@ class Fitted:
         Initial states and constant.
     triangle : ndarray, shape (n_free, n_free)
         R of the free coefficients, nuisance taken out.
+    directions : tuple of ndarray
+        U, s, Vt and column lengths: `triangle` with columns of unit length is U diag(s) Vt.
     cost : float
         Squared residual.
     n_rows : int
@@ -53,6 +56,7 @@ class Fitted:
     free: NDArray[np.int64]
     nuisance: Array
     triangle: Array
+    directions: Directions
     cost: float
     n_rows: int
     converged: bool
@@ -124,7 +128,8 @@ def searched(
         at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
     damping, converged, shortened, exact, count = 0.0, False, False, False, 1
     while True:
-        U, s, Vt, scale = _directions(at, n)
+        directions = _directions(at, n)
+        U, s, Vt, scale = _seen(*directions)
         spread = max(at.rest / max(n_rows - n - free.size, 1), 1e-300)
         left = float(np.sum((U.T @ at.gradient) ** 2))
         step = _step(U, s, Vt, scale, at.gradient, 0.0)
@@ -157,6 +162,7 @@ def searched(
         free=free,
         nuisance=at.nuisance,
         triangle=at.R[n:-1, n:-1],
+        directions=directions,
         cost=at.cost,
         n_rows=n_rows,
         converged=converged,
@@ -170,13 +176,18 @@ def _linear(predictor: Predictor) -> bool:
     return not (x.nc or x.nd or any(x.nf))
 
 
-def _directions(at: _Point, n: int) -> tuple[Array, Array, Array, Array]:
-    """Singular directions of the scaled triangle; those that the data do not see are left out."""
+def _directions(at: _Point, n: int) -> Directions:
+    """Singular directions of the scaled triangle."""
     R = at.R[n:-1, n:-1]
-    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-300)
+    scale = np.maximum(np.sqrt(np.einsum("ij,ij->j", R, R)), 1e-150)
     U, s, Vt = np.linalg.svd(R / scale)
+    return U, s, Vt, scale
+
+
+def _seen(U: Array, s: Array, Vt: Array, scale: Array) -> Directions:
+    """Those directions that the data see."""
     seen = s > _UNSEEN * max(s[0] if s.size else 0.0, 1e-300)
-    return U[:, seen], s[seen], Vt[seen], scale
+    return (U, s, Vt, scale) if seen.all() else (U[:, seen], s[seen], Vt[seen], scale)
 
 
 def _step(U: Array, s: Array, Vt: Array, scale: Array, gradient: Array, damping: float) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtrs
 
 from ambid.identify.blackbox.roots import stable
 from ambid.identify.polynomial.orders import Layout
@@ -45,6 +46,6 @@ def solved(R: Array, right: Array) -> Array:
     scale = np.sqrt(np.einsum("ij,ij->j", R, R))
     scale[scale == 0.0] = 1.0
     S = R / scale
-    diagonal = np.abs(S.diagonal())
-    x = np.linalg.solve(S, right) if np.min(diagonal) > 1e-8 else np.linalg.lstsq(S, right, rcond=1e-10)[0]
+    # back substitution by LAPACK itself: numpy's solve would factorise the triangle again
+    x = dtrtrs(S, right)[0] if np.abs(S.diagonal()).min() > 1e-8 else np.linalg.lstsq(S, right, rcond=1e-10)[0]
     return np.asarray((x.T / scale).T)
