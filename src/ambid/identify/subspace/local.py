@@ -52,6 +52,35 @@ def tangent(model: StateSpaceModel, *, feedthrough: bool) -> Array:
     return out
 
 
+def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
+    """Return directions along which the predictions are linear: inputs and outputs enter a predictor that stays.
+
+    With F = A - K C and C held, they are linear in K and in B - K D (and in D).
+
+    Parameters
+    ----------
+    model : StateSpaceModel
+    feedthrough : bool
+        Whether D moves.
+
+    Returns
+    -------
+    ndarray, shape (n_theta, n (n_inputs + n_outputs) [+ n_outputs n_inputs])
+    """
+    m, n, n_u, n_y = model, model.order, model.n_inputs, model.n_outputs
+    ends = np.cumsum([0, n * n, n * n_u, n_y * n, n_y * n_u, n * n_y])
+    by_b, by_k = n * n_u, n * n_y
+    out = np.zeros((m.theta.size, by_b + by_k + (n_y * n_u if feedthrough else 0)))
+    out[ends[1] : ends[2], :by_b] = np.eye(by_b)
+    out[ends[4] : ends[5], by_b : by_b + by_k] = np.eye(by_k)
+    out[: ends[1], by_b : by_b + by_k] = np.kron(np.eye(n), m.C.T)  # dA = dK C
+    out[ends[1] : ends[2], by_b : by_b + by_k] = np.kron(np.eye(n), m.D.T)  # dB = dK D
+    if feedthrough:
+        out[ends[3] : ends[4], by_b + by_k :] = np.eye(n_y * n_u)
+        out[ends[1] : ends[2], by_b + by_k :] = np.kron(m.K, np.eye(n_u))  # dB = K dD
+    return out
+
+
 def moved(model: StateSpaceModel, change: Array) -> StateSpaceModel:
     """Return the model with its coefficients changed.
 

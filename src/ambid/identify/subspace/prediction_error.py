@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dtpqrt
 from ambid.identify._kernels import state_scan
 from ambid.identify.blackbox.gradient import Sensitivities
 from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.subspace.local import balanced, moved, tangent
+from ambid.identify.subspace.local import balanced, linear, moved, tangent
 from ambid.identify.subspace.realisation import radius
 
 Array = NDArray[np.float64]
@@ -104,11 +104,7 @@ def started(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Point |
         return None
     n, n_y = model.order, model.n_outputs
     rough = Point(model=model, x0=np.zeros(n), constant=np.zeros(n_y), noise=noise, cost=np.inf)
-    factor = _reduced(rough, np.zeros((model.theta.size, 0)), u, y)
-    change = np.asarray(
-        np.linalg.lstsq(factor[: n + n_y, :-1], factor[: n + n_y, -1], rcond=1e-10)[0], dtype=np.float64
-    )
-    return _judged(model, change[:n], change[n:], u, y)
+    return _settled(rough, np.zeros((model.theta.size, 0)), u, y)
 
 
 def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick = None) -> Found:
@@ -141,7 +137,7 @@ def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick 
         promise = float(np.sum(factor[:-1, -1] ** 2))
         better = None
         if promise > _NEAR and iterations < _STEPS:
-            better, damping = _step(point, ways, factor, damping, u, y)
+            better, damping = _step(point, ways, factor, damping, u, y, feedthrough=feedthrough)
         if better is None:
             break
         point, iterations = better, iterations + 1
@@ -156,7 +152,9 @@ def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick 
     )
 
 
-def _step(point: Point, ways: Array, factor: Array, damping: float, u: Array, y: Array) -> tuple[Point | None, float]:
+def _step(
+    point: Point, ways: Array, factor: Array, damping: float, u: Array, y: Array, *, feedthrough: bool
+) -> tuple[Point | None, float]:
     """Find a better point: more damping after failure, a shorter step where the predictor gets unstable."""
     n, k = point.model.order, point.model.order + point.model.n_outputs
     size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
@@ -173,7 +171,10 @@ def _step(point: Point, ways: Array, factor: Array, damping: float, u: Array, y:
             model = moved(point.model, ways @ (part * change[k:]))
         trial = None
         if part > _SHORTEST:
-            trial = _judged(model, point.x0 + part * change[:n], point.constant + part * change[n:k], u, y)
+            near = replace(
+                point, model=model, x0=point.x0 + part * change[:n], constant=point.constant + part * change[n:k]
+            )
+            trial = _settled(near, linear(model, feedthrough=feedthrough), u, y)
         left = right - part * rows @ scaled
         promised = float(right @ right - left @ left)
         if trial is not None and point.cost - trial.cost > 1e-3 * promised > 0:
@@ -181,6 +182,19 @@ def _step(point: Point, ways: Array, factor: Array, damping: float, u: Array, y:
             return trial, max(damping / 20, 1e-14) if good else damping
         damping = max(damping, 1e-10) * 8
     return None, damping
+
+
+def _settled(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
+    """Solve for all that the predictions are linear in: the valley of poles that zeros nearly cancel gets straight."""
+    n, k = rough.model.order, rough.model.order + rough.model.n_outputs
+    factor = _reduced(rough, ways, u, y)
+    if not np.all(np.isfinite(factor)):
+        return None
+    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
+    solved = np.linalg.lstsq(factor[:-1, :-1] / size, factor[:-1, -1], rcond=1e-10)[0]
+    change = np.asarray(solved / size, dtype=np.float64)
+    model = moved(rough.model, ways @ change[k:])
+    return _judged(model, rough.x0 + change[:n], rough.constant + change[n:k], u, y)
 
 
 def _judged(model: StateSpaceModel, x0: Array, constant: Array, u: Array, y: Array) -> Point | None:
