@@ -155,6 +155,7 @@ REFUSED = {
     "a delay of nothing": ((*SIGNALS, *REFERENCE, "--delay", "1e-4"), "--delay"),
     "a delay that is to be found": ((*SIGNALS, *REFERENCE, "--state-space", "3", "--delay", "auto"), "--delay"),
     "a domain of nothing": ((*SIGNALS, *REFERENCE, "--domain", "z"), "--domain"),
+    "a direct path of nothing": ((*SIGNALS, *REFERENCE, "--orders", "nf=2", "--feedthrough"), "--feedthrough"),
     "half a band": ((*SIGNALS, *REFERENCE, "--band", "5"), "--band"),
     "a band upside down": ((*SIGNALS, *REFERENCE, "--band", "50:5"), "--band"),
     "a band without lines": ((*SIGNALS, *REFERENCE, "--band", "9000:9100"), "band"),

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import freqz, lfilter
 
 from ambid.errors import EstimationError
 from ambid.identify.frequency.measured import model_responses
 from ambid.job import frf
 from ambid.physics.presets import preset
-from ambid.record import write_record
+from ambid.record import Channel, Record, write_record
 from ambid.rig import default_rig
 from tests.job.loops import loop_record, odd_record
 
@@ -113,6 +114,25 @@ def test_an_operating_point_is_the_records_and_a_response_does_not_claim_it(reco
     found = frf(record, **BOTH, orders={"nf": 4})
     assert found.fit.offsets.y == pytest.approx([record["position"].mean(), record["current"].mean()])
     assert "do not" in found.fit.details["offsets"] or "does not" in found.fit.details["offsets"]
+
+
+def test_several_inputs_and_a_direct_path_in_open_loop():
+    rng, n, a = np.random.default_rng(1), 6000, [1.0, -1.6, 0.8]
+    b = (([0.0, 0.5], [0.0, 0.2, 0.1]), ([0.3, 0.1], [0.0, 0.4]))
+    u = rng.normal(size=(n, 2))
+    y = np.stack([sum(lfilter(f, a, x) for f, x in zip(row, u.T, strict=True)) for row in b], axis=1)
+    y += 0.05 * rng.normal(size=(n, 2))
+    columns = {"u1": u[:, 0], "u2": u[:, 1], "y1": y[:, 0], "y2": y[:, 1]}
+    made = Record(rate_hz=1000.0, channels=tuple(Channel(name=k, unit="V", values=v) for k, v in columns.items()))
+    found = frf(made, inputs=["u1", "u2"], outputs=["y1", "y2"], open_loop=True, method="random",
+                state_space=4, feedthrough=True, domain="z")  # fmt: skip
+    assert found.response.method.startswith("H1")
+    assert pytest.approx(np.array([[0.0, 0.0], [0.3, 0.0]]), abs=0.01) == found.fit.model.D
+    w = np.linspace(0.02, 0.45, 30)
+    (m,) = model_responses(found, 1000.0 * w)
+    for j, k in np.ndindex(2, 2):
+        truth = freqz(b[j][k], a, 2 * np.pi * w)[1]
+        assert np.max(np.abs(m.G[:, j, k] - truth)) < 0.02 * np.max(np.abs(truth))
 
 
 def test_a_constant_reference_is_refused(record):

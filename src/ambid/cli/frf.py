@@ -60,6 +60,9 @@ def command(
             show_default=False,
         ),
     ] = None,
+    feedthrough: Annotated[
+        bool, typer.Option("--feedthrough", help="With --state-space: a direct path from input to output (D).")
+    ] = False,
     domain: Annotated[
         Literal["s", "z"] | None,
         typer.Option(
@@ -114,6 +117,7 @@ def command(
                 band=between,
                 orders=wanted,
                 state_space=n,
+                feedthrough=feedthrough,
                 domain=domain,
                 delay=late,
                 rig=rig,

@@ -43,6 +43,7 @@ def frf(
     band: tuple[float, float] | None = None,
     orders: Orders | None = None,
     state_space: int | Literal["auto"] | None = None,
+    feedthrough: bool = False,
     domain: Literal["s", "z"] | None = None,
     delay: Delay | None = None,
     rig: Rig | str | Path | None = None,
@@ -74,6 +75,8 @@ def frf(
         ``nf`` and ``nb`` of transfer functions, fitted by maximum likelihood.
     state_space : int or "auto", optional
         Order of a state space, fitted by subspace with the Laguerre operator. Not together with `orders`.
+    feedthrough : bool, optional
+        Whether that state space has a direct path D; in z, one within a sample.
     domain : {"s", "z"}, optional
         Of that model; default z for transfer functions of a held input, else s.
     delay : float or "auto", s, optional
@@ -102,7 +105,7 @@ def frf(
         If the response cannot be measured, or a model not be fitted to it.
     """
     say = tick or _silent
-    _agree(orders, state_space, domain, delay, rig)
+    _agree(orders, state_space, feedthrough, domain, delay, rig)
     laps, last = dict[str, float](), time.perf_counter()
     rig = load_rig(rig) if isinstance(rig, str | Path) else rig
     part = (from_s, to_s)
@@ -122,7 +125,7 @@ def frf(
     estimate: FrequencyEstimate | None = None
     if orders is not None or state_space is not None:
         say("fit")
-        found = _fitted(response, data, orders, state_space, domain, 0.0 if delay is None else delay)
+        found = _fitted(response, data, orders, state_space, feedthrough, domain, 0.0 if delay is None else delay)
         laps["fit"], last = time.perf_counter() - last, time.perf_counter()
     if rig is not None:
         say("identify")
@@ -139,7 +142,14 @@ def frf(
     )
 
 
-def _agree(orders: object, state_space: int | str | None, domain: str | None, delay: Delay | None, rig: object) -> None:
+def _agree(
+    orders: object,
+    state_space: int | str | None,
+    feedthrough: bool,
+    domain: str | None,
+    delay: Delay | None,
+    rig: object,
+) -> None:
     """Refuse what contradicts itself before the record is read."""
     if orders is not None and state_space is not None:
         raise EstimationError(
@@ -149,6 +159,8 @@ def _agree(orders: object, state_space: int | str | None, domain: str | None, de
         raise EstimationError(f"a state space of order {state_space}; it must be at least 1, or 'auto'. Correct it")
     if orders is None and state_space is None and domain is not None:
         raise EstimationError("--domain is for --orders and --state-space; neither is given. Leave it out")
+    if feedthrough and state_space is None:
+        raise EstimationError("--feedthrough is for --state-space (--orders has it with nb = nf + 1). Leave it out")
     if state_space is not None and delay == "auto":
         raise EstimationError(
             "a state space takes a delay that is known, not 'auto'. Give --delay S; --orders or --rig can find it"
@@ -246,6 +258,7 @@ def _fitted(
     data: IOData,
     orders: Orders | None,
     state_space: int | Literal["auto"] | None,
+    feedthrough: bool,
     domain: Literal["s", "z"] | None,
     delay: Delay,
 ) -> BlackBoxFit:
@@ -258,7 +271,7 @@ def _fitted(
     else:
         assert state_space is not None
         assert delay != "auto"
-        found = frf_subspace(response, {"n": state_space}, domain=domain or "s", delay=delay)
+        found = frf_subspace(response, {"n": state_space}, domain=domain or "s", delay=delay, feedthrough=feedthrough)
     return replace(
         found,
         offsets=Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0)),
