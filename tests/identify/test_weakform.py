@@ -1,5 +1,7 @@
 """Weak form: integrals without differentiation, no bias from noise in the regressors, intervals that hold."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -104,6 +106,25 @@ def test_no_bias_and_honest_intervals(name):
     z = np.array(z)
     assert np.all(np.abs(z.mean(axis=0)) < 3.5 / np.sqrt(runs))  # bias under half a standard deviation
     assert np.all(np.abs(np.mean(np.abs(z) < 1.96, axis=0) - 0.95) < 0.085)
+
+
+@pytest.mark.parametrize(
+    ("num", "den"),
+    [([4000.0], [1.0, 14.0, 140.0, 1000.0]), ([200.0], [1.0, 4.0, 100.0]), ([40.0, 400.0], [1.0, 4.0, 100.0])],
+)
+def test_records_of_little_noise_are_not_biased_by_sums_for_integrals(num, den):
+    # at 80 dB a degree too low for 20 samples of support left up to 260 standard deviations in the response
+    def steps(rng, n):
+        return np.repeat(rng.choice([-1.0, 1.0], size=n // 3 + 1), 3)[:n]
+
+    z = []
+    for seed in range(8):
+        quiet = record(num, den, 0.01, 1000, 0.0, seed, delay=1, u=steps)
+        noise = 1e-4 * quiet.y.std() * np.random.default_rng([seed, 1]).standard_normal(quiet.y.shape)
+        fit = weakform(replace(quiet, y=quiet.y + noise), {"nf": len(den) - 1, "nb": len(num), "nk": 1})
+        free = fit.sd > 0
+        z.append(((fit.model.theta - np.r_[num, den]) / np.where(free, fit.sd, 1.0))[free])
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
 def test_the_support_is_chosen_by_the_data():

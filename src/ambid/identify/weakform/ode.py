@@ -21,6 +21,7 @@ from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, pe
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.threads import one_thread
+from ambid.identify.weakform.bumps import degree_for
 from ambid.identify.weakform.equations import Solution, best_support
 from ambid.identify.weakform.system import Kink, Signal, System, Term
 
@@ -69,7 +70,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     u, y = (data.u - u_mean) / u_sd, (data.y - y_mean) / y_sd
     with one_thread():
         found = [
-            best_support(_system(y[:, o], u, n, nb, nk, data.dt), halves, n + 5, min([_SHORTEST, *halves]))
+            best_support(_system(y[:, o], u, n, nb, nk, data.dt), halves, degree_for(n), min([_SHORTEST, *halves]))
             for o in range(data.n_outputs)
         ]
     solutions = [f[0] for f in found]

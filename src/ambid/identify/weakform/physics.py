@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.scaling import noise_floor
 from ambid.identify.threads import one_thread
+from ambid.identify.weakform.bumps import degree_for
 from ambid.identify.weakform.equations import best_support
 from ambid.identify.weakform.ode import contradictions, kink, supports
 from ambid.identify.weakform.system import Kink, Signal, System, Term
@@ -24,7 +25,7 @@ from ambid.physics.parameters import Parameter
 
 Array = NDArray[np.float64]
 
-_DEGREE = 8
+_DEGREE = degree_for(2)
 _COIL = (("voltage", 0, None, -1.0), ("current", 0, "R", 1.0), ("current", 1, "L", 1.0))
 _MOTION = (
     ("position", 2, "m", 1.0),
