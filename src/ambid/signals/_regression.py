@@ -9,8 +9,7 @@ import numpy as np
 
 from ambid.errors import EstimationError
 from ambid.record.record import Array
-
-_ROWS = 8192
+from ambid.signals.lagged import lagged_triangle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,9 +34,12 @@ def fit_arx(y: Array, inputs: Sequence[Array], na: int, lags: Sequence[int]) -> 
             f"{y.size} samples are too few for a regression on {n_columns} lagged values; it needs more than "
             f"{2 * n_columns + reach}. Use a longer record, or a lower order"
         )
-    columns = [(y, lag) for lag in range(1, na + 1)] + [(u, lag) for u in inputs for lag in lags]
-    norms = np.array([np.linalg.norm(x) or 1.0 for x, _ in columns] + [np.sqrt(n_rows)])
-    r = _triangle(y, columns, norms, reach)
+    signals = [y, *inputs]
+    sizes = [float(np.linalg.norm(x)) or 1.0 for x in signals]
+    past_y, *past = (x / size for x, size in zip(signals, sizes, strict=True))
+    columns = [(past_y, lag) for lag in range(1, na + 1)] + [(u, lag) for u in past for lag in lags]
+    norms = np.repeat([*sizes, np.sqrt(n_rows)], [na, *(len(lags) for _ in inputs), 1])
+    r = lagged_triangle([*columns, (np.full(y.size, 1.0 / norms[-1]), 0), (y, 0)], reach)
     triangle, rhs = r[:n_columns, :n_columns], r[:n_columns, n_columns]
     # A noise-free record makes lagged columns dependent: the smallest norm among all solutions predicts as well.
     u, s, vt = np.linalg.svd(triangle)
@@ -46,20 +48,3 @@ def fit_arx(y: Array, inputs: Sequence[Array], na: int, lags: Sequence[int]) -> 
     variance = float(r[n_columns, n_columns] ** 2) / (n_rows - int(kept.sum()))
     sd = np.sqrt(variance * np.sum(inverse**2, axis=1)) / norms
     return Regression(coefficients=inverse @ rhs / norms, sd=sd, variance=variance, n_rows=n_rows)
-
-
-def _triangle(y: Array, columns: Sequence[tuple[Array, int]], norms: Array, reach: int) -> Array:
-    """Return R of the QR factorisation of [x(t - lag)/norm of all columns, 1/norm, y(t)] for t >= reach.
-
-    Rows are folded in by blocks that fit the processor's cache, so that memory does not grow with the record.
-    """
-    r = np.zeros((0, len(columns) + 2))
-    for first in range(reach, y.size, _ROWS):
-        last = min(first + _ROWS, y.size)
-        block = np.empty((last - first, len(columns) + 2), order="F")
-        for k, (x, lag) in enumerate(columns):
-            np.divide(x[first - lag : last - lag], norms[k], out=block[:, k])
-        block[:, -2] = 1.0 / norms[-1]
-        block[:, -1] = y[first:last]
-        r = np.asarray(np.linalg.qr(np.concatenate((r, block)), mode="r"))
-    return r

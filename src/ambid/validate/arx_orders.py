@@ -6,7 +6,7 @@ entry of the triangle of those columns of R (Ljung 1999, sec. 16.4); the samples
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
+from ambid.signals.lagged import lagged_triangle
 
 Array = NDArray[np.float64]
 Bounds = Mapping[str, tuple[int, int]]
-
-_ROWS = 20_000  # rows of a block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,19 +117,10 @@ def _delays(least: int, most: int, n_inputs: int) -> Iterator[tuple[int, ...]]:
 
 
 def _triangle(data: IOData, o: int, na: int, n_u_lags: int, first: int) -> Array:
-    """R of [y(t-1)... y(t-na), u(t)... u(t-n+1) of each input, 1, y(t)], block by block."""
+    """R of [y(t-1)... y(t-na), u(t)... u(t-n+1) of each input, 1, y(t)]."""
     y, u = data.y[:, o] - data.y[:, o].mean(), data.u - data.u.mean(axis=0)
-    R = np.zeros((0, na + data.n_inputs * n_u_lags + 2))
-    for start in range(first, data.n_samples, _ROWS):
-        end = min(start + _ROWS, data.n_samples)
-        columns: Sequence[Array] = [
-            *(y[start - k : end - k] for k in range(1, na + 1)),
-            *(u[max(start - k, 0) : end - k, i] for i in range(data.n_inputs) for k in range(n_u_lags)),
-            np.ones(end - start),
-            y[start:end],
-        ]
-        R = np.asarray(np.linalg.qr(np.vstack([R, np.stack(columns, axis=1)]), mode="r"), dtype=np.float64)
-    return R
+    past = [(y, k) for k in range(1, na + 1)] + [(x, k) for x in u.T for k in range(n_u_lags)]
+    return lagged_triangle([*past, (np.ones(y.size), 0), (y, 0)], first)
 
 
 def _loss(R: Array) -> float:

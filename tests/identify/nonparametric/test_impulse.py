@@ -15,7 +15,7 @@ from ambid.identify.nonparametric import (
     rfir,
     step_response,
 )
-from ambid.identify.nonparametric.bayes import _Evidence, triangle, with_outputs
+from ambid.identify.nonparametric.bayes import _Evidence, triangle
 from ambid.identify.nonparametric.kernels import kernel_matrix, kernel_root
 
 NUM, DEN = [0.0, 0.0, 1.0, 0.5], [1.0, -1.5, 0.8]  # two samples of delay, poles 0.75 +- 0.49j
@@ -68,18 +68,14 @@ def test_kernels_and_roots_agree(kernel):
 def test_the_gradient_and_the_value_of_the_evidence_are_exact(kernel):
     data = record(400, 1, inputs=2)
     u, y = data.u - data.u.mean(axis=0), data.y[:, 0] - data.y.mean()
-
-    def columns(a, b):
-        return np.column_stack([*(u[a - k : b - k, i] for i in range(2) for k in range(15)), y[a:b]])
-
-    evidence = _Evidence(with_outputs(triangle(columns, 14, 400), 1), 0, (15, 15), kernel)
+    evidence = _Evidence(triangle([(x, k) for x in u.T for k in range(15)], y[:, None], 14), 0, (15, 15), kernel)
     v = evidence.start(0.8) + 0.1 * np.random.default_rng(0).standard_normal(evidence.start(0.8).size)
     value, gradient = evidence(v)
     for j in range(v.size):
         ends = [evidence(v + s * 1e-3 * np.eye(v.size)[j])[0] for s in (-2, -1, 1, 2)]
         assert gradient[j] == pytest.approx((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / 12e-3, rel=1e-6, abs=1e-6)
     # the value, by the definition: rows jointly Gaussian with covariance s2 (Phi P Phi^T + I), mean free, s2 best
-    rows = columns(14, 400)
+    rows = np.column_stack([*(x[14 - k : 400 - k] for x in u.T for k in range(15)), y[14:]])
     L, _ = evidence._prior(v)
     center = np.eye(386) - 1 / 386
     within = np.linalg.svd(center)[0][:, :385]
@@ -107,11 +103,8 @@ def test_a_prior_beats_least_squares_and_its_band_holds():
 
 def test_pieces_make_the_same_triangle():
     data = record(9000, 2)
-
-    def columns(a, b):
-        return np.column_stack([*(data.u[a - k : b - k, 0] for k in range(10)), data.y[a:b]])
-
-    t, rows = triangle(columns, 9, 9000), columns(9, 9000)
+    t = triangle([(data.u[:, 0], k) for k in range(10)], data.y, 9)
+    rows = np.column_stack([*(data.u[9 - k : 9000 - k, 0] for k in range(10)), data.y[9:]])
     rows = rows - rows.mean(axis=0)
     np.testing.assert_allclose(t.R.T @ t.R, rows[:, :10].T @ rows[:, :10], rtol=1e-10, atol=1e-7)
     np.testing.assert_allclose(t.R.T @ t.r, rows[:, :10].T @ rows[:, 10:], rtol=1e-10, atol=1e-7)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify._kernels import state_scan
 from ambid.identify.blackbox.data import IOData
+from ambid.signals.lagged import lagged_triangle
 
 Array = NDArray[np.float64]
 
@@ -114,11 +115,10 @@ def reference_part(who: str, data: IOData) -> ReferencePart:
 
 def _triangle(w: Array, r: Array, highest: int) -> Array:
     """R of the regression of w on 1, r(t) and lags 1, 2, ... of [w, r], lag by lag, so that orders are nested."""
-    n = w.shape[0]
-    columns = [np.ones((n - highest, 1)), r[highest:]]
-    for k in range(1, highest + 1):
-        columns += [w[highest - k : n - k], r[highest - k : n - k]]
-    return np.asarray(np.linalg.qr(np.hstack([*columns, w[highest:]]), mode="r"), dtype=np.float64)
+    columns = [(np.ones(w.shape[0]), 0), *((x, 0) for x in r.T)]
+    both = np.hstack([w, r])
+    columns += [(x, k) for k in range(1, highest + 1) for x in both.T]
+    return lagged_triangle([*columns, *((x, 0) for x in w.T)], highest)
 
 
 def _by_criterion(R: Array, rows: int, n_w: int, n_r: int, highest: int) -> list[int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonparametric.bayes import posterior, triangle, with_outputs
+from ambid.identify.nonparametric.bayes import posterior, triangle
 from ambid.identify.nonparametric.kernels import Kernel
 
 Array = NDArray[np.float64]
@@ -61,12 +61,7 @@ def predictor_taps(data: IOData, lags: int, kernels: Sequence[Kernel]) -> Predic
     y_sd, u_sd = data.y.std(axis=0), data.u.std(axis=0)
     z = np.hstack([(data.y - data.y.mean(axis=0)) / y_sd, (data.u - data.u.mean(axis=0)) / u_sd])
     n_y = data.n_outputs
-
-    def columns(a: int, b: int) -> Array:
-        past = [z[a - k : b - k, j] for j in range(z.shape[1]) for k in range(1, lags + 1)]
-        return np.column_stack([*past, z[a:b, :n_y]])
-
-    t = with_outputs(triangle(columns, lags, data.n_samples), n_y)
+    t = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z[:, :n_y], lags)
     found = [posterior(t, o, (lags,) * z.shape[1], kernels) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T

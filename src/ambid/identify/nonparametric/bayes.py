@@ -7,7 +7,7 @@ is profiled out; the gradient is exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.nonparametric.kernels import SHAPES, Kernel, kernel_matrix, kernel_root
+from ambid.signals.lagged import lagged_triangle
 
 Array = NDArray[np.float64]
-
-_PIECE = 4096  # rows of a piece
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,48 +72,25 @@ class Posterior:
     evidence: float
 
 
-def triangle(columns: Callable[[int, int], Array], first: int, last: int) -> Triangle:
-    """Reduce rows `first` to `last` to a triangle.
+def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int) -> Triangle:
+    """Reduce a regression on lagged signals and a constant to a triangle.
 
     Parameters
     ----------
-    columns : callable
-        (first, last) -> rows of [Phi y], shape (last - first, p + n_outputs). How many are y the caller knows.
-    first, last : int
-
-    Returns
-    -------
-    Triangle
-        `r` holds the last column alone; see `with_outputs`.
-    """
-    R: Array | None = None
-    for start in range(first, last, _PIECE):
-        rows = columns(start, min(start + _PIECE, last))
-        rows = np.hstack([np.ones((rows.shape[0], 1)), rows])
-        R = _triangle(rows if R is None else np.vstack([R, rows]))
-    assert R is not None
-    size = columns(first, first + 1).shape[1] + 1
-    R = np.vstack([R, np.zeros((max(0, size - R.shape[0]), size))])
-    return Triangle(R=R[1:-1, 1:-1], r=R[1:-1, -1:], left=R[-1:, -1:] ** 2, head=R[0], rows=last - first)
-
-
-def with_outputs(t: Triangle, n_outputs: int) -> Triangle:
-    """Tell which of the last columns are outputs.
-
-    Parameters
-    ----------
-    t : Triangle
-        With one output.
-    n_outputs : int
+    regressors : sequence of (ndarray, shape (n_samples,), and int)
+        Signal and lag of every column of Phi.
+    outputs : ndarray, shape (n_samples, n_outputs)
+    first : int
+        First row, at least the largest lag.
 
     Returns
     -------
     Triangle
     """
-    whole = np.vstack([np.hstack([t.R, t.r]), np.r_[np.zeros(t.R.shape[1]), np.sqrt(t.left[0, 0])]])
-    p = whole.shape[1] - n_outputs
-    tail = whole[p:, p:]
-    return Triangle(R=whole[:p, :p], r=whole[:p, p:], left=tail.T @ tail, head=t.head, rows=t.rows)
+    rows, p = outputs.shape[0], len(regressors)
+    R = lagged_triangle([(np.ones(rows), 0), *regressors, *((y, 0) for y in outputs.T)], first)
+    phi, y = slice(1, 1 + p), slice(1 + p, None)
+    return Triangle(R=R[phi, phi], r=R[phi, y], left=R[y, y].T @ R[y, y], head=R[0], rows=rows - first)
 
 
 def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel]) -> Posterior:

@@ -23,7 +23,7 @@ from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, pe
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.nonparametric.autoregression import predictor_taps, responses
-from ambid.identify.nonparametric.bayes import Posterior, posterior, triangle, with_outputs
+from ambid.identify.nonparametric.bayes import Posterior, posterior, triangle
 from ambid.identify.nonparametric.kernels import Kernel
 from ambid.identify.threads import one_thread
 
@@ -250,12 +250,7 @@ def _regressed(
     means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
     y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
     u, y = (data.u - means) / u_sd, (data.y - y_mean) / y_sd
-
-    def columns(a: int, b: int) -> Array:
-        lags = [u[a - k : b - k, i] for i in range(len(nb)) for k in range(nk[i], nk[i] + nb[i])]
-        return np.column_stack([*lags, y[a:b]])
-
-    t = with_outputs(triangle(columns, first, data.n_samples), data.n_outputs)
+    t = triangle([(x, k) for x, b, d in zip(u.T, nb, nk, strict=True) for k in range(d, d + b)], y, first)
     return [posterior(t, o, nb, kernels) for o in range(data.n_outputs)], (means, u_sd), (y_mean, y_sd)
 
 
