@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.response import one_step, simulation
-from ambid.identify.blackbox.spread import pole_covariance
+from ambid.identify.blackbox.spread import pole_covariance, zero_covariance
 from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.report._drawing import BOUND, MEASURED, PREDICTED, grid, magnitude_axis, phase_axis, pole_region
 from ambid.report._panels import Traces, residuals_panel, signals_panel
@@ -156,29 +156,37 @@ def _bode(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
 
 
 def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
-    """Poles with 95 % regions and zeros, and beside them in numbers."""
+    """Poles and zeros with 95 % regions, and beside them the poles in numbers."""
     axes, beside = figure.subplots(1, 2, width_ratios=(3, 3))
     discrete = fit.model.dt is not None
     poles, zeros = fit.model.poles(), fit.model.zeros()
-    spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
+    spread = pole_covariance(fit.model, fit.covariance) if fit.covariance is not None else None
     for k, p in enumerate(poles):
         unstable = abs(p) > 1 if discrete else p.real > 0
         color = BOUND if unstable else PREDICTED
         axes.plot(p.real, p.imag, "x", color=color, markersize=8, markeredgewidth=1.8)
-        usable = spread is not None and np.all(np.isfinite(spread[k])) and np.max(np.abs(spread[k])) < 1e6
-        pole_region(
-            axes, Pole(value=complex(p), covariance=spread[k] if usable and spread is not None else None), color
-        )
-    seen = zeros[np.abs(zeros) < 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))]
+        _region(axes, p, None if spread is None else spread[k], color, 1e3)
+    reach = 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))
+    near = np.abs(zeros) < reach
+    seen = zeros[near]
     axes.plot(seen.real, seen.imag, "o", color=MEASURED, markersize=7, markerfacecolor="none", markeredgewidth=1.4)
+    if fit.covariance is not None:
+        for z, of_zero in zip(seen, zero_covariance(fit.model, fit.covariance)[near], strict=True):
+            _region(axes, z, of_zero, MEASURED, reach)
     hidden = f"; {zeros.size - seen.size} zero(s) farther out" if seen.size < zeros.size else ""
     _stability(axes, discrete)
     delayed = isinstance(fit.model, TransferModel) and any(fit.model.delay)
-    axes.set_title(f"poles (x, 95 % regions) and zeros (o){hidden}{', delay apart' if delayed else ''}", fontsize=10)
+    axes.set_title(f"poles (x) and zeros (o), 95 % regions{hidden}{', delay apart' if delayed else ''}", fontsize=10)
     grid(axes)
     beside.axis("off")
     text = "\n".join(pole_lines(fit))
     beside.text(0.0, 0.97, text, fontsize=9, va="top", family="monospace", transform=beside.transAxes)
+
+
+def _region(axes: Axes, root: complex, covariance: Array | None, color: str, most: float) -> None:
+    """Draw it where there is one, and not much wider than the figure: a multiple root has no spread of first order."""
+    usable = covariance is not None and np.all(np.isfinite(covariance)) and np.max(np.abs(covariance)) < most**2
+    pole_region(axes, Pole(value=complex(root), covariance=covariance if usable else None), color)
 
 
 def _stability(axes: Axes, discrete: bool) -> None:

@@ -1,0 +1,40 @@
+"""Figures of black-box fits: what is estimated is drawn with its uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse
+from scipy.signal import lfilter
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.blackbox.structures import structure
+from ambid.report.fit_figures import overview
+from ambid.validate.blackbox import judged
+
+POLES, ZEROS = 0.9 * np.exp(0.4j), 0.8 * np.exp(1.2j)
+
+
+@pytest.fixture(scope="module")
+def data() -> IOData:
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((2000, 1))
+    b, f = (np.poly([r, r.conj()]).real for r in (ZEROS, POLES))
+    y = lfilter(np.append(0.0, b), f, u, axis=0) + 0.5 * rng.standard_normal(u.shape)
+    return IOData(
+        u=u, y=y, dt=0.01, inputs=("u",), outputs=("y",), units={"u": "V", "y": "m"}, open_loop=True,
+        record={"samples": 2000},
+    )  # fmt: skip
+
+
+def test_poles_and_zeros_are_drawn_with_their_regions(data: IOData) -> None:
+    fit = judged(structure("oe").estimator(data, {"nb": 3, "nf": 2, "nk": 1}), data)
+    (axes,) = (a for a in overview(fit, data).findobj(Axes) if "zeros" in a.get_title())
+    regions = [p for p in axes.patches if isinstance(p, Ellipse)]
+    centres = np.array([complex(*p.get_center()) for p in regions])
+    truth = np.array([POLES, POLES.conj(), ZEROS, ZEROS.conj()])
+    assert len(regions) == 4
+    assert np.max(np.min(np.abs(truth[:, None] - centres), axis=1)) < 0.02
+    assert all(0 < p.width < 0.1 for p in regions)
+    assert "95 % regions" in axes.get_title()
