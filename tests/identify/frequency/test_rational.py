@@ -1,12 +1,14 @@
 """Maximum likelihood: exact slope, honest intervals and cost, model errors seen, nothing silent."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.spread import pole_covariance
+from ambid.identify.blackbox.fit_file import fit_from_json, fit_text
+from ambid.identify.blackbox.spread import pole_covariance, response_covariance
 from ambid.identify.frequency import rational
 from ambid.identify.frequency.basis import orthogonal_polynomials
 from ambid.identify.frequency.rational import frf_ml
@@ -93,6 +95,23 @@ def test_a_delay_is_found(delay):
     assert sd < 0.02 / RATE
     assert abs(fit.details["delay_s"] - delay / RATE) < 3.3 * sd
     assert fit.model.delay == (fit.details["delay_s"],)
+
+
+def test_an_estimated_delay_is_part_of_every_spread():
+    # without the delay in the covariance the response missed the truth by up to 22 of its standard deviations
+    f = np.linspace(20.0, 1900.0, 60)
+    G = second_order(f) * np.exp(-2j * np.pi * f * 1.3e-4)[:, None, None]
+    scores = []
+    for seed in range(20):
+        fit = frf_ml(noisy(f, G, 0.05, seed), {"nf": 2, "nb": 2}, delay="auto")
+        spread = response_covariance(fit.model, fit.covariance, 2 * np.pi * f)[:, 0, 0]
+        error = fit.model.frequency_response(2 * np.pi * f)[:, 0, 0] - G[:, 0, 0]
+        scores.append(np.stack([error.real, error.imag]) / np.sqrt(np.diagonal(spread, axis1=1, axis2=2).T))
+    assert fit.model.names[-1] == "delay[0]"
+    assert fit.sd[-1] == pytest.approx(fit.details["delay_sd_s"])
+    assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.25
+    again = fit_from_json(json.loads(fit_text(fit)), "fit")
+    np.testing.assert_array_equal(again.model.theta, fit.model.theta)
 
 
 def test_entries_may_have_their_own_denominators():

@@ -242,7 +242,10 @@ def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tup
         return StateSpaceModel(dt=dt, **parts)
     if "transfer_function" in d:
         tf = d["transfer_function"]
-        return TransferModel(num=tf["num"], den=tf["den"], dt=dt, delay=tuple(d["delay_s"]))
+        names = () if d["covariance"] is None else d["covariance"]["names"]
+        return TransferModel(
+            num=tf["num"], den=tf["den"], dt=dt, delay=tuple(d["delay_s"]), delay_estimated="delay[0]" in names
+        )
     found = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
     one = len(inputs) == 1
     sets = tuple(

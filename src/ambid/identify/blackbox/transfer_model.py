@@ -28,12 +28,16 @@ class TransferModel:
         Sampling interval in s; None for continuous time.
     delay : tuple of float, s
         One for each input (whole samples times dt for a discrete model).
+    delay_estimated : bool
+        Whether the delays are real numbers that were estimated: `theta` then ends with them, so that what is open about
+        them goes into every spread.
     """
 
     num: tuple[tuple[Array, ...], ...]
     den: tuple[tuple[Array, ...], ...]
     dt: float | None
     delay: tuple[float, ...] = ()
+    delay_estimated: bool = False
 
     def __post_init__(self) -> None:
         for name in ("num", "den"):
@@ -62,16 +66,17 @@ class TransferModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, as in `theta`."""
+        """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, ``delay[i]``, as in `theta`."""
         variable = "s" if self.dt is None else "z"
-        return tuple(
+        coefficients = tuple(
             f"{which}[{o},{i}]{variable}{p.size - 1 - k}" for o, i, which, p, _ in self.parts() for k in range(p.size)
         )
+        return coefficients + tuple(f"delay[{i}]" for i in range(self.n_inputs) if self.delay_estimated)
 
     @property
     def theta(self) -> Array:
-        """All coefficients, leading ones included, in the order of `names`, shape (n_theta,)."""
-        return np.concatenate([p for _, _, _, p, _ in self.parts()])
+        """All coefficients, leading ones included, and estimated delays in s, as in `names`, shape (n_theta,)."""
+        return np.concatenate([*(p for _, _, _, p, _ in self.parts()), self.delay if self.delay_estimated else ()])
 
     def frequency_response(self, omega: Array) -> Complex:
         """Return G.
@@ -121,6 +126,10 @@ class TransferModel:
             den = np.polyval(self.den[o][i], s)
             factor = lag[:, i] / den if which == "num" else -lag[:, i] * np.polyval(self.num[o][i], s) / den**2
             out[:, o, i, place] = powers * factor[:, None]
+        if self.delay_estimated:
+            g, first = self.frequency_response(omega), self.theta.size - self.n_inputs
+            for i in range(self.n_inputs):
+                out[:, :, i, first + i] = -1j * omega[:, None] * g[:, :, i]
         return out
 
     def poles(self) -> Complex:

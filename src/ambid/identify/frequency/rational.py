@@ -98,9 +98,9 @@ def frf_ml(
     Returns
     -------
     BlackBoxFit
-        Structure ``frf-ml``, a TransferModel with covariance, the check ``cost`` (see `Lines.verdict`), and in
-        `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s`` and ``condition`` (of the
-        scaled Jacobian).
+        Structure ``frf-ml``, a TransferModel with covariance (that of an estimated delay included), the check ``cost``
+        (see `Lines.verdict`), and in `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s``
+        and ``condition`` (of the scaled Jacobian).
 
     Raises
     ------
@@ -363,10 +363,15 @@ def _powers(at: _Form, vector: Array, lag: float) -> tuple[TransferModel, Array]
     if not all(np.all(np.isfinite(p)) for p in (*tops, *bottoms)):
         raise EstimationError("frf-ml: no finite coefficients fit these lines. Lower the orders")
     delay = float(vector[-1]) * at.lines.dt if at.delay_free else lag
+    if at.delay_free:
+        moved = np.zeros((n_u, vector.size))
+        moved[:, -1] = at.lines.dt
+        rows.append(moved)
     model = TransferModel(
         num=tuple(tuple(tops[o * n_u : (o + 1) * n_u]) for o in range(n_y)),
         den=tuple(tuple(bottoms[o * n_u : (o + 1) * n_u]) for o in range(n_y)),
         dt=at.dt,
         delay=(delay,) * n_u,
+        delay_estimated=at.delay_free,
     )
     return model, np.vstack(rows)
