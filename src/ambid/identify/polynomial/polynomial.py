@@ -22,6 +22,7 @@ from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.result import result
 from ambid.identify.polynomial.scaled import Scaled, liveliest, scaled_data, unit
 from ambid.identify.polynomial.search import Fitted, searched
+from ambid.identify.polynomial.separable import SMOOTH, separable_starts
 from ambid.identify.polynomial.stability import stable_predictor
 from ambid.identify.polynomial.starts import starts
 from ambid.identify.threads import one_thread
@@ -30,7 +31,6 @@ Array = NDArray[np.float64]
 
 _ROUNDING = 1e-24  # squared residual, in units of the output's variance
 _WINDOW = 8192  # samples of a long record that decide between neighbouring delays
-_SMOOTH = 12  # evaluations; a longer way hints at a second minimum (always to be expected where A and D share roots)
 
 
 def estimate(
@@ -151,17 +151,34 @@ def fit_output(
             "Lower the orders, or take a longer part of the record"
         )
     worth = unit(layout, scaled, o)
-    best: Fitted | None = None
-    for start in starts(layout, y, scaled.u):
-        for place, value in known.items():
-            start[place] = value / worth[place]
-        if not stable_predictor(layout, start):
-            continue
-        found = searched(p, y, scaled.u, start, tick=tick)
-        if best is None or found.cost < best.cost:
-            best = found
-        if best.converged and found.iterations <= _SMOOTH and not (layout.na and layout.nd):
+    found: list[Fitted] = []
+    for ordinary, some in ((True, starts(layout, y, scaled.u)), (False, separable_starts(layout, y, scaled.u))):
+        for start in some:
+            for place, value in known.items():
+                start[place] = value / worth[place]
+            if not stable_predictor(layout, start):
+                continue
+            found.append(searched(p, y, scaled.u, start, tick=tick))
+            if _smooth(found) and not (ordinary and layout.na and layout.nd):
+                break
+        if _smooth(found) or (layout.na and layout.nd and _agreed(found)):
             break
+    best = min(found, key=lambda x: x.cost, default=None)
     if best is None:
         raise EstimationError(f"{name}: no stable predictor to start from. Change the fixed coefficients of C or F")
     return best
+
+
+def _smooth(found: list[Fitted]) -> bool:
+    """Whether the last search went straight to the lowest minimum; a long way hints at a second one."""
+    last = found[-1] if found else None
+    return last is not None and last.converged and last.iterations <= SMOOTH and last.cost <= _lowest(found)
+
+
+def _agreed(found: list[Fitted]) -> bool:
+    """Whether two starts led to the lowest minimum; where A and D share roots there always are several."""
+    return sum(x.converged and x.cost <= _lowest(found) for x in found) > 1
+
+
+def _lowest(found: list[Fitted]) -> float:
+    return min(x.cost for x in found) * (1 + 1e-6)

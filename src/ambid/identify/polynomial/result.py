@@ -24,6 +24,7 @@ from ambid.identify.polynomial.predictor import predictor
 from ambid.identify.polynomial.rest import not_at_rest
 from ambid.identify.polynomial.scaled import Scaled, unit
 from ambid.identify.polynomial.search import BLIND, Fitted
+from ambid.identify.polynomial.separable import missed_minimum
 
 Array = NDArray[np.float64]
 
@@ -66,6 +67,7 @@ def result(
     warnings = cautions(model, covariance, fits)
     if any(layouts[0].nf) and not data.open_loop:
         warnings += unstable_plant(layouts, scaled)
+    warnings += missed_minimum(layouts, fits, scaled)
     if scaled.at_rest:
         warnings += not_at_rest(layouts, fits, scaled)
     if estimated_delay and any(k >= LARGEST_DELAY for x in layouts for k in x.nk):
