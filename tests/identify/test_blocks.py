@@ -60,6 +60,25 @@ def test_first_order_blocks_are_not_doubted_too_often():
     assert sum(bool(f.warnings) for f in found) <= 1
 
 
+@pytest.mark.parametrize("seed", [0, 5])
+def test_a_false_root_of_the_instruments_is_not_taken_for_the_coil(seed):
+    # under strong noise the equations have roots with a coil of 62 +- 1 rad/s and three times the error in the current
+    ka, a, kb, b, kc, c = 650.0, 1200.0, 5.0, 40.0, -30.0, 60.0
+    M = np.zeros((4, 4))
+    M[:3] = [[-a, 0, 0, ka], [0, -b, kb, 0], [kc, kc, -c, 0]]
+    E, n, rng = expm(M / 5000), 4000, np.random.default_rng(seed)
+    v = np.repeat(rng.choice([-1.0, 1.0], n // 5 + 1), 5)[:n]
+    x, y = rng.standard_normal(3) * 0.1, np.empty((n, 2))
+    e = rng.standard_normal((n, 2))
+    for k in range(n):
+        y[k] = x[0] + x[1], x[2]
+        x = E[:3, :3] @ x + E[:3, 3] * v[k]
+    y += 0.3 * y.std(axis=0) * e
+    found = three_blocks(v + 1.0, y[:, 0] + 2.0, y[:, 1] - 3.0, 5000.0, open_loop=True)
+    assert abs(found.blocks["a"].pole - a) < 4 * found.blocks["a"].pole_sd
+    assert found.fit["current"] > 0.65
+
+
 def test_a_controller_wants_the_reference():
     scores = []
     for seed in range(6):

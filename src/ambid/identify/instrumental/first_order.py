@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 _STEPS = 50
 _SETTLED = 1e-8  # change of a block's output by a step, relative to that output
 _AGREE = 1e-7  # difference in fit of two starts that found the same blocks
+_ENOUGH = 1.1  # error over what no block explains, from which a root of the equations may be a false one
 _LAGS = 3  # of the spare instruments that tell whether a block is of first order
 
 
@@ -69,15 +70,17 @@ def electric(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
     """
     best: tuple[Equation, bool] | None = None
     n = measured.shape[0]
+    # instruments have false roots too, with a larger error than the voltage and the position leave of the current
+    least = 1 - _ENOUGH * float(np.linalg.norm(measured[:, 1] - clean[:, 1]) / np.linalg.norm(measured[:, 1]))
     for a, b in _starts(n, dt):
         theta = _gains(measured, clean, a, b, dt)
         found, settled = _newton(measured, clean, theta, dt)
         if found is None:
             continue
         agree = best is not None and best[1] and settled and abs(found.fit - best[0].fit) < _AGREE
-        if best is None or (settled, found.fit) > (best[1], best[0].fit):
+        if best is None or (settled and found.fit > least, found.fit) > (best[1] and best[0].fit > least, best[0].fit):
             best = (found, settled)
-        if agree:
+        if agree and found.fit > least:
             break
     if best is None:
         raise EstimationError(
