@@ -1,8 +1,9 @@
 """Physical parameters from any identified black-box model, with covariance (theory.md sec. 1).
 
 Matrices of a state space are not unique, transfer functions are: the frequency response of the physical model is laid
-through that of the black box, weighted by the inverse of the black box's own covariance (minimum distance; Ljung 1999,
-sec. 7.4 and 9.7). What is left over tells by a chi-square test whether the black box is this physics at all.
+through that of the black box, weighted by what the black box knows at each frequency; its whole covariance then gives
+that of the parameters (minimum distance; Ljung 1999, sec. 7.4 and 9.7). What is left over tells by a chi-square test
+whether the black box is this physics at all.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.estimate import Check, Delay, EstimatedParameter
-from ambid.identify.physical_match import Match, matched
+from ambid.identify.physical_match import Match, Spread, matched, spread
 from ambid.identify.physical_target import Target, target_of
+from ambid.identify.threads import one_thread
 from ambid.identify.uncertainty import WEAK
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -124,7 +126,21 @@ def physical_parameters(
         raise EstimationError(f"nothing is said of parameter {missing[0]!r} of {model.name!r}. Give it, free or fixed")
     if not free:
         raise EstimationError("every parameter is fixed; nothing is left to find. Free at least one")
-    target = target_of(fit, model, roles or {}, band_hz)
+    with one_thread():
+        return _found(fit, model, parameters, free, delay, roles or {}, band_hz)
+
+
+def _found(
+    fit: BlackBoxFit,
+    model: LinearModel,
+    parameters: Sequence[Parameter],
+    free: Sequence[Parameter],
+    delay: float | Literal["auto"],
+    roles: Mapping[str, str],
+    band_hz: tuple[float, float] | None,
+) -> PhysicalFit:
+    """Match, and judge the match."""
+    target = target_of(fit, model, roles, band_hz)
     if target.rank < len(free):
         raise EstimationError(
             f"the {fit.structure} model has {target.rank} independent numbers for {len(free)} free parameters. Fix "
@@ -189,8 +205,9 @@ def _result(
 ) -> PhysicalFit:
     """Covariance, misfit and identifiability of a finished match."""
     names, theta, n = found.names, found.theta, len(found.names)
-    check, factor = _misfit(fit, model, target, found)
-    whole = found.covariance() * factor**2
+    own = spread(target, found)
+    check, factor = _misfit(fit, model, target, found, own)
+    whole = own.covariance * factor**2 * _roughness(target)
     reference = model.references(theta)
     scale = np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
     relative = whole[:n, :n] / np.outer(scale, scale)
@@ -226,15 +243,30 @@ def _result(
     )
 
 
-def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match) -> tuple[Check, float]:
-    """Chi-square test of what the match leaves over, and by how much standard deviations widen."""
-    from scipy.stats import chi2
+def _roughness(target: Target) -> float:
+    """Factor on variances from few groups of a jackknife: the variance of Student's t."""
+    freedom = np.inf if target.groups is None else max(target.groups - 1.0, 3.0)
+    return 1.0 if np.isinf(freedom) else freedom / (freedom - 2.0)
 
-    freedom, left = target.rank - len(found.names) - found.delay_free + found.n_priors, found.criterion
-    if freedom <= 0:
+
+def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match, own: Spread) -> tuple[Check, float]:
+    """Test of what the match leaves over, and by how much standard deviations widen.
+
+    A sum of chi-squares of several sizes is one chi-square by its mean and variance (Satterthwaite 1946); where the
+    sizes come from a jackknife, it is judged by Fisher's F.
+    """
+    from scipy.stats import chi2, f
+
+    if target.rank - len(found.names) - found.delay_free + found.n_priors <= 0:
         return Check(passed=True, detail="the black box has no number left to test the physics by", p=None), 1.0
-    p = float(chi2.sf(left, freedom))
-    text = f"chi-square {left:.4g} for {freedom} degrees of freedom (p = {p:.2g})"
+    mean = float(np.sum(own.left))
+    freedom = mean**2 / float(np.sum(own.left**2))
+    left = found.criterion / mean * freedom
+    if target.groups is None:
+        p = float(chi2.sf(left, freedom))
+    else:
+        p = float(f.sf(left / freedom, freedom, freedom * (target.groups - 1)))
+    text = f"chi-square {left:.4g} for {freedom:.3g} degrees of freedom (p = {p:.2g})"
     passed, factor = p > _MISFIT, max(1.0, float(np.sqrt(left / freedom)))
     if passed:
         detail = f"the {fit.structure} model agrees with {model.name!r}: {text}"
@@ -248,7 +280,7 @@ def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match) 
             f"the {fit.structure} model is not a {model.name!r} plant: {text}. Other orders (a delay takes poles too), "
             "a structure that stands feedback, or the grey-box method"
         )
-    values = {"statistic": left, "freedom": float(freedom)}
+    values = {"statistic": left, "freedom": freedom}
     return Check(passed=passed, detail=detail, p=p, values=values), factor
 
 

@@ -17,7 +17,6 @@ from ambid.errors import EstimationError
 from ambid.identify.physical_response import physical_response
 from ambid.identify.physical_target import Target
 from ambid.identify.start import candidates
-from ambid.identify.uncertainty import inverse_information
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 
@@ -70,15 +69,59 @@ class Match:
         """Number of parameters with a prior."""
         return int(np.sum(np.isfinite(self.prior_sd)))
 
-    def covariance(self) -> Array:
-        """Return the covariance of the free parameters, the delay in s last where it is free, shape (n, n) or one more.
+    @property
+    def size(self) -> Array:
+        """What the columns of `J` are scaled by, the delay's last where it is free, shape (n,) or (n + 1,), SI."""
+        return np.append(self.magnitude, self.period_s) if self.delay_free else self.magnitude
 
-        Returns
-        -------
-        ndarray, shape (n, n) or (n + 1, n + 1), SI
-        """
-        size = np.append(self.magnitude, self.period_s) if self.delay_free else self.magnitude
-        return np.asarray(inverse_information(self.J) * np.outer(size, size))
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spread:
+    """What the black box's own covariance makes of a match.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (n, n) or (n + 1, n + 1), SI
+        Of the free parameters, the delay in s last where it is free.
+    left : ndarray, shape (rank,)
+        Variances along which the match leaves something over: the criterion is a sum of chi-squares with these sizes.
+    """
+
+    covariance: Array
+    left: Array
+
+
+def spread(target: Target, found: Match) -> Spread:
+    """Propagate the black box's covariance S through a weighted match: (J'WJ)^-1 J'W S W J (J'WJ)^-1.
+
+    What the black box's covariance does not reach at all gets the weight's own noise, so that a direction without
+    information is not taken for one without error.
+
+    Parameters
+    ----------
+    target : Target
+    found : Match
+
+    Returns
+    -------
+    Spread
+    """
+    norm = np.maximum(np.linalg.norm(found.J, axis=0), 1e-100)
+    U, s, Vt = np.linalg.svd(found.J / norm, full_matrices=False)
+    back = (Vt.T / np.maximum(s, 1e-15 * s[0])) / norm[:, None]  # J^+ = back U'
+    points, priors = target.noise.shape[0], found.J.shape[0] - target.noise.shape[0]
+    noise = np.zeros((found.J.shape[0], target.rank + priors))
+    noise[:points, : target.rank] = target.noise
+    noise[points:, target.rank :] = np.eye(priors)
+    reached = np.linalg.qr(noise)[0]
+    seen, blind = U.T @ noise, U.T - (U.T @ reached) @ reached.T
+    inner = seen @ seen.T + blind @ blind.T
+    over = noise - U @ seen
+    size = found.size
+    covariance = back @ inner @ back.T * np.outer(size, size)
+    return Spread(
+        covariance=0.5 * (covariance + covariance.T), left=np.asarray(np.linalg.svd(over, compute_uv=False) ** 2)
+    )
 
 
 def matched(
@@ -188,10 +231,9 @@ def search(target: Target, start: Match) -> Match:
             start.model, theta, target.omega, dt=target.dt, delay_s=delay, along=start.names,
             with_delay=start.delay_free,
         )  # fmt: skip
-        size = np.append(start.magnitude, target.period_s) if start.delay_free else start.magnitude
         prior = (v[:n] * start.magnitude - start.prior_mean)[has] / start.prior_sd[has]
         r = np.concatenate([target.numbers(g) - wanted, prior])
-        return r, np.vstack([target.numbers(slope) * size, rows])
+        return r, np.vstack([target.numbers(slope) * start.size, rows])
 
     first = np.array([start.theta[k] for k in start.names]) / start.magnitude
     if start.delay_free:

@@ -1,13 +1,13 @@
 """What a physical model has to meet: the response of a black box, reduced to the numbers that its covariance knows.
 
-Points of the response that the black box does not know itself are left out; the others are turned into independent
-numbers of unit variance by the singular values of their spread, whose rank is that of the covariance.
+Points of the response that the black box does not know itself are left out; the others are weighed by what the black
+box knows at each frequency, and come with their whole covariance, whose rank is that of the black box's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
 from ambid.identify.blackbox.spread import response_covariance
 from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.identify.physical_weight import point_weight
 from ambid.identify.start import Moments
 from ambid.physics.linear_model import LinearModel
 
@@ -39,8 +40,13 @@ class Target:
         Of the black box, channels in the model's order.
     known : ndarray, shape (n_frequencies, n_outputs, n_inputs), bool
         Where it knows its own response.
-    weight : ndarray, shape (rank, 2 n_known)
-        From real and imaginary parts at the known points to independent numbers of unit variance.
+    root : ndarray, shape (2 n_known,)
+        What real and imaginary parts at the known points are multiplied by: about one over their noise, if it were
+        independent from point to point.
+    noise : ndarray, shape (2 n_known, rank)
+        Half factor of the covariance of the numbers that result.
+    groups : int or None
+        Groups of a jackknife from which the covariance was estimated; None where it is not an estimate by scatter.
     omega : ndarray, shape (n_frequencies,), rad/s
     dt : float or None
         None for a model in continuous time.
@@ -54,7 +60,9 @@ class Target:
 
     response: Complex
     known: NDArray[np.bool_]
-    weight: Array
+    root: Array
+    noise: Array
+    groups: int | None
     omega: Array
     dt: float | None
     period_s: float
@@ -64,7 +72,7 @@ class Target:
     @property
     def rank(self) -> int:
         """Number of independent numbers."""
-        return int(self.weight.shape[0])
+        return int(self.noise.shape[1])
 
     @property
     def band_hz(self) -> tuple[float, float]:
@@ -73,7 +81,7 @@ class Target:
         return float(used[0]), float(used[-1])
 
     def numbers(self, response: Complex) -> Array:
-        """Reduce a response, or a derivative of one, to the independent numbers.
+        """Reduce a response, or a derivative of one, to the weighed numbers.
 
         Parameters
         ----------
@@ -81,10 +89,10 @@ class Target:
 
         Returns
         -------
-        ndarray, shape (rank, ...)
+        ndarray, shape (2 n_known, ...)
         """
         points = response[self.known]
-        return np.asarray(self.weight @ np.concatenate([points.real, points.imag]))
+        return np.asarray((np.concatenate([points.real, points.imag]).T * self.root).T)
 
 
 def target_of(
@@ -115,8 +123,13 @@ def target_of(
     if fit.covariance is None:
         raise EstimationError(
             f"the {fit.structure} model has no covariance, so no uncertainty follows from it. Use a method that gives "
-            "one (arx, armax, oe, bj, pbsid)"
+            "one (arx, armax, oe, bj, sspem, pbsid)"
         )
+    if isinstance(fit.model, TransferModel) and fit.model.delay_estimated:
+        # the match holds the delay where it was found: what is open about it stands in the coefficients' own spread
+        plain = replace(fit.model, delay_estimated=False)
+        n = plain.theta.size
+        fit = replace(fit, model=plain, covariance=fit.covariance[:n, :n])
     nyquist = np.pi / fit.dt
     samples = fit.record.get("samples")
     low = 4 * np.pi / (fit.dt * (samples if isinstance(samples, int) and samples > 64 else 8192))
@@ -136,10 +149,13 @@ def target_of(
     moments = tuple(
         _moments(fit, model, grid, np.interp(grid, omega, everywhere, left=0.0) > 0.5, rows, columns) for grid in grids
     )
+    root, noise = _weight(fit, omega, known, rows, columns)
     return Target(
         response=response,
         known=known,
-        weight=_weight(fit, omega, known, rows, columns),
+        root=root,
+        noise=noise,
+        groups=_groups(fit),
         omega=omega,
         dt=fit.model.dt,
         period_s=fit.dt,
@@ -204,19 +220,31 @@ def _known(fit: BlackBoxFit, omega: Array, rows: list[int], columns: list[int]) 
     return g, np.asarray(np.isfinite(variance) & (variance >= 0) & (variance < (_KNOWN * np.abs(g)) ** 2))
 
 
-def _weight(fit: BlackBoxFit, omega: Array, known: NDArray[np.bool_], rows: list[int], columns: list[int]) -> Array:
-    """Whitening of the response at the known points on the range of its covariance."""
+def _weight(
+    fit: BlackBoxFit, omega: Array, known: NDArray[np.bool_], rows: list[int], columns: list[int]
+) -> tuple[Array, Array]:
+    """Weight of the response at the known points, and what its covariance becomes by it."""
     assert fit.covariance is not None
     slope = fit.model.frequency_response_derivative(omega)[np.ix_(range(omega.size), rows, columns)][known]
-    size = np.abs(fit.model.frequency_response(omega)[np.ix_(range(omega.size), rows, columns)][known])
+    size = np.tile(np.abs(fit.model.frequency_response(omega)[np.ix_(range(omega.size), rows, columns)][known]), 2)
     sd = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     used = sd > 0
     values, ways = np.linalg.eigh(fit.covariance[np.ix_(used, used)] / np.outer(sd[used], sd[used]))
     half = ways * np.sqrt(np.maximum(values, 0.0)) * sd[used, None]
-    spread = np.vstack([slope.real[:, used] @ half, slope.imag[:, used] @ half]) / np.tile(size, 2)[:, None]
+    spread = np.vstack([slope.real[:, used] @ half, slope.imag[:, used] @ half]) / size[:, None]
     left, s, _ = np.linalg.svd(spread, full_matrices=False)
     kept = s > _RANK * s[0]
-    return np.asarray((left[:, kept] / s[kept]).T / np.tile(size, 2))
+    spread = left[:, kept] * s[kept]
+    frequency, row, column = np.nonzero(known)
+    root = np.sqrt(np.tile(point_weight(spread, frequency, row * len(columns) + column, omega), 2))
+    return root / size, root[:, None] * spread
+
+
+def _groups(fit: BlackBoxFit) -> int | None:
+    """Number of groups of a jackknife, None for a covariance of another kind."""
+    said = fit.details.get("covariance")
+    groups = said.get("groups") if isinstance(said, Mapping) else None
+    return groups if isinstance(groups, int) else None
 
 
 def _moments(

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_lyapunov
 
 from ambid.identify.blackbox.state_space import StateSpaceModel
 
 Array = NDArray[np.float64]
 
+_DOUBLINGS = 24  # samples as a power of two
 _FAINT = 1e-10  # Hankel singular value beside the largest below which a state is not scaled further
 
 
@@ -55,7 +55,7 @@ def tangent(model: StateSpaceModel, *, feedthrough: bool) -> Array:
 def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
     """Return directions along which the predictions are linear: inputs and outputs enter a predictor that stays.
 
-    With F = A - K C and C held, they are linear in K and in B - K D (and in D).
+    With F = A - K C and C held, they are linear in K and in B - K D; in D beside K up to the product of their changes.
 
     Parameters
     ----------
@@ -123,8 +123,7 @@ def balanced(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpac
     F, G = m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K])
     seen = np.linalg.solve(np.linalg.cholesky(noise), m.C)
     try:
-        left = _factor(solve_discrete_lyapunov(F, G @ G.T))
-        right = _factor(solve_discrete_lyapunov(F.T, seen.T @ seen))
+        left, right = _factor(_gramian(F, G)), _factor(_gramian(F.T, seen.T))
         U, s, _ = np.linalg.svd(right.T @ left)
         s = np.sqrt(np.maximum(s, _FAINT * s[0]))
         T = (U / s).T @ right.T  # new states = T old states
@@ -134,6 +133,19 @@ def balanced(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpac
     if not (np.all(np.isfinite(T)) and np.linalg.cond(T) < 1e12):
         return model, x0
     return StateSpaceModel(A=T @ m.A @ back, B=T @ m.B, C=m.C @ back, D=m.D, K=T @ m.K, dt=m.dt), T @ x0
+
+
+def _gramian(F: Array, G: Array) -> Array:
+    """Sum of F^k G G' F'^k, its length doubled until nothing is added: no equation to be ill-conditioned."""
+    total, power = G @ G.T, F
+    for _ in range(_DOUBLINGS):
+        total = total + power @ total @ power.T
+        power = power @ power
+        if not np.any(np.abs(power) > 1e-18):
+            break
+    if not np.all(np.isfinite(total)):
+        raise np.linalg.LinAlgError("the predictor forgets nothing")
+    return np.asarray(total)
 
 
 def _factor(gramian: Array) -> Array:
