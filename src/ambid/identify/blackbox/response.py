@@ -12,6 +12,7 @@ from ambid.identify.blackbox.state_space import StateSpaceModel
 Array = NDArray[np.float64]
 
 _FORGOTTEN = 1e-9  # what is left of an initial state when it no longer counts
+_RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record from which nothing is left of its digits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,8 +43,11 @@ def one_step(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Ar
     Returns
     -------
     ndarray, shape (n_samples, n_outputs), SI
+        Not a number throughout where an unstable predictor (A - K C) runs away over the record.
     """
     F = model.A - model.K @ model.C
+    if _runs_away(F, y.shape[0]):
+        return np.full(y.shape, np.nan)
     G = np.hstack([model.B - model.K @ model.D, model.K])
     return _response(F, G, model, u, y, offsets)
 
@@ -107,6 +111,12 @@ def stable(model: StateSpaceModel) -> bool:
         return True
     values = np.linalg.eigvals(model.A)
     return bool(np.max(np.abs(values)) < 1.0 if model.dt is not None else np.max(values.real) < 0.0)
+
+
+def _runs_away(F: Array, n_samples: int) -> bool:
+    """Whether x+ = F x grows beyond all digits."""
+    radius = float(np.max(np.abs(np.linalg.eigvals(F)), initial=0.0)) if F.size else 0.0
+    return radius > 1 and n_samples * np.log(radius) > _RUNAWAY
 
 
 def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:

@@ -21,8 +21,6 @@ from ambid.physics.discretise import zero_order_hold
 
 Array = NDArray[np.float64]
 
-_RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record from which nothing is left of its digits
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Errors:
@@ -81,7 +79,7 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
     claims_noise = bool(np.any(model.K)) or not model.n_inputs
     if not claims_noise and not stable(model):
         model = _mirrored(model, fit.noise_covariance)
-    e = _one_step_error(model, data, data.y, fit)
+    e = data.y - one_step(model, data.u, data.y, fit.offsets)
     simulated = simulation(plant, data.u, data.y, fit.offsets)
     simulated = None if simulated is None else data.y - simulated
     return Errors(model=model, plant=plant, one_step=e, simulation=simulated, claims_noise=claims_noise)
@@ -116,7 +114,7 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
     for _ in range(2):
         if np.all(np.isfinite(e)):
             moved += np.linalg.lstsq(through, e[late].mean(axis=0), rcond=1e-6)[0]
-            e = _one_step_error(m, data, data.y - moved, fit)
+            e = data.y - moved - one_step(m, data.u, data.y - moved, fit.offsets)
         if simulated is not None:
             shifted += simulated[late].mean(axis=0)
             y = data.y - shifted
@@ -147,14 +145,6 @@ def _mirrored(model: StateSpaceModel, noise: Array) -> StateSpaceModel:
     S = model.C @ P @ model.C.T + R / np.trace(R)
     K = np.linalg.solve(S, model.C @ P @ model.A.T).T
     return StateSpaceModel(A=model.A, B=model.B, C=model.C, D=model.D, K=K, dt=model.dt)
-
-
-def _one_step_error(model: StateSpaceModel, data: IOData, y: Array, fit: BlackBoxFit) -> Array:
-    F = model.A - model.K @ model.C
-    radius = float(np.max(np.abs(np.linalg.eigvals(F)), initial=0.0)) if model.order else 0.0
-    if radius > 1 and data.n_samples * np.log(radius) > _RUNAWAY:
-        return np.full(y.shape, np.nan)
-    return y - one_step(model, data.u, y, fit.offsets)
 
 
 def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
