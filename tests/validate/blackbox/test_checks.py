@@ -213,7 +213,7 @@ def test_the_tangent_of_a_state_space_holds_the_change_of_every_entry():
             for o, J in enumerate(rows):
                 rest = slope[60:, o] - J[60:] @ np.linalg.lstsq(J[60:], slope[60:, o], rcond=1e-10)[0]
                 assert np.linalg.norm(rest) < 1e-5 * np.linalg.norm(slope[60:]) + 1e-9, (name, at)
-    assert wide.shape[1] == 2 * (2 + 1 + 2) + 1
+    assert wide.shape[1] == 2 * (2 + 1 + 2) + 2
 
 
 def by_hand(model, data) -> BlackBoxFit:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.gradient import Sensitivities
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import stable, states
 from ambid.identify.blackbox.transfer_model import TransferModel
@@ -22,6 +23,8 @@ from ambid.validate.blackbox.predictor import Errors, held_transfer
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+_BLOCK = 4096  # samples at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,21 +156,12 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
 
 
 def _state_space_tangent(found: Errors, u: Array, y: Array) -> tuple[Array, ...]:
-    """Move along A, B, K (and D): C (q - F)^-1 e_i times each of x, u and e, and u itself.
-
-    The rows C (q - F)^-1 come from the transposed system, driven by one signal for each output.
-    """
-    m, e = found.model, found.one_step
-    F = m.A - m.K @ m.C
-    noise = bool(np.any(m.K))
-    x = states(F, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
-    signals = np.hstack([x, u, e] if noise else [x, u])
-    out = list[Array]()
-    for o in range(m.n_outputs):
-        drive = m.C[o][:, None]
-        rows = [states(F.T, drive, signals[:, j : j + 1]) for j in range(signals.shape[1])]
-        if np.any(m.D):
-            # D moves the prediction at once and, through the gain, the state
-            rows.append(u)
-        out.append(np.hstack(rows) if rows else np.zeros((u.shape[0], 0)))
-    return tuple(out)
+    """Move along every entry of A and B, of K where there is noise, and of D where there is any."""
+    m = found.model
+    x = states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
+    moves = {"A": True, "B": True, "C": False, "D": bool(np.any(m.D)), "K": bool(np.any(m.K))}
+    free = np.concatenate([np.full(getattr(m, name).size, moves[name]) for name in "ABCDK"])
+    along = Sensitivities(m, np.eye(free.size)[:, free])
+    signals = np.hstack([x, u, found.one_step])
+    blocks = [along.block(signals[k : k + _BLOCK]) for k in range(0, u.shape[0], _BLOCK)]
+    return tuple(np.concatenate(blocks, axis=1))
