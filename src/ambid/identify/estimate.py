@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, nearest
 
 Array = NDArray[np.float64]
 
@@ -217,13 +217,7 @@ class Estimate:
         EstimationError
             If the model has none of that name.
         """
-        for p in self.parameters:
-            if p.name == name:
-                return p
-        raise EstimationError(
-            f"the estimate has no parameter {name!r}; it has {', '.join(p.name for p in self.parameters)}. "
-            "Check the name"
-        )
+        return parameter_named(self.parameters, name)
 
     @property
     def values(self) -> dict[str, float]:
@@ -245,3 +239,29 @@ class Estimate:
         from ambid.identify.estimate_file import estimate_text
 
         return estimate_text(self)
+
+
+def parameter_named(parameters: Sequence[EstimatedParameter], name: str) -> EstimatedParameter:
+    """Return one of several parameters.
+
+    Parameters
+    ----------
+    parameters : sequence of EstimatedParameter
+    name : str
+
+    Returns
+    -------
+    EstimatedParameter
+
+    Raises
+    ------
+    EstimationError
+        If there is none of that name.
+    """
+    for p in parameters:
+        if p.name == name:
+            return p
+    names = [p.name for p in parameters]
+    raise EstimationError(
+        f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
+    )

@@ -10,8 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.errors import EstimationError
-from ambid.identify.estimate import Check, Continuous, Delay, EstimatedParameter
+from ambid.identify.estimate import Check, Continuous, Delay, EstimatedParameter, parameter_named
 from ambid.identify.frequency.lines import Lines
 from ambid.identify.frequency.physical_problem import PhysicalProblem
 from ambid.identify.uncertainty import WEAK, inverse_information
@@ -88,11 +87,7 @@ class FrequencyEstimate:
         EstimationError
             If the model has none of that name.
         """
-        for p in self.parameters:
-            if p.name == name:
-                return p
-        names = [p.name for p in self.parameters]
-        raise EstimationError(f"the estimate has no parameter {name!r}; it has {', '.join(names)}. Check the name")
+        return parameter_named(self.parameters, name)
 
 
 def frequency_estimate(
