@@ -6,20 +6,13 @@ and outputs is, whatever the controller; with a model of the equation's noise as
 
 from __future__ import annotations
 
-import numpy as np
-
-from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
-from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals, refined, step
+from ambid.identify.instrumental.arx_form import ArxEstimate, ArxOrders, Signals
+from ambid.identify.instrumental.corners import searched
 from ambid.identify.instrumental.iv4 import arx_fit, arx_orders, centred
 from ambid.identify.instrumental.reference import reference_part, wants_reference
-
-_NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it
-_CORNERS = (np.inf, 0.5, 0.1, 0.02)  # of the filters of the first step, in radians a sample
-_ROUGH = 3
-_ROUNDS = 30  # noise model and estimate in turn, at most; sampled fast, the first estimate is a poor start
 
 
 def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -71,20 +64,4 @@ def in_loop(signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
     EstimationError
         If the reference does not move every term.
     """
-    highest = orders.size + _NOISE_ORDER
-    best: ArxEstimate | None = None
-    for corner in _CORNERS:
-        C = np.asarray(np.poly(np.full(orders.na, np.exp(-corner)))) if np.isfinite(corner) else np.ones(1)
-        try:
-            theta = step("cliv", signals, clean, orders, C=C).theta
-            found = refined("cliv", signals, clean, orders, theta, highest, _ROUGH)
-        except EstimationError:
-            continue
-        if best is None or found.noise.variance < best.noise.variance:
-            best = found
-    if best is None:
-        raise EstimationError(
-            "cliv: the reference does not move every term of this model. Lower the orders, or excite more frequencies"
-        )
-    theta = best.solution.theta
-    return refined("cliv", signals, clean, orders, theta, highest, _ROUNDS)
+    return searched("cliv", signals, clean, orders)

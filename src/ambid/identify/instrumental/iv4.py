@@ -2,6 +2,8 @@
 
 Least squares is biased where the equation's noise is not white. Instruments simulated from the inputs alone carry no
 noise; filtering with a model of the noise makes the estimate as sharp as a method without a noise model of G can be.
+The four steps from least squares end far from the plant where sampling is fast or damping light: here the first
+instruments are what a long autoregression makes of the inputs, and the last two steps are repeated until they settle.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.made import made
@@ -24,12 +27,14 @@ from ambid.identify.instrumental.arx_form import (
     operating_point,
     optimal,
     polynomials,
-    step,
 )
+from ambid.identify.instrumental.corners import NOISE_ORDER, exact, searched
+from ambid.identify.instrumental.reference import reference_part
 
 Array = NDArray[np.float64]
 
-_NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it
+_ROUNDS = 10  # of instruments from the model itself, at most
+_SETTLED = 1e-4  # change of the filtered output by a round, relative to the innovations
 _INSIDE = 0.999  # radius to which the poles of an unstable instrument are drawn
 
 
@@ -55,7 +60,11 @@ def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
     """
     used = arx_orders("iv4", data, orders)
     deviations, means, sds = centred(data)
-    found = [_one_output(Signals(y=deviations.y[:, o], u=deviations.u), used) for o in range(data.n_outputs)]
+    explained = _explained(deviations)
+    found = [
+        _one_output(Signals(y=y, u=deviations.u), used, None if explained is None else explained[:, o])
+        for o, y in enumerate(deviations.y.T)
+    ]
     return arx_fit("iv4", data, used, found, means, sds)
 
 
@@ -157,11 +166,33 @@ def arx_fit(
     )
 
 
-def _one_output(signals: Signals, orders: ArxOrders) -> ArxEstimate:
-    start = least_squares("iv4", signals, orders)
-    theta = step("iv4", signals, _simulated(signals, start, orders), orders).theta
-    highest = orders.size + _NOISE_ORDER
-    return optimal("iv4", signals, _simulated(signals, theta, orders), orders, theta, highest)
+def _one_output(signals: Signals, orders: ArxOrders, explained: Array | None) -> ArxEstimate:
+    """Instruments from what the inputs explain of the output, then from the model itself, until it stands still."""
+    if explained is None:
+        start = least_squares("iv4", signals, orders)
+        clean = _simulated(signals, start, orders)
+    else:
+        clean = Signals(y=explained, u=signals.u)
+    found, highest = searched("iv4", signals, clean, orders), orders.size + NOISE_ORDER
+    for _ in range(0 if exact(found, signals) else _ROUNDS):
+        before = found.solution.theta
+        found = optimal("iv4", signals, _simulated(signals, before, orders), orders, before, highest)
+        moved = np.linalg.pinv(found.solution.inverse) @ (found.solution.theta - before)
+        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
+            break
+    return found
+
+
+def _explained(deviations: IOData) -> Array | None:
+    """What the inputs alone make of the outputs, by an autoregression of many lags; None where none is stable."""
+    from dataclasses import replace
+
+    u, names = deviations.u, deviations.inputs
+    alone = replace(deviations, u=np.empty((u.shape[0], 0)), inputs=(), reference=u, references=names)
+    try:
+        return reference_part("iv4", alone).y
+    except EstimationError:
+        return None
 
 
 def _simulated(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
