@@ -36,3 +36,47 @@ def test_a_step_from_rest(step, ambid):
     refused = ambid("fit", "step.csv", "--structure", "iv4", *words)
     assert refused.code != 0
     assert "iv4 cannot be told that a record begins at rest; fir, arx, armax" in " ".join(refused.err.split())
+
+
+@pytest.fixture(scope="module")
+def bearing(tmp_path_factory):
+    """A levitated bearing and its rig, 1 s."""
+    from ambid.cli import run
+
+    folder = tmp_path_factory.mktemp("bearing")
+    record = str(folder / "loop.csv")
+    assert (
+        run(["simulate", "unstable-bearing", "-o", record, "--duration", "1", "--band", "5:2000", "--seed", "3"]) == 0
+    )
+    assert run(["init", record, "-o", str(folder / "rig.toml")]) == 0
+    return folder
+
+
+def test_with_a_rig_physical_parameters_follow(bearing, ambid, monkeypatch):
+    monkeypatch.chdir(bearing)
+    words = ("--rig", "rig.toml", "--structure", "sspem", "--orders", "n=4", "--json", "fit.json", "--strict")
+    found = ambid("fit", "loop.csv", *words)
+    assert found.code == 0, found.err
+    assert "physical parameters of model one-axis, from sspem" in found.out
+    assert max(map(len, found.out.splitlines())) <= 80
+    document = json.loads((bearing / "fit.json").read_text())
+    assert (document["inputs"], document["outputs"]) == (["voltage"], ["position", "current"])
+    physical = document["physical"]
+    assert physical["misfit"]["passed"]
+    assert physical["delay"]["samples"] == 1
+    truth = {"m": 4.0, "k_x": -129.01e3, "k_i": 55.734, "R": 1.6, "L": 26.0769e-3}
+    for name, true in truth.items():
+        p = physical["parameters"][name]
+        assert abs(p["value"] - true) < 4 * p["sd"], name
+        assert p["sd"] < 0.05 * abs(true), name
+    judged = ambid("validate", "fit.json", "loop.csv")
+    assert judged.code == 0
+
+
+def test_a_fit_that_cannot_carry_the_rig_s_model_is_refused(bearing, ambid, monkeypatch):
+    monkeypatch.chdir(bearing)
+    words = ("--rig", "rig.toml", "--structure", "sspem", "--orders", "n=2", "--output", "position")
+    refused = ambid("fit", "loop.csv", *words, "--json", "none.json")
+    assert refused.code == 2
+    assert len(refused.err.splitlines()) == 1
+    assert not (bearing / "none.json").exists()

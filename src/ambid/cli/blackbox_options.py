@@ -16,8 +16,9 @@ Inputs = Annotated[
     list[str] | None,
     typer.Option("--input", metavar="COL", help="Input column; repeat for several.", show_default=False),
 ]
-Outputs_ = Annotated[
-    list[str], typer.Option("--output", metavar="COL", help="Output column; repeat for several.", show_default=False)
+OutputColumns = Annotated[
+    list[str] | None,
+    typer.Option("--output", metavar="COL", help="Output column; repeat for several.", show_default=False),
 ]
 References = Annotated[
     list[str] | None,

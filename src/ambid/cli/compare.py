@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli.blackbox_options import Inputs, OpenLoop, Outputs_, References, SecondRecord, orders_of
+from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, SecondRecord, orders_of
 from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
@@ -23,7 +23,7 @@ def command(
             show_default=False,
         ),
     ],
-    output: Outputs_,
+    output: OutputColumns = None,
     inputs: Inputs = None,
     reference: References = None,
     open_loop: OpenLoop = False,
@@ -56,7 +56,7 @@ def command(
                 record,
                 wanted,
                 inputs=inputs or (),
-                outputs=output,
+                outputs=output or (),
                 references=reference or (),
                 open_loop=open_loop,
                 from_s=from_s,

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import json as json_format
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli.blackbox_options import Inputs, OpenLoop, Outputs_, References, SecondRecord, fixed_of, orders_of
-from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, Strict, To, json_path
+from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, SecondRecord, fixed_of, orders_of
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
+
+if TYPE_CHECKING:
+    from ambid.identify.blackbox.fit import BlackBoxFit
+    from ambid.identify.physical import PhysicalFit
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
 
 def command(
     record: RecordFile,
-    output: Outputs_,
     structure: Annotated[
         str,
         typer.Option("--structure", metavar="NAME", help="Structure; 'ambid models' lists them.", show_default=False),
     ],
     inputs: Inputs = None,
+    output: OutputColumns = None,
     orders: Annotated[
         str,
         typer.Option(
@@ -38,6 +43,7 @@ def command(
         list[str] | None,
         typer.Option("--fix", metavar="NAME=NUMBER", help="A coefficient that is known; repeat.", show_default=False),
     ] = None,
+    rig: RigFile = None,
     reference: References = None,
     open_loop: OpenLoop = False,
     at_rest: Annotated[
@@ -72,20 +78,22 @@ def command(
     """Fit a black-box model to a record: polynomial, subspace or continuous-time structures.
 
     The plant is taken to be under feedback unless --open-loop says otherwise: structures that feedback disturbs warn.
+    With --rig, inputs and outputs are the rig's, and the fit is carried on to its physical parameters.
     """
-    from ambid.identify.blackbox.fit_file import fit_text as fit_json
-    from ambid.job import fit, read_data
-    from ambid.report.fit_text import fit_text
+    from ambid.job import fit, physics, read_data
+    from ambid.report.fit_text import fit_text, physics_text
+    from ambid.rig import load_rig
 
-    with Outputs(record, second) as outputs:
+    with Outputs(record, second, rig) as outputs:
         outputs.claim(json_path(json), "--json")
         outputs.claim(plot, "--plot", FIGURE_ENDINGS)
         wanted, known = orders_of(orders), fixed_of(fix)
+        bench = None if rig is None else load_rig(rig)
         with progress("fit") as tick:
             found = fit(
                 record,
                 inputs=inputs or (),
-                outputs=output,
+                outputs=output or (),
                 structure_name=structure,
                 orders=wanted,
                 criterion=criterion,
@@ -100,22 +108,39 @@ def command(
                 validate=second,
                 validate_from_s=validate_from,
                 validate_to_s=validate_to,
+                rig=bench,
                 tick=tick,
             )
+            physical = None if bench is None else physics(found, bench)
             if plot is not None:
                 from ambid.report.figures import save
                 from ambid.report.fit_figures import overview
 
                 tick("draw")
-                data = read_data(record, inputs or (), output, part=(from_s, to_s), rate_hz=rate, gaps=gaps)
+                data = read_data(
+                    record, inputs or (), output or (), part=(from_s, to_s), rate_hz=rate, gaps=gaps, rig=bench
+                )
                 page = overview(found, data)
                 outputs.stage(plot, lambda path: save(page, path))
-        path = json_path(json)
-        if path is not None:
-            outputs.stage_text(path, fit_json(found))
+        written = _json_text(found, physical)
+        if (path := json_path(json)) is not None:
+            outputs.stage_text(path, written)
         elif json == "-":
-            typer.echo(fit_json(found), nl=False)
+            typer.echo(written, nl=False)
     if json != "-":
         typer.echo(fit_text(found, paint=painter()))
-    if strict and not found.passed:
+        if physical is not None:
+            typer.echo("\n" + physics_text(physical, paint=painter()))
+    if strict and not (found.passed and (physical is None or physical.passed)):
         raise typer.Exit(FAILED_CHECK)
+
+
+def _json_text(found: BlackBoxFit, physical: PhysicalFit | None) -> str:
+    """The fit as ``ambid.fit/1``, with ``physical`` where a rig was given."""
+    from ambid.identify.blackbox.fit_file import fit_to_json
+    from ambid.identify.physical_file import physical_to_json
+
+    document = fit_to_json(found)
+    if physical is not None:
+        document["physical"] = physical_to_json(physical)
+    return json_format.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ambid.cli.blackbox_options import Inputs, OpenLoop, References, orders_of
+from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, orders_of
 from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
@@ -22,10 +22,7 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 def command(
     record: RecordFile,
     inputs: Inputs = None,
-    output: Annotated[
-        list[str] | None,
-        typer.Option("--output", metavar="COL", help="Output column; repeat for several.", show_default=False),
-    ] = None,
+    output: OutputColumns = None,
     reference: References = None,
     open_loop: OpenLoop = False,
     method: Annotated[

@@ -4,8 +4,8 @@
 Command line, benchmarks and tests call these functions, so that what is tested is what runs.
 """
 
-from ambid.job.blackbox import compare, fit, read_data
+from ambid.job.blackbox import compare, fit, physics, read_data
 from ambid.job.frequency import frf
 from ambid.job.physical import identify, judged, load, signals_of
 
-__all__ = ["compare", "fit", "frf", "identify", "judged", "load", "read_data", "signals_of"]
+__all__ = ["compare", "fit", "frf", "identify", "judged", "load", "physics", "read_data", "signals_of"]

@@ -16,10 +16,14 @@ from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.structures import STRUCTURES, Structure, structure
+from ambid.job.bench_data import bench_data
+from ambid.physics.models import model
 from ambid.record import Record, read_record
+from ambid.rig import Rig, load_rig
 from ambid.signals.samples import cut
 
 if TYPE_CHECKING:
+    from ambid.identify.physical import PhysicalFit
     from ambid.validate.comparison import Comparison
 
 Tick = Callable[[str], None]
@@ -28,8 +32,8 @@ Tick = Callable[[str], None]
 def fit(
     record: Record | str | Path,
     *,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
     structure_name: str,
     orders: Orders | None = None,
     criterion: str = "bic",
@@ -44,6 +48,7 @@ def fit(
     validate: Record | str | Path | None = None,
     validate_from_s: float | None = None,
     validate_to_s: float | None = None,
+    rig: Rig | str | Path | None = None,
     tick: Tick | None = None,
 ) -> BlackBoxFit:
     """Fit a black-box model to one record, and judge it.
@@ -78,6 +83,8 @@ def fit(
         A second record to judge on; may be the first, with another part.
     validate_from_s, validate_to_s : float, optional
         Part of the second record to use, in s; default all of it.
+    rig : Rig, str or Path, optional
+        Names and calibrates the channels; without `inputs` and `outputs` all of its model are taken.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
 
@@ -97,17 +104,17 @@ def fit(
 
     say = tick or _silent
     of = structure(structure_name)
-    _check_use(of, inputs, fixed, at_rest=at_rest)
+    bench = rig if isinstance(rig, Rig) or rig is None else load_rig(rig)
     laps, last = dict[str, float](), time.perf_counter()
-    data = read_data(
-        record, inputs, outputs, references, open_loop=open_loop, part=(from_s, to_s), rate_hz=rate_hz, gaps=gaps
-    )
-    second = None
-    if validate is not None:
-        part = (validate_from_s, validate_to_s)
-        second = read_data(
-            validate, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
+
+    def read(source: Record | str | Path, part: tuple[float | None, float | None]) -> IOData:
+        return read_data(
+            source, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps, rig=bench
         )
+
+    _check_use(of, inputs if bench is None else inputs or model(bench.model).inputs, fixed, at_rest=at_rest)
+    data = read(record, (from_s, to_s))
+    second = None if validate is None else read(validate, (validate_from_s, validate_to_s))
     laps["read"], last = time.perf_counter() - last, time.perf_counter()
     with one_thread():
         chosen: dict[str, object] = {}
@@ -127,6 +134,32 @@ def fit(
         found = judged(found, data, second=second)
         laps["checks"] = time.perf_counter() - last
     return replace(found, timing_s=laps, details={**found.details, **chosen})
+
+
+def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
+    """Carry a fit to the physical parameters of a rig.
+
+    Parameters
+    ----------
+    found : BlackBoxFit
+        With inputs and outputs named by role.
+    rig : Rig, str or Path
+        Its model, what it fixes and knows, its delay.
+
+    Returns
+    -------
+    PhysicalFit
+
+    Raises
+    ------
+    EstimationError
+        If the fit cannot carry the model: inputs, outputs, poles or a covariance are missing.
+    """
+    from ambid.identify.physical import physical_parameters
+
+    bench = rig if isinstance(rig, Rig) else load_rig(rig)
+    plant = model(bench.model)
+    return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
 
 
 def compare(
@@ -201,6 +234,7 @@ def read_data(
     part: tuple[float | None, float | None] = (None, None),
     rate_hz: float | None = None,
     gaps: str | None = None,
+    rig: Rig | None = None,
 ) -> IOData:
     """Read a record, cut it and take inputs and outputs out of it.
 
@@ -214,6 +248,8 @@ def read_data(
         From and to, in s.
     rate_hz : float, optional
     gaps : {"error", "interpolate", "cut"}, optional
+    rig : Rig, optional
+        Names inputs and outputs by role and calibrates them; where none are named, all of its model are taken.
 
     Returns
     -------
@@ -224,6 +260,10 @@ def read_data(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
+    if rig is not None:
+        return bench_data(
+            record, rig, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
+        )
     if not isinstance(record, Record):
         record = read_record(record, rate_hz=rate_hz, gaps=gaps or "error")  # type: ignore[arg-type]
     if part != (None, None):

@@ -13,20 +13,19 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.errors import EstimationError, RecordError
-from ambid.identify.blackbox.data import IOData, io_data
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.frequency.measured import Measured
 from ambid.identify.frequency.physical_estimate import FrequencyEstimate
+from ambid.job.bench_data import bench_data
 from ambid.job.blackbox import Tick, read_data
 from ambid.physics.models import model
-from ambid.record import Record, read_record
-from ambid.rig import Rig, bench_record, load_rig, mat_variables
+from ambid.record import Record
+from ambid.rig import Rig, load_rig
 from ambid.signals.frf import FrequencyResponse, Hold, Method, frequency_response, repeats
-from ambid.signals.samples import cut
-from ambid.units import UNKNOWN
 
 Delay = float | Literal["auto"]
 
@@ -116,7 +115,9 @@ def frf(
             record, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
         )
     else:
-        data = _bench_data(record, rig, inputs, outputs, references, open_loop, part, rate_hz, gaps)
+        data = bench_data(
+            record, rig, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
+        )
     laps["read"], last = time.perf_counter() - last, time.perf_counter()
     say("measure")
     response = _measured(data, method, hold, band)
@@ -169,59 +170,6 @@ def _agree(
         raise EstimationError("--delay is for a model; none is asked for. Give --orders, --state-space or --rig too")
     if isinstance(delay, float | int) and not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
-
-
-def _bench_data(
-    record: Record | str | Path,
-    rig: Rig,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    references: Sequence[str],
-    open_loop: bool,
-    part: tuple[float | None, float | None],
-    rate_hz: float | None,
-    gaps: str | None,
-) -> IOData:
-    """Inputs and outputs by role, calibrated; references as they stand in the file, or by role."""
-    plant = model(rig.model)
-    if isinstance(record, Record):
-        bench, raw = record, record
-    else:
-        mat = Path(record).suffix.lower() == ".mat"
-        variables = {**{x: (x, UNKNOWN) for x in references}, **mat_variables(rig)} if mat else None
-        raw = read_record(
-            record,
-            rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz,
-            gaps=gaps or rig.record.gaps or "error",  # type: ignore[arg-type]
-            variables=variables,
-        )
-        bench = bench_record(raw, rig)
-    beside = []
-    for name in references:
-        if name not in bench.names and name not in raw.names:
-            raise RecordError(
-                f"the record has no column {name!r} for the reference; it has {', '.join(raw.names)}. Correct "
-                "--reference"
-            )
-        if name not in bench.names:
-            beside.append(raw.channel(name))
-    bench = replace(bench, channels=(*bench.channels, *beside))
-    first, last = (a if a is not None else b for a, b in zip(part, (rig.record.from_s, rig.record.to_s), strict=True))
-    if first is not None or last is not None:
-        bench = cut(bench, first, last)
-    ins = [_role(x, rig, plant.inputs, "input") for x in inputs] or list(plant.inputs)
-    outs = [_role(x, rig, plant.outputs, "output") for x in outputs] or list(plant.outputs)
-    return io_data(bench, ins, outs, references=references, open_loop=open_loop or rig.open_loop)
-
-
-def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
-    found = next((c.role for c in rig.channels if name in (c.role, c.column) and c.role in roles), None)
-    if found is None:
-        raise EstimationError(
-            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or leave "
-            f"--{what} out for all"
-        )
-    return found
 
 
 def _measured(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:

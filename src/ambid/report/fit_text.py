@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.blackbox.structures import structure
 from ambid.report.numbers import quantity, sized
-from ambid.report.text import WIDTH, Paint, check_lines, columns, plain
+from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain
+
+if TYPE_CHECKING:
+    from ambid.identify.physical import PhysicalFit
 
 _SHOWN = 24  # coefficients that a terminal shows; the file has all
 
@@ -45,6 +48,35 @@ def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> s
         [paint(_timing_line(fit), "dim")] if fit.timing_s else [],
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write the physical parameters that follow from a fit.
+
+    Parameters
+    ----------
+    found : PhysicalFit
+    width : int
+        Columns of the terminal.
+    paint : callable
+        Adds colour.
+
+    Returns
+    -------
+    str
+        Parameters, delay, whether the fit can be this physics, and warnings, without a final line feed.
+    """
+    d = found.delay
+    total = d.samples + d.fraction
+    low, high = found.band_hz
+    lines = [
+        paint(f"physical parameters of model {found.model}, from {found.structure}", "strong"),
+        *parameter_lines(found, width=width, paint=paint),
+        f"delay {total:.3g} sample{'' if total == 1 else 's'}, {d.how}; from {sized(low, 'Hz')} to {sized(high, 'Hz')}",
+        *check_lines({"misfit": found.misfit}, width=width, paint=paint),
+        *_warnings([w for w in found.warnings if w != found.misfit.detail], width, paint),
+    ]
+    return "\n".join(lines)
 
 
 def _header(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
@@ -188,11 +220,14 @@ def _number(x: float | None) -> str:
 
 def _warning_lines(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
     said = {c.detail for c in fit.checks.values()}
+    return _warnings([w for w in fit.warnings if w not in said], width, paint)
+
+
+def _warnings(warnings: Sequence[str], width: int, paint: Paint) -> list[str]:
     lines: list[str] = []
-    for warning in fit.warnings:
-        if warning not in said:
-            first, *more = textwrap.wrap(warning, width - 9, break_long_words=False, break_on_hyphens=False)
-            lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
+    for warning in warnings:
+        first, *more = textwrap.wrap(warning, width - 9, break_long_words=False, break_on_hyphens=False)
+        lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
     return lines
 
 

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 from ambid.identify.estimate import Check, Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.numbers import Quantity, quantity, sized
 
-if TYPE_CHECKING:
-    from ambid.identify.frequency.physical_estimate import FrequencyEstimate
-
 Style = Literal["good", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
 
 WIDTH = 80
+
+
+class Parameters(Protocol):
+    """Anything that has estimated parameters.
+
+    Attributes
+    ----------
+    parameters : tuple of EstimatedParameter
+    """
+
+    @property
+    def parameters(self) -> tuple[EstimatedParameter, ...]: ...  # noqa: D102
 
 
 def plain(text: str, style: Style) -> str:
@@ -93,13 +102,13 @@ def header_line(estimate: Estimate, paint: Paint = plain) -> str:
     )
 
 
-def parameter_lines(estimate: Estimate | FrequencyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+def parameter_lines(estimate: Parameters, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write the table of the parameters.
 
     Parameters
     ----------
-    estimate : Estimate or FrequencyEstimate
-        Any.
+    estimate : Parameters
+        Anything that has estimated parameters.
     width : int
         Columns of the terminal; where they are too few, the column of SI values is left out.
     paint : callable

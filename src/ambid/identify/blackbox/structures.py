@@ -104,15 +104,19 @@ STRUCTURES: Mapping[str, Structure] = {
         _polynomial("oe", "nb nf nk", "biased", "y = B/F u + e"),
         _polynomial("bj", "nb nc nd nf nk", "with noise model", "y = B/F u + C/D e"),
         _instrumental("iv4", "na nb nk", "biased", "q", "A y = B u + noise of any colour"),
-        _instrumental("cliv", "na nb nk", "consistent", "q", "the same in a loop, with its reference"),
+        _instrumental(
+            "cliv", "na nb nk", "consistent", "q", "A y = B u + noise of any colour, in a loop with its reference"
+        ),
         _instrumental("srivc", "nb nf nk", "biased", "s", "y = B(s)/F(s) u + noise, continuous time"),
-        _instrumental("clsrivc", "nb nf nk", "consistent", "s", "the same in a loop, with its reference"),
+        _instrumental(
+            "clsrivc", "nb nf nk", "consistent", "s", "y = B(s)/F(s) u + noise, in a loop with its reference"
+        ),
         _instrumental("two-stage", "nb nf nk", "consistent", "q", "y = B/F u in a loop: reference to input, then oe"),
-        _subspace("n4sid", "biased", "x+ = A x + B u + K e by oblique projection"),
-        _subspace("moesp", "biased", "the same, past without future inputs"),
-        _subspace("cva", "biased", "the same, canonical variates"),
-        _subspace("pbsid", "consistent", "the same from a long autoregression: feedback does not disturb it"),
-        _subspace("sspem", "with noise model", "the same by prediction error, started from pbsid: the sharpest"),
+        _subspace("n4sid", "biased", "x+ = A x + B u + K e, subspace by oblique projection"),
+        _subspace("moesp", "biased", "x+ = A x + B u + K e, subspace, past without future inputs"),
+        _subspace("cva", "biased", "x+ = A x + B u + K e, subspace by canonical variates"),
+        _subspace("pbsid", "consistent", "x+ = A x + B u + K e, subspace from a long autoregression; stands feedback"),
+        _subspace("sspem", "with noise model", "x+ = A x + B u + K e by prediction error: the sharpest"),
         Structure(
             name="rfir",
             summary="y = B u + e, many taps with a fading prior",

@@ -1,0 +1,36 @@
+"""Physical parameters from a black box as JSON, beside the fit that they came from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ambid.identify.estimate_file import parameter_json
+from ambid.identify.json_values import check_json, plain_json
+from ambid.identify.physical import PhysicalFit
+
+
+def physical_to_json(found: PhysicalFit) -> dict[str, Any]:
+    """Return physical parameters in the words of schema ``ambid.estimate/1``.
+
+    Parameters
+    ----------
+    found : PhysicalFit
+
+    Returns
+    -------
+    dict
+        ``model``, ``parameters``, ``covariance``, ``delay``, ``misfit``, ``band_hz``, ``warnings``; SI.
+    """
+    d = found.delay
+    document = {
+        "model": found.model,
+        "parameters": {p.name: parameter_json(p) for p in found.parameters},
+        "covariance": {"names": found.covariance_names, "matrix": found.covariance},
+        "delay": {
+            "samples": d.samples, "fraction": d.fraction, "total": d.samples + d.fraction, "sd": d.sd, "how": d.how
+        },
+        "misfit": check_json(found.misfit),
+        "band_hz": found.band_hz,
+        "warnings": found.warnings,
+    }  # fmt: skip
+    return {name: plain_json(value) for name, value in document.items()}
