@@ -84,7 +84,7 @@ def test_starts_from_a_grid_hold_slow_roots() -> None:
     assert not list(separable_starts(layout("oe", nb=2, nf=2), scaled.y[0], scaled.y))
 
 
-@pytest.mark.parametrize("name", ["armax", "ararx", "ararmax"])
+@pytest.mark.parametrize("name", ["armax", "ararx", "ararmax", "oe", "bj"])
 def test_the_search_ends_as_low_as_from_the_truth(name: str) -> None:
     worse = 0
     for seed in range(30):
@@ -92,16 +92,18 @@ def test_the_search_ends_as_low_as_from_the_truth(name: str) -> None:
         n = int(rng.integers(1, 4))
         A = np.poly(rng.uniform(-0.5, 0.97, n))
         B = np.r_[0.0, rng.standard_normal(n)]
-        C = np.poly(rng.uniform(-0.8, 0.97, 1)) if name != "ararx" else np.ones(1)
-        D = np.poly(rng.uniform(-0.8, 0.9, 1)) if name != "armax" else np.ones(1)
+        C = np.poly(rng.uniform(-0.8, 0.97, 1)) if name in ("armax", "ararmax", "bj") else np.ones(1)
+        D = np.poly(rng.uniform(-0.8, 0.9, 1)) if name in ("ararx", "ararmax", "bj") else np.ones(1)
         u = rng.standard_normal(800)
-        e = lfilter(C, np.convolve(A, D), rng.standard_normal(800))
+        plant = "F" if name in ("oe", "bj") else "A"
+        e = lfilter(C, np.convolve(A, D) if plant == "A" else D, rng.standard_normal(800))
         g = lfilter(B, A, u)
         y = g + e * np.std(g) / np.std(e) / 2
         scaled = scaled_data(name, record(u[:, None], y[:, None], open_loop=True))
-        of = layout(name, na=n, nb=n, nc=C.size - 1, nd=D.size - 1)
+        of = layout(name, **{f"n{plant.lower()}": n}, nb=n, nc=C.size - 1, nd=D.size - 1)
         truth = of.start()
-        truth[of.places["A", None]], truth[of.places["C", None]], truth[of.places["D", None]] = A, C, D
+        truth[of.places["C", None]], truth[of.places["D", None]] = C, D
+        truth[of.places[plant, None if plant == "A" else 0]] = A
         truth[of.places["B", 0]] = B * scaled.u_scale[0] / scaled.y_scale[0]
         there = searched(predictor(of), scaled.y[0], scaled.u, truth)
         fit = engine.fit_output(name, of, scaled, 0, {}, None)

@@ -24,13 +24,14 @@ from ambid.identify.polynomial.scaled import Scaled, liveliest, scaled_data, uni
 from ambid.identify.polynomial.search import Fitted, searched
 from ambid.identify.polynomial.separable import SMOOTH, separable_starts
 from ambid.identify.polynomial.stability import stable_predictor
-from ambid.identify.polynomial.starts import starts
+from ambid.identify.polynomial.starts import starts, weighted_starts
 from ambid.identify.threads import one_thread
 
 Array = NDArray[np.float64]
 
 _ROUNDING = 1e-24  # squared residual, in units of the output's variance
 _WINDOW = 8192  # samples of a long record that decide between neighbouring delays
+_EQUAL = 0.5  # of squared residual, in units of the noise variance: minima that are equally likely
 
 
 def estimate(
@@ -152,21 +153,32 @@ def fit_output(
         )
     worth = unit(layout, scaled, o)
     found: list[Fitted] = []
-    for ordinary, some in ((True, starts(layout, y, scaled.u)), (False, separable_starts(layout, y, scaled.u))):
+    shared = bool(layout.na and layout.nd)  # A and D share roots: there always are several minima
+    more = weighted_starts(layout, y, scaled.u) if any(layout.nf) else separable_starts(layout, y, scaled.u)
+    for ordinary, some in ((True, starts(layout, y, scaled.u)), (False, more)):
         for start in some:
             for place, value in known.items():
                 start[place] = value / worth[place]
             if not stable_predictor(layout, start):
                 continue
             found.append(searched(p, y, scaled.u, start, tick=tick))
-            if _smooth(found) and not (ordinary and layout.na and layout.nd):
+            if _agreed(found) if ordinary and shared else _smooth(found):
                 break
-        if _smooth(found) or (layout.na and layout.nd and _agreed(found)):
+        if _smooth(found) and not shared:
             break
-    best = min(found, key=lambda x: x.cost, default=None)
+    best = _best(found)
     if best is None:
         raise EstimationError(f"{name}: no stable predictor to start from. Change the fixed coefficients of C or F")
     return best
+
+
+def _best(found: list[Fitted]) -> Fitted | None:
+    """The lowest minimum; one that converged, where a lower one that did not is not told from it by the data."""
+    best = min(found, key=lambda x: x.cost, default=None)
+    if best is None or best.converged:
+        return best
+    near = [x for x in found if x.converged and x.cost <= best.cost * (1 + _EQUAL / best.n_rows)]
+    return min(near, key=lambda x: x.cost, default=best)
 
 
 def _smooth(found: list[Fitted]) -> bool:
@@ -176,7 +188,7 @@ def _smooth(found: list[Fitted]) -> bool:
 
 
 def _agreed(found: list[Fitted]) -> bool:
-    """Whether two starts led to the lowest minimum; where A and D share roots there always are several."""
+    """Whether two starts led to the lowest minimum."""
     return sum(x.converged and x.cost <= _lowest(found) for x in found) > 1
 
 

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 _ROWS = 4096  # of the long model: more would not make a better start
 _CHUNK = 1024
 _SM_ITERATIONS = 5
+_DOUBLE = np.array([1.0, 1.6, 0.64])  # two roots at -0.8: as a numerator low frequencies, as a denominator high ones
 _WINDOW = 8192  # samples that a start from the data takes of a long record
 
 
@@ -294,6 +295,30 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         for i in range(layout.n_inputs):
             _set(theta, layout, "B", i, found[white.places["B", i]])
             _set(theta, layout, "F", i, found[white.places["F", i]])
+        _set_noise(theta, layout, y, u)
+        yield theta
+
+
+def weighted_starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
+    """Yield starts for hard cases of OE and BJ: the plant from the data with other frequencies stressed.
+
+    Parameters
+    ----------
+    layout : Layout
+    y : ndarray, shape (n_samples,)
+        Scaled, mean taken off.
+    u : ndarray, shape (n_inputs, n_samples)
+
+    Yields
+    ------
+    ndarray, shape (n_theta,)
+    """
+    if layout.n_inputs > 1:
+        return
+    one = np.ones(1)
+    for num, den in ((_DOUBLE, one), (one, _DOUBLE), (one, _DOUBLE * np.array([1.0, -1.0, 1.0]))):
+        fy, fu = filtered(num, den, y), filtered(num, den, u[0])[None, :]
+        theta = _from_data(replace(layout, fixed=()), fy, fu)
         _set_noise(theta, layout, y, u)
         yield theta
 
