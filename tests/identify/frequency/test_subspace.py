@@ -126,6 +126,12 @@ def test_units_do_not_matter():
     np.testing.assert_allclose(two.details["singular_values"][:3], one.details["singular_values"][:3], rtol=1e-6)
 
 
+def test_a_part_of_a_sample_under_a_hold_is_refused():
+    frf = noisy(F, plant("unstable-bearing", F, hold="zoh", delay=0.5), 0.01, 3, hold="zoh")
+    with pytest.raises(EstimationError, match="whole samples"):
+        frf_subspace(frf, {"n": 3}, delay=0.5 / RATE)
+
+
 @pytest.mark.parametrize(
     ("orders", "options", "message"),
     [

@@ -59,6 +59,21 @@ def test_unstable_plant_in_continuous_time():
     assert fit.offsets.y[0] - gain * (fit.offsets.u[0] - 1.0) == pytest.approx(0.3, abs=0.05)
 
 
+def test_an_integrating_plant_is_not_disturbed_by_the_time_before_the_record():
+    # 1000/(s (s + 5)), sampled fast: the noise filter's own transient never fades and was taken for the plant
+    plant, truth = second_order(0.0, 5.0, 1000.0, 0.002), np.array([1000.0, 5.0, 0.0])
+    scores, sampled = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        r = np.repeat(rng.choice([-1.0, 1.0], 1000), 2)
+        d = in_loop(rng, *plant, 0.002, n=2000, noise=0.01, colour=False, kp=6.0, kd=25.0, reference=r)
+        fit = clsrivc(d, {"nf": 2, "nb": 1, "nk": 0})
+        scores.append((fit.model.theta[[0, 2, 3]] - truth) / fit.sd[[0, 2, 3]])
+        sampled.append(np.abs(cliv(d, {"na": 2, "nb": 2, "nk": 1}).model.poles()) - [1.0, np.exp(-0.01)])
+    assert np.sqrt(np.mean(np.square(scores))) < 1.5
+    assert np.max(np.abs(sampled)) < 0.002
+
+
 def test_poles_within_one_percent():
     fit = clsrivc(_rising(np.random.default_rng(3), n=10_000), {"nb": 1, "nf": 2})
     np.testing.assert_allclose(np.sort(fit.model.poles().real), [-300, 300], rtol=0.01)

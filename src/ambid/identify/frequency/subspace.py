@@ -174,6 +174,12 @@ def _order(
         raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
     if not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive. Correct it")
+    samples = delay * frf.rate_hz
+    if frf.hold == "zoh" and abs(samples - round(samples)) > 1e-9 * max(samples, 1.0):
+        raise EstimationError(
+            f"a delay of {delay} s is {samples:.4g} samples; under a hold a part of a sample is no common phase of the "
+            "lines. Give whole samples, or estimate it with greybox_frf or frf_ml in domain 's'"
+        )
     asked = {} if isinstance(orders, str) and orders == "auto" else orders
     known_orders("frf-subspace", asked, ("n",))
     if not left_open(asked, "n"):

@@ -16,7 +16,7 @@ from ambid.identify.blackbox.polynomial_model import Polynomials
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.roots import reflected
 from ambid.identify.instrumental.noise import Autoregression, autoregression, noise_covariance
-from ambid.identify.instrumental.solve import Solution, solve
+from ambid.identify.instrumental.solve import Solution, solve, without
 
 Array = NDArray[np.float64]
 
@@ -145,6 +145,9 @@ def step(
         from scipy.signal import lfilter
 
         rows, Z, target = (lfilter(noise.D, C, x, axis=0)[p:] for x in (rows, Z, target))
+    if C.size > 1:  # what the filter does not know of the time before the record fades with the plant's own poles
+        free = _free(C, rows.shape[0])
+        rows, Z, target = without(free, rows), without(free, Z), without(free, target[:, None])[:, 0]
     return solve(Z, rows, target, who=who)
 
 
@@ -209,7 +212,8 @@ def optimal(
     error = equation_error(data, theta, orders)
     noise, C = autoregression(error, highest), _NO_AVERAGE
     mirrored = reflected(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE)
-    at_output = autoregression(np.asarray(lfilter([1.0], mirrored, error)), highest)
+    outer = np.asarray(lfilter([1.0], mirrored, error))
+    at_output = autoregression(without(_free(mirrored, outer.size), outer[:, None])[:, 0], highest)
     if _cost(at_output, error.size) < _cost(noise, error.size):
         noise, C = at_output, mirrored
     solution = step(who, data, instruments, orders, noise, C)
@@ -256,6 +260,13 @@ def refined(
         if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
             break
     return found
+
+
+def _free(C: Array, n: int) -> Array:
+    """Free responses of 1/C, shape (n, order of C)."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], C, np.eye(n, C.size - 1), axis=0))
 
 
 def _cost(noise: Autoregression, n: int) -> float:
