@@ -9,7 +9,7 @@ feedback; Pillonetto, Chiuso and De Nicolao 2011), and the impulse response foll
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.orders import Orders, known_orders, long_enough, per_input, shown
 from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.identify.blackbox.response import Offsets
+from ambid.identify.instrumental.noise import autoregression
 from ambid.identify.nonparametric.autoregression import predictor_taps, responses
 from ambid.identify.nonparametric.bayes import Posterior, posterior, triangle
 from ambid.identify.nonparametric.kernels import Kernel
@@ -30,6 +31,7 @@ from ambid.identify.threads import one_thread
 Array = NDArray[np.float64]
 
 _ALL: tuple[Kernel, ...] = ("tc", "dc", "ss")
+_NOISE_ORDER = 20  # highest of the noise's autoregression
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
 
 
@@ -250,8 +252,48 @@ def _regressed(
     means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
     y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
     u, y = (data.u - means) / u_sd, (data.y - y_mean) / y_sd
-    t = triangle([(x, k) for x, b, d in zip(u.T, nb, nk, strict=True) for k in range(d, d + b)], y, first)
-    return [posterior(t, o, nb, kernels) for o in range(data.n_outputs)], (means, u_sd), (y_mean, y_sd)
+    lags = [(i, k) for i, (b, d) in enumerate(zip(nb, nk, strict=True)) for k in range(d, d + b)]
+    t = triangle([(u[:, i], k) for i, k in lags], y, first)
+    rough = [posterior(t, o, nb, kernels) for o in range(data.n_outputs)]
+    found = [_whitened(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
+    return found, (means, u_sd), (y_mean, y_sd)
+
+
+def _whitened(
+    rough: Posterior, u: Array, y: Array, nb: tuple[int, ...], lags: Sequence[tuple[int, int]], first: int
+) -> Posterior:
+    """Fit once more with all signals filtered so that the noise is white; as it is where it was white already.
+
+    Noise of another colour would be averaged too well and too badly: the band of the step response would be too narrow
+    by a factor of the noise's memory.
+    """
+    from scipy.signal import lfilter
+
+    left = _left(rough.mean, rough.constant, u, y, lags, first)
+    noise = autoregression(left, _NOISE_ORDER)
+    p = noise.order
+    if not p or left.size - p <= 4 * rough.freedom:
+        return rough
+    v, z = (np.asarray(lfilter(noise.D, 1.0, x, axis=0)[p:]) for x in (u, y))
+    found = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb, (rough.kernel,))
+    constant = found.constant / float(noise.D.sum())
+    left = _left(found.mean, constant, u, y, lags, first)
+    total = float(left @ left) / max(left.size - 1 - found.freedom, 1.0)
+    return replace(found, constant=constant, noise_variance=total)
+
+
+def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple[int, int]], first: int) -> Array:
+    """What the taps leave of an output, shape (n_samples - first,)."""
+    from scipy.signal import oaconvolve
+
+    out = y - constant
+    for i in range(u.shape[1]):
+        full = np.zeros(1 + max([k for j, k in lags if j == i], default=0))
+        for g, (j, k) in zip(taps, lags, strict=True):
+            if j == i:
+                full[k] = g
+        out = out - oaconvolve(u[:, i], full)[: y.size]
+    return np.asarray(out[first:])
 
 
 def _polynomials(f: Posterior, nb: tuple[int, ...], nk: tuple[int, ...], u_sd: Array, y_sd: float) -> Polynomials:
