@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 
 _ROUNDING = 1e-24  # squared residual, in units of the output's variance
 _WINDOW = 8192  # samples of a long record that decide between neighbouring delays
+_LONG, _SHORT = 100, 40  # evaluations of a search; those after which a further start has to be ahead
 _EQUAL = 0.5  # of squared residual, in units of the noise variance: minima that are equally likely
 
 
@@ -161,7 +162,10 @@ def fit_output(
                 start[place] = value / worth[place]
             if not stable_predictor(layout, start):
                 continue
-            found.append(searched(p, y, scaled.u, start, tick=tick))
+            end = searched(p, y, scaled.u, start, most=_LONG if ordinary else _SHORT, tick=tick)
+            if not ordinary and not end.converged and found and end.cost < min(x.cost for x in found):
+                end = searched(p, y, scaled.u, end.theta, tick=tick)
+            found.append(end)
             if _agreed(found) if ordinary and shared else _smooth(found):
                 break
         if _smooth(found) and not shared:
