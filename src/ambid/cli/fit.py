@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +15,10 @@ from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
 if TYPE_CHECKING:
+    from ambid.identify.blackbox.data import IOData
     from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.physical import PhysicalFit
+    from ambid.validate.sensitivity import SensitivityAnalysis
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
@@ -73,6 +76,19 @@ def command(
         Path | None,
         typer.Option("--plot", metavar="FILE.png", help="Draw signals, residuals, Bode and poles.", show_default=False),
     ] = None,
+    stabilisation: Annotated[
+        Path | None,
+        typer.Option(
+            "--stabilisation",
+            metavar="FILE.png",
+            help="Draw the poles of models of order 1 to 20 (n4sid, moesp or cva where --structure names them, else"
+            " pbsid).",
+            show_default=False,
+        ),
+    ] = None,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Show how much each coefficient matters, and which belong together.")
+    ] = False,
     strict: Strict = False,
 ) -> None:
     """Fit a black-box model to a record: polynomial, subspace or continuous-time structures.
@@ -82,11 +98,14 @@ def command(
     """
     from ambid.job import fit, physics, read_data
     from ambid.report.fit_text import fit_text, physics_text
+    from ambid.report.sensitivity import sensitivity_text
     from ambid.rig import load_rig
+    from ambid.validate.sensitivity import sensitivity_analysis
 
     with Outputs(record, second, rig) as outputs:
         outputs.claim(json_path(json), "--json")
         outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+        outputs.claim(stabilisation, "--stabilisation", FIGURE_ENDINGS)
         wanted, known = orders_of(orders), fixed_of(fix)
         bench = None if rig is None else load_rig(rig)
         with progress("fit") as tick:
@@ -112,17 +131,13 @@ def command(
                 tick=tick,
             )
             physical = None if bench is None else physics(found, bench)
-            if plot is not None:
-                from ambid.report.figures import save
-                from ambid.report.fit_figures import overview
-
-                tick("draw")
-                data = read_data(
-                    record, inputs or (), output or (), part=(from_s, to_s), rate_hz=rate, gaps=gaps, rig=bench
-                )
-                page = overview(found, data)
-                outputs.stage(plot, lambda path: save(page, path))
-        written = _json_text(found, physical)
+            matter = None
+            if plot is not None or stabilisation is not None or sensitivity:
+                part = (from_s, to_s)
+                data = read_data(record, inputs or (), output or (), part=part, rate_hz=rate, gaps=gaps, rig=bench)
+                matter = sensitivity_analysis(found, data) if sensitivity else None
+                _draw(found, data, outputs, plot, stabilisation, tick)
+        written = _json_text(found, physical, matter)
         if (path := json_path(json)) is not None:
             outputs.stage_text(path, written)
         elif json == "-":
@@ -131,16 +146,49 @@ def command(
         typer.echo(fit_text(found, paint=painter()))
         if physical is not None:
             typer.echo("\n" + physics_text(physical, paint=painter()))
+        if matter is not None:
+            typer.echo("\n" + sensitivity_text(matter, paint=painter()))
     if strict and not (found.passed and (physical is None or physical.passed)):
         raise typer.Exit(FAILED_CHECK)
 
 
-def _json_text(found: BlackBoxFit, physical: PhysicalFit | None) -> str:
-    """The fit as ``ambid.fit/1``, with ``physical`` where a rig was given."""
+def _draw(
+    found: BlackBoxFit,
+    data: IOData,
+    outputs: Outputs,
+    plot: Path | None,
+    stabilisation: Path | None,
+    tick: Callable[[str], None],
+) -> None:
+    """Draw the figures that are asked for."""
+    from ambid.report.figures import save
+
+    if plot is not None:
+        from ambid.report.fit_figures import overview
+
+        tick("draw")
+        page = overview(found, data)
+        outputs.stage(plot, lambda path: save(page, path))
+    if stabilisation is not None:
+        from ambid.report.stabilisation import stabilisation_figure
+        from ambid.validate.stabilisation import stabilisation as poles_by_order
+
+        method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
+        diagram = stabilisation_figure(poles_by_order(data, method, tick=lambda: tick("stabilisation")))
+        outputs.stage(stabilisation, lambda path: save(diagram, path))
+
+
+def _json_text(found: BlackBoxFit, physical: PhysicalFit | None, matter: SensitivityAnalysis | None) -> str:
+    """Put the fit into ``ambid.fit/1``, with ``physical`` of a rig and ``sensitivity`` where they were asked for."""
+    from dataclasses import asdict
+
     from ambid.identify.blackbox.fit_file import fit_to_json
+    from ambid.identify.json_values import plain_json
     from ambid.identify.physical_file import physical_to_json
 
     document = fit_to_json(found)
     if physical is not None:
         document["physical"] = physical_to_json(physical)
+    if matter is not None:
+        document["sensitivity"] = plain_json(asdict(matter))
     return json_format.dumps(document, indent=1, allow_nan=False) + "\n"

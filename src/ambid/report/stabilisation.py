@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ambid.report.numbers import sized
 from ambid.validate.stabilisation import ModePole, Stabilisation
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
+_WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
 
 
 def stabilisation_figure(found: Stabilisation) -> Figure:
@@ -36,7 +38,9 @@ def stabilisation_figure(found: Stabilisation) -> Figure:
         2, 2, width_ratios=(4, 1), height_ratios=(1, 2), sharex="col", sharey="row"
     )
     empty.axis("off")
+    _frequency_axis(diagram, found)
     _diagram(diagram, found)
+    empty.legend(*diagram.get_legend_handles_labels(), loc="center", fontsize=8, title="poles", title_fontsize=9)
     _damping(damping, found)
     size = np.asarray(found.singular_values)
     values.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
@@ -50,6 +54,8 @@ def stabilisation_figure(found: Stabilisation) -> Figure:
 
 
 def _diagram(axes: Axes, found: Stabilisation) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     kinds = (
         ("new", "x", _NEW),
         ("stable in frequency", "^", _FREQUENCY),
@@ -62,15 +68,23 @@ def _diagram(axes: Axes, found: Stabilisation) -> None:
         axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6)
     axes.set_xlabel("frequency of the pole [Hz]")
     axes.set_ylabel("order")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.85)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _frequency_axis(axes: Axes, found: Stabilisation) -> None:
+    """Frequencies over several decades want a logarithmic axis."""
+    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
+    if seen.size and seen.max() > _WIDE * seen.min():
+        axes.set_xscale("log")
 
 
 def _damping(axes: Axes, found: Stabilisation) -> None:
     stable = [p for p in found.poles if p.stable]
+    axes.set_ymargin(0.2)
     axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
     for mode in found.modes:
         axes.annotate(
-            f"{mode.frequency_hz:.4g} Hz",
+            sized(mode.frequency_hz, "Hz"),
             (mode.frequency_hz, mode.damping),
             textcoords="offset points",
             xytext=(4, 4),
