@@ -125,6 +125,8 @@ def transfer_orders(who: str, data: IOData, orders: Orders) -> TransferOrders:
     """
     known_orders(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
     n_u = data.n_inputs
+    if not n_u:
+        raise EstimationError(f"{who}: no input is named; it estimates the way from inputs to outputs. Give --input")
     nb, nf = per_input(who, orders, "nb", 1, n_u), per_input(who, orders, "nf", 1, n_u)
     for b, f in zip(nb, nf, strict=True):
         if b > f + 1:

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 
 _ALL: tuple[Kernel, ...] = ("tc", "dc", "ss")
 _NOISE_ORDER = 20  # highest of the noise's autoregression
+_OLDER = 10  # lags beyond the taps that are looked at
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
 
 
@@ -275,11 +276,27 @@ def _whitened(
     if not p or left.size - p <= 4 * rough.freedom:
         return rough
     v, z = (np.asarray(lfilter(noise.D, 1.0, x, axis=0)[p:]) for x in (u, y))
+    if _truncated(np.asarray(lfilter(noise.D, 1.0, left)[p:]), v, lags):
+        return rough  # what is left comes from inputs older than the taps: no noise, and not to be whitened
     found = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb, (rough.kernel,))
     constant = found.constant / float(noise.D.sum())
     left = _left(found.mean, constant, u, y, lags, first)
     total = float(left @ left) / max(left.size - 1 - found.freedom, 1.0)
     return replace(found, constant=constant, noise_variance=total)
+
+
+def _truncated(error: Array, v: Array, lags: Sequence[tuple[int, int]]) -> bool:
+    """Return whether inputs older than the taps still move a white error (chi-square of their regression)."""
+    from scipy.stats import chi2
+
+    last = {i: max(k for j, k in lags if j == i) for i in range(v.shape[1])}
+    n = v.shape[0] - max(last.values()) - _OLDER
+    if n < 4 * _OLDER * v.shape[1]:
+        return False
+    older = [v[v.shape[0] - n - last[i] - k : v.shape[0] - last[i] - k, i] for i in last for k in range(1, _OLDER + 1)]
+    Q, e = np.linalg.qr(np.stack(older, axis=1))[0], error[-n:]
+    share = float(np.sum((Q.T @ e) ** 2) / max(float(e @ e), 1e-300))
+    return bool(n * share > float(chi2.isf(_SEEN, Q.shape[1])))
 
 
 def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple[int, int]], first: int) -> Array:
