@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -27,6 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     # first imported, which is later.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    if not sys.warnoptions:
+        # Warnings of numerical libraries speak to programmers; what concerns the user is said in results and errors.
+        warnings.simplefilter("ignore")
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 

@@ -92,10 +92,12 @@ def _judged_fit(
 ) -> tuple[dict[str, Any], list[str]]:
     from ambid.identify.json_values import plain_json
     from ambid.job import read_data
+    from ambid.job.blackbox import same_bench
     from ambid.report.fit_text import validation_lines
     from ambid.validate.blackbox.judge import validation
 
     data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)
+    same_bench(known.units, known.dt, data)
     found = validation(known, data)
     return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
 

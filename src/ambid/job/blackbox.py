@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, nearest
 from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
@@ -21,6 +21,7 @@ from ambid.physics.models import model
 from ambid.record import Record, read_record
 from ambid.rig import Rig, load_rig
 from ambid.signals.samples import cut
+from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from ambid.identify.physical import PhysicalFit
@@ -104,6 +105,11 @@ def fit(
 
     say = tick or _silent
     of = structure(structure_name)
+    _check_criterion(criterion, orders)
+    if validate is None and not (validate_from_s is None and validate_to_s is None):
+        raise EstimationError(
+            "--validate-from and --validate-to cut a second record; none is given. Give --validate, or leave them out"
+        )
     bench = rig if isinstance(rig, Rig) or rig is None else load_rig(rig)
     laps, last = dict[str, float](), time.perf_counter()
 
@@ -115,6 +121,8 @@ def fit(
     _check_use(of, inputs if bench is None else inputs or model(bench.model).inputs, fixed, at_rest=at_rest)
     data = read(record, (from_s, to_s))
     second = None if validate is None else read(validate, (validate_from_s, validate_to_s))
+    if second is not None:
+        same_bench(data.units, data.dt, second)
     laps["read"], last = time.perf_counter() - last, time.perf_counter()
     with one_thread():
         chosen: dict[str, object] = {}
@@ -220,6 +228,7 @@ def compare(
         second = read_data(
             validate, inputs, outputs, references, open_loop=open_loop, part=whole, rate_hz=rate_hz, gaps=gaps
         )
+        same_bench(data.units, data.dt, second)
     with one_thread():
         return compared(data, candidates, holdout=holdout, second=second, tick=tick or _silent)
 
@@ -269,6 +278,48 @@ def read_data(
     if part != (None, None):
         record = cut(record, *part)
     return io_data(record, inputs, outputs, references=references, open_loop=open_loop)
+
+
+def same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:
+    """Refuse a second record whose rate or units are not those of the first.
+
+    Parameters
+    ----------
+    units : Mapping[str, str]
+        SI unit by channel, of the first record; one that is not known agrees with any.
+    dt : float, s
+        Of the first record.
+    second : IOData
+
+    Raises
+    ------
+    EstimationError
+        Naming the rate or the channel.
+    """
+    if abs(second.dt / dt - 1) > 1e-6:
+        raise EstimationError(
+            f"the second record is sampled at {1 / second.dt:g} Hz, the first at {1 / dt:g} Hz; they have to agree. "
+            "Resample one of them"
+        )
+    for name in (*second.inputs, *second.outputs):
+        one, other = units.get(name, UNKNOWN), second.units[name]
+        if one != other and UNKNOWN not in (one, other):
+            raise EstimationError(
+                f"channel {name!r} is in {other} in the second record, in {one} in the first; they have to agree. "
+                "Check that it is the same channel, and its unit"
+            )
+
+
+def _check_criterion(criterion: str, orders: Orders | None) -> None:
+    from ambid.validate.selection import Criterion
+
+    known = get_args(Criterion)
+    if criterion not in known:
+        raise EstimationError(f"criterion {criterion!r} is not one of {', '.join(known)}.{nearest(criterion, known)}")
+    if orders is not None and criterion != "bic":
+        raise EstimationError(
+            f"criterion {criterion} chooses orders, but orders are given. Leave one of them out, or give --orders auto"
+        )
 
 
 def _check_use(

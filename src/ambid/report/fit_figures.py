@@ -51,7 +51,8 @@ def overview(fit: BlackBoxFit, data: IOData) -> Figure:
         parts.append((4.6, lambda part: _bode(part, fit)))
     parts.append((3.6, lambda part: _poles(part, fit)))
     heights = [h for h, _ in parts]
-    page = Figure(figsize=(11, sum(heights) + 0.5), layout="constrained")
+    pairs = min(_PAIRS, len(fit.inputs) * n_y)
+    page = Figure(figsize=(max(11.0, 3.3 * pairs), sum(heights) + 0.5), layout="constrained")
     page.suptitle(f"{fit.record.get('file') or 'record'}: {fit.structure}", fontsize=13)
     figures: Any = page.subfigures(len(parts), 1, height_ratios=heights)
     for figure, (_, draw) in zip(figures, parts, strict=True):

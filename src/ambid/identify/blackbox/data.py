@@ -14,6 +14,9 @@ from ambid.record import Record
 
 Array = NDArray[np.float64]
 
+_LARGEST = 1e60  # squares of ratios of channels have to stay inside the range of floating-point numbers
+_SMALLEST = 1e-60
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IOData:
@@ -67,7 +70,10 @@ class IOData:
         names = (*self.inputs, *self.outputs, *self.references)
         twice = sorted({x for x in names if names.count(x) > 1})
         if twice:
-            raise EstimationError(f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ")
+            raise EstimationError(
+                f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ. Leave one out"
+            )
+        _no_copies(np.hstack([self.u, self.y]), (*self.inputs, *self.outputs))
 
     @property
     def n_samples(self) -> int:
@@ -190,5 +196,33 @@ def _columns(values: Array, what: str, names: tuple[str, ...], n: int) -> Array:
             f"{what} {names[column]!r} is not finite at sample {row}; every value must be a number. "
             "Cut the part out, or replace it (signals.replace_samples)"
         )
+    _check_size(array, what, names)
     array.flags.writeable = False
     return array
+
+
+def _no_copies(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse two inputs or outputs that hold the same numbers: no method can say which of them does what.
+
+    Channels that stand still are left to the estimators, which say so.
+    """
+    for i in range(values.shape[1]):
+        for k in range(i):
+            if np.array_equal(values[:, i], values[:, k]) and np.ptp(values[:, i]) > 0:
+                raise EstimationError(
+                    f"channels {names[k]!r} and {names[i]!r} hold the same numbers; a model cannot tell them apart. "
+                    "Leave one out"
+                )
+
+
+def _check_size(array: Array, what: str, names: tuple[str, ...]) -> None:
+    """Refuse values whose squares leave the range of floating-point numbers; a channel that stands still may pass."""
+    for name, column in zip(names, array.T, strict=True):
+        low, high = float(column.min()), float(column.max())
+        peak, span = max(-low, high), high / 2 - low / 2
+        if peak > _LARGEST or 0.0 < span < _SMALLEST:
+            size = f"reaches {peak:.3g}" if peak > _LARGEST else f"moves by only {2 * span:.3g}"
+            raise EstimationError(
+                f"{what} {name!r} {size} in SI units; {_SMALLEST:g} to {_LARGEST:g} can be computed with. "
+                "Check its unit, or scale it"
+            )

@@ -24,6 +24,7 @@ from ambid.identify.json_values import check_from_json, check_json, plain_json
 Array = NDArray[np.float64]
 
 SCHEMA = "ambid.fit/1"
+_LARGEST = 1e100  # what a number in a file may be: beyond, its square is not finite any more
 NO_INNOVATIONS = (
     "none: a frequency response has no innovations, and its noise stands in the covariance of the coefficients"
 )
@@ -188,33 +189,36 @@ def fit_from_json(document: Mapping[str, Any], where: str) -> BlackBoxFit:
 
 
 def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
-    outputs, inputs = tuple(d["outputs"]), tuple(d["inputs"])
+    inputs, outputs = _names(d, "inputs"), _names(d, "outputs")
     model = _model_from_json(d, inputs, outputs)
     any_structure(d["structure"])
-    covariance = None if d["covariance"] is None else np.array(d["covariance"]["matrix"], dtype=np.float64)
+    covariance = None if d["covariance"] is None else _array(d["covariance"]["matrix"], "covariance")
     silent = d["noise_covariance"] is None and d["structure"] in RESPONSE_STRUCTURES
-    noise = np.zeros((len(outputs),) * 2) if silent else np.array(d["noise_covariance"], dtype=np.float64)
+    noise = np.zeros((len(outputs),) * 2) if silent else _array(d["noise_covariance"], "noise_covariance")
     if (model.n_inputs, model.n_outputs) != (len(inputs), len(outputs)) or noise.shape != (len(outputs),) * 2:
         raise ValueError("inputs, outputs, noise and model are not of the same size")
     if covariance is not None and covariance.shape != (model.theta.size,) * 2:
         raise ValueError("the covariance is not of the model's coefficients")
-    if not (float(d["rate_hz"]) > 0 and np.all(np.isfinite(model.theta)) and np.all(np.isfinite(noise))):
-        raise ValueError("rate, coefficients or noise are no finite numbers")
+    if np.any(np.diag(noise) < 0):
+        raise ValueError("a noise variance is negative")
+    if not isinstance(d["units"], dict) or not all(isinstance(x, str) for x in d["units"].values()):
+        raise ValueError("units are not text")
+    offsets = Offsets(
+        u=_array([d["offsets"]["inputs"][x] for x in inputs], "offsets"),
+        y=_array([d["offsets"]["outputs"][x] for x in outputs], "offsets"),
+    )
     return BlackBoxFit(
         structure=d["structure"],
         orders={k: tuple(v) if isinstance(v, list) else int(v) for k, v in d["orders"].items()},
         model=model,
         covariance=covariance,
         n_estimated=int(d["n_estimated"]),
-        offsets=Offsets(
-            u=np.array([d["offsets"]["inputs"][x] for x in inputs], dtype=np.float64),
-            y=np.array([d["offsets"]["outputs"][x] for x in outputs], dtype=np.float64),
-        ),
+        offsets=offsets,
         noise_covariance=noise,
         inputs=inputs,
         outputs=outputs,
         units=d["units"],
-        dt=1.0 / float(d["rate_hz"]),
+        dt=1.0 / _rate(d),
         record=d["record"],
         status=d["status"],
         fit={o: OutputFit(**_numbers(d["fit"][o])) for o in outputs if o in d["fit"]},
@@ -232,29 +236,60 @@ def _numbers(f: Mapping[str, Any]) -> dict[str, Any]:
     return {k: float("nan") if v is None and k != "simulation" else v for k, v in f.items()}
 
 
+def _names(d: Mapping[str, Any], which: str) -> tuple[str, ...]:
+    names = d[which]
+    if not isinstance(names, list) or not all(isinstance(x, str) for x in names):
+        raise ValueError(f"{which} is not a list of names")
+    return tuple(names)
+
+
+def _array(value: Any, what: str) -> Array:
+    """Numbers as an array; text, truth values and what could not be computed with are no numbers."""
+    found = np.array(value)
+    if found.size and found.dtype.kind not in "iuf":
+        raise ValueError(f"{what} does not consist of numbers")
+    if not np.all(np.abs(found.astype(np.float64)) <= _LARGEST):
+        raise ValueError(f"{what} is not finite, or too large")
+    return found.astype(np.float64)
+
+
+def _rate(d: Mapping[str, Any]) -> float:
+    rate = d["rate_hz"]
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1 / _LARGEST < rate < _LARGEST:
+        raise ValueError("the rate is no positive number")
+    return float(rate)
+
+
 def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tuple[str, ...]) -> BlackBoxModel:
-    dt = None if d["continuous_time"] else 1.0 / float(d["rate_hz"])
+    if not isinstance(d["continuous_time"], bool):
+        raise ValueError("continuous_time is neither true nor false")
+    dt = None if d["continuous_time"] else 1.0 / _rate(d)
     if "state_space" in d:
         n = len(d["state_space"]["A"])
         shapes = {"A": (n, n), "B": (n, len(inputs)), "C": (len(outputs), n), "D": (len(outputs), len(inputs))}
         shapes["K"] = (n, len(outputs))
-        parts = {k: np.array(d["state_space"][k], dtype=np.float64).reshape(v) for k, v in shapes.items()}
+        parts = {k: _array(d["state_space"][k], k) for k in shapes}
+        for k, shape in shapes.items():
+            if parts[k].shape != shape and (parts[k].size or 0 not in shape):
+                raise ValueError(f"{k} has shape {parts[k].shape}; {shape} belongs to states, inputs and outputs")
+        parts = {k: parts[k].reshape(shape) for k, shape in shapes.items()}
         return StateSpaceModel(dt=dt, **parts)
     if "transfer_function" in d:
-        tf = d["transfer_function"]
+        tf, delay = d["transfer_function"], d["delay_s"]
+        if not isinstance(delay, list) or len(delay) != len(inputs) or np.any(_array(delay, "delay_s") < 0):
+            raise ValueError("delay_s is not a time for each input")
+        num, den = (tuple(tuple(_array(x, k) for x in row) for row in tf[k]) for k in ("num", "den"))
         names = () if d["covariance"] is None else d["covariance"]["names"]
-        return TransferModel(
-            num=tf["num"], den=tf["den"], dt=dt, delay=tuple(d["delay_s"]), delay_estimated="delay[0]" in names
-        )
+        return TransferModel(num=num, den=den, dt=dt, delay=tuple(delay), delay_estimated="delay[0]" in names)
     found = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
     one = len(inputs) == 1
     sets = tuple(
         Polynomials(
-            A=p["A"],
-            B=tuple([p["B"]] if one else p["B"]),
-            C=p["C"],
-            D=p["D"],
-            F=tuple([p["F"]] if one else p["F"]),
+            A=_array(p["A"], "A"),
+            B=tuple(_array(x, "B") for x in ([p["B"]] if one else p["B"])),
+            C=_array(p["C"], "C"),
+            D=_array(p["D"], "D"),
+            F=tuple(_array(x, "F") for x in ([p["F"]] if one else p["F"])),
         )
         for p in found
     )

@@ -102,12 +102,12 @@ def validation(fit: BlackBoxFit, second: IOData) -> dict[str, object]:
     EstimationError
         If channels or rate of the record differ from those of the fit, or an output of it is constant.
     """
-    found = errors_elsewhere(fit, second)
-    for j, name in enumerate(fit.outputs):
+    for j, name in enumerate(second.outputs):
         if not np.any(second.y[:, j] != second.y[0, j]):
             raise EstimationError(
                 f"output {name!r} is constant over the second record; nothing can be judged on it. Give another record"
             )
+    found = errors_elsewhere(fit, second)
     return {
         name: {
             "one_step": _sizes(found.one_step[:, j], second.y[:, j]),
