@@ -184,11 +184,12 @@ def _offsets(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitted]) 
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
         constant = float(f.nuisance[-1]) if f.nuisance.size else 0.0
         level = float(f.theta[x.places["A", None]].sum())
-        if abs(constant) <= _FAR * abs(level):
-            y[o] = constant / level
-        elif n_u:
-            p = x.polynomials(f.theta)
-            rows.append([-np.sum(b) / np.sum(a) for b, a in zip(p.B, p.F, strict=True)])
+        p = x.polynomials(f.theta)
+        gain = [np.sum(b) / np.sum(a) if np.sum(a) else np.inf for b, a in zip(p.B, p.F, strict=True)]
+        if abs(constant) <= _FAR * abs(level) or (level and not np.all(np.isfinite(gain))):
+            y[o] = constant / level  # an F that integrates has no static gain to shift an input by
+        elif n_u and np.all(np.isfinite(gain)):
+            rows.append([-g for g in gain])
             right.append(constant)
     u = np.linalg.lstsq(np.array(rows), np.array(right), rcond=1e-10)[0] if rows else np.zeros(n_u)
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
