@@ -195,6 +195,6 @@ def _offsets(scaled: Scaled, layouts: Sequence[Layout], fits: Sequence[Fitted]) 
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
         if rows and y[o]:  # the shifted input moves the other outputs too
             p = x.polynomials(f.theta)
-            gain = np.array([np.sum(b) / np.sum(a) for b, a in zip(p.B, p.F, strict=True)])
-            y[o] += float(gain @ u) / float(p.A.sum())
+            static = np.array([np.sum(b) / np.sum(a) if np.sum(a) else 0.0 for b, a in zip(p.B, p.F, strict=True)])
+            y[o] += float(static @ u) / float(p.A.sum())
     return Offsets(u=scaled.u_mean + scaled.u_scale * u, y=scaled.y_mean + scaled.y_scale * y)
