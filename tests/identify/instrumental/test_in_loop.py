@@ -151,3 +151,18 @@ def test_fast_sampling_and_a_reference_of_narrow_band():
     spread = pole_covariance(fit.model, fit.covariance)[np.argsort(fit.model.poles())]
     np.testing.assert_array_less(np.abs(error), 3 * np.sqrt(np.trace(spread, axis1=1, axis2=2)))
     assert np.max(np.abs(error)) < 0.2 * np.max(np.abs(truth))
+
+
+@pytest.mark.parametrize(("method", "orders"), [(cliv, {"na": 2, "nb": 2}), (clsrivc, {"nb": 1, "nf": 2})])
+def test_weak_instruments_are_said(method, orders):
+    # a reference that moves the plant about as much as the loop's noise does: estimates are off by tens of sd
+    said = 0
+    for seed in range(8):
+        weak = in_loop(np.random.default_rng(seed), *SPRUNG, DT, n=600, noise=1.0, kp=0.8, kd=2.0)
+        said += any("instruments" in w and "weak" in w for w in method(weak, orders).warnings)
+    assert said >= 7
+    for seed in range(4):
+        strong = in_loop(np.random.default_rng(seed), *SPRUNG, DT, n=2000, noise=0.02, kp=0.8, kd=2.0)
+        fit = method(strong, orders)
+        assert not any("weak" in w for w in fit.warnings)
+        assert fit.details["instrument_strength"][0] > 50

@@ -26,6 +26,7 @@ from ambid.identify.instrumental.continuous import Numbers, companion
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression, score_covariance
 from ambid.identify.instrumental.reference import reference_part, wants_reference
+from ambid.identify.instrumental.solve import weak
 from ambid.identify.instrumental.srivc import TransferOrders, transfer_orders
 from ambid.identify.threads import one_thread
 from ambid.physics.discretise import zero_order_hold
@@ -238,6 +239,7 @@ def _fit(
                 f"show (misfit {c.misfit:.3g} for {c.freedom} degrees of freedom): check nb, nf and the delay nk, and "
                 "that the input is held over a sample"
             )
+    warnings += weak([f.solution for f in found], data.outputs)
     rows = min(f.innovations.size for f in found)
     e = np.stack([f.innovations[-rows:] for f in found], axis=1) * sds[1]
     scaled = operating_point(
@@ -257,6 +259,7 @@ def _fit(
         details={
             "condition": [f.solution.condition for f in found],
             "noise_order": [f.noise.order for f in found],
+            "instrument_strength": [f.solution.strength() for f in found],
             "misfit": [c.misfit for c in nearest],
             "freedom": [c.freedom for c in nearest],
         },

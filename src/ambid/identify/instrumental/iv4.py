@@ -30,6 +30,7 @@ from ambid.identify.instrumental.arx_form import (
 )
 from ambid.identify.instrumental.corners import NOISE_ORDER, exact, searched
 from ambid.identify.instrumental.reference import reference_part
+from ambid.identify.instrumental.solve import weak
 
 Array = NDArray[np.float64]
 
@@ -158,10 +159,11 @@ def arx_fit(
         n_estimated=sum(orders.size + f.noise.order for f in found),
         offsets=operating_point(found, *means, *sds),
         noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
-        warnings=warnings,
+        warnings=(*warnings, *weak([f.solution for f in found], data.outputs)),
         details={
             "noise_order": [f.noise.order for f in found],
             "condition": [f.solution.condition for f in found],
+            "instrument_strength": [f.solution.strength() for f in found],
         },
     )
 

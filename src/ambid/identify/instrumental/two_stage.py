@@ -27,7 +27,7 @@ from ambid.identify.instrumental.cliv import cliv
 from ambid.identify.instrumental.iv4 import centred
 from ambid.identify.instrumental.noise import autoregression
 from ambid.identify.instrumental.reference import reference_part, wants_reference
-from ambid.identify.instrumental.solve import Solution, solve, span
+from ambid.identify.instrumental.solve import Solution, solve, span, weak
 from ambid.identify.threads import one_thread
 
 Array = NDArray[np.float64]
@@ -120,8 +120,12 @@ def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
         offsets=Offsets(u=mean, y=second.offsets.y + np.array([f.constant for f in found])),
         noise_covariance=noise.T @ noise / max(noise.shape[0] - unknowns - 1, 1),
         status="converged" if all(f.settled for f in found) else "stalled",
-        warnings=warnings,
-        details={"first_stage_lags": lags, "condition": [f.step.condition for f in found]},
+        warnings=(*warnings, *weak([f.step for f in found], data.outputs)),
+        details={
+            "first_stage_lags": lags,
+            "condition": [f.step.condition for f in found],
+            "instrument_strength": [f.step.strength() for f in found],
+        },
     )
 
 
