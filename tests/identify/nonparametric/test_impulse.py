@@ -254,3 +254,19 @@ def test_what_breaks_a_rule_is_refused():
     first, second = rfir(data, {"nb": 30}), rfir(data, {"nb": 30})
     np.testing.assert_array_equal(first.model.theta, second.model.theta)
     np.testing.assert_array_equal(data.u, before)
+
+
+def test_a_path_within_the_sample_is_said_where_it_is_not_estimated():
+    def data(y):
+        return IOData(u=u[:, None], y=y[:, None], dt=0.1, inputs=("u",), outputs=("y",), units={})
+
+    said = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        u = lfilter([1], [1, -0.5], rng.standard_normal(400))
+        y = lfilter([0, 1, 0.5], [1, -0.8], u) + lfilter([1], [1, -0.7], 0.3 * rng.standard_normal(400))
+        said += len(impulse_response(data(y), 20).warnings)
+    assert said <= 1  # one in a thousand
+    direct = data(y + 0.3 * u)
+    assert "same sample" in impulse_response(direct, 20).warnings[0]
+    assert not impulse_response(replace(direct, open_loop=True), 20).warnings

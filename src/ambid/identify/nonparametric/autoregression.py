@@ -8,13 +8,13 @@ follows by the delta method, dG = (1 - A)^-1 (dB + dA G).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonparametric.bayes import posterior, triangle
+from ambid.identify.nonparametric.bayes import Triangle, posterior, triangle
 from ambid.identify.nonparametric.kernels import Kernel
 
 Array = NDArray[np.float64]
@@ -35,6 +35,9 @@ class PredictorTaps:
     y_sd : ndarray, shape (n_outputs,)
     u_sd : ndarray, shape (n_inputs,)
     kernels : tuple of str
+    within_sample : float
+        Probability of the correlation that is left between outputs and inputs of one sample, if there is no path
+        between them that is faster than a sample; 1 where the record is too short to see one.
     """
 
     mean: Array
@@ -43,6 +46,7 @@ class PredictorTaps:
     y_sd: Array
     u_sd: Array
     kernels: tuple[str, ...]
+    within_sample: float
 
 
 def predictor_taps(data: IOData, lags: int, kernels: Sequence[Kernel]) -> PredictorTaps:
@@ -61,7 +65,8 @@ def predictor_taps(data: IOData, lags: int, kernels: Sequence[Kernel]) -> Predic
     y_sd, u_sd = data.y.std(axis=0), data.u.std(axis=0)
     z = np.hstack([(data.y - data.y.mean(axis=0)) / y_sd, (data.u - data.u.mean(axis=0)) / u_sd])
     n_y = data.n_outputs
-    t = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z[:, :n_y], lags)
+    whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
+    t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
     found = [posterior(t, o, (lags,) * z.shape[1], kernels) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T
@@ -74,8 +79,28 @@ def predictor_taps(data: IOData, lags: int, kernels: Sequence[Kernel]) -> Predic
         for b in range(n_y):
             covariance[a, b] = found[a].covariance if a == b else noise[a, b] * weight[a] @ weight[b].T
     return PredictorTaps(
-        mean=mean, covariance=covariance, noise=noise, y_sd=y_sd, u_sd=u_sd, kernels=tuple(f.kernel for f in found)
+        mean=mean,
+        covariance=covariance,
+        noise=noise,
+        y_sd=y_sd,
+        u_sd=u_sd,
+        kernels=tuple(f.kernel for f in found),
+        within_sample=_within_sample(whole, n_y),
     )
+
+
+def _within_sample(t: Triangle, n_y: int) -> float:
+    """Wilks' test that what the past leaves of outputs and of inputs is independent (Bartlett's factor)."""
+    from scipy.stats import chi2
+
+    n_z, freedom = t.left.shape[0], t.rows - 1 - t.R.shape[0]
+    rows = freedom - 0.5 * (n_z + 1)
+    sizes = np.sqrt(np.diag(t.left))
+    if rows < n_z or not np.all(sizes > 0):
+        return 1.0
+    r = t.left / np.outer(sizes, sizes)
+    parts = [np.linalg.slogdet(x)[1] for x in (r, r[:n_y, :n_y], r[n_y:, n_y:])]
+    return float(chi2.sf(max(rows * (parts[1] + parts[2] - parts[0]), 0.0), n_y * (n_z - n_y)))
 
 
 def responses(taps: PredictorTaps, n_y: int, n_u: int, lags: int) -> tuple[Array, Array]:

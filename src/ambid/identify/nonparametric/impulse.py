@@ -34,6 +34,11 @@ _ALL: tuple[Kernel, ...] = ("tc", "dc", "ss")
 _NOISE_ORDER = 20  # highest of the noise's autoregression
 _OLDER = 10  # lags beyond the taps that are looked at
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
+_WITHIN = (
+    "inputs and outputs depend on each other within the same sample (p = {p:.2g}). If the controller acts without "
+    "delay, that is as it should be; if the plant does, its first tap is not zero, as is taken for granted here, and "
+    "the later ones are off. Where there was no feedback say open_loop (--open-loop): then the first tap is estimated"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -237,6 +242,7 @@ def _through_autoregression(data: IOData, n_taps: int, kernels: Sequence[Kernel]
         units=data.units,
         kernels=taps.kernels,
         method="rarx",
+        warnings=() if taps.within_sample > _SEEN else (_WITHIN.format(p=taps.within_sample),),
     )
 
 
