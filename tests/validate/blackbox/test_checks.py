@@ -275,3 +275,12 @@ def test_errors_ahead_are_as_large_as_the_model_expects():
     assert found[0].fit > found[1].fit > found[2].fit
     noise = lfilter([1, 0.4], [1, -0.8], np.eye(1, 30)[0])
     assert found[2].expected_sd == pytest.approx(0.3 * np.linalg.norm(noise), rel=0.1)
+
+
+@pytest.mark.parametrize("estimator", [n4sid, pbsid])
+def test_a_wrong_delay_is_seen_in_the_residuals(estimator):
+    """States of a delay that was given stand still: otherwise they would explain what it leaves out."""
+    data = record(polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),)))
+    right, wrong = (judged(estimator(data, {"n": 2, "nk": nk}), data) for nk in (1, 4))
+    assert right.checks["residuals_uncorrelated"].passed
+    assert not wrong.checks["residuals_uncorrelated"].passed

@@ -73,7 +73,7 @@ def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
         return Gradient(
             rows=tuple(_transfer_gradient(model, fit.dt, o, u, y, found) for o in range(model.n_outputs)), theta=None
         )
-    return Gradient(rows=_state_space_tangent(found, u, y), theta=None)
+    return Gradient(rows=_state_space_tangent(fit, found, u, y), theta=None)
 
 
 def polynomial_gradient(p: Polynomials, u: Array, y: Array, e: Array) -> Array:
@@ -155,12 +155,18 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
     return every[:, free]
 
 
-def _state_space_tangent(found: Errors, u: Array, y: Array) -> tuple[Array, ...]:
-    """Move along every entry of A and B, of K where there is noise, and of D where there is any."""
+def _state_space_tangent(fit: BlackBoxFit, found: Errors, u: Array, y: Array) -> tuple[Array, ...]:
+    """Move along every entry of A and B, of K where there is noise, and of D where there is any.
+
+    Entries that were not estimated, as those of a delay that was given, stand still: moving them would take a wrong
+    delay out of the residuals.
+    """
     m = found.model
     x = states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
     moves = {"A": True, "B": True, "C": False, "D": bool(np.any(m.D)), "K": bool(np.any(m.K))}
     free = np.concatenate([np.full(getattr(m, name).size, moves[name]) for name in "ABCDK"])
+    if fit.covariance is not None and fit.covariance.shape[0] == free.size:
+        free &= np.diag(fit.covariance) > 0
     along = Sensitivities(m, np.eye(free.size)[:, free])
     signals = np.hstack([x, u, found.one_step])
     blocks = [along.block(signals[k : k + _BLOCK]) for k in range(0, u.shape[0], _BLOCK)]
