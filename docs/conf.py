@@ -1,7 +1,10 @@
 """Sphinx settings: pages in Markdown (MyST), API pages from numpydoc docstrings."""
 
+import re
 from importlib.metadata import version as installed_version
 from pathlib import Path
+
+from sphinx.application import Sphinx
 
 project = "ambid"
 author = "the ambid contributors"
@@ -66,3 +69,16 @@ def _write_api_index() -> None:
 
 
 _write_api_index()
+
+
+def _formulas_are_text(_app: object, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
+    """Keep |x|, x* and *args of formulas from being read as markup, outside of ``code``."""
+    for k, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [re.sub(r"(?<!\\)([|*])", r"\\\1", part) for part in parts[::2]]
+        lines[k] = "``".join(parts)
+
+
+def setup(app: Sphinx) -> None:
+    """Connect what is above; first, so that numpydoc's own markup comes after it."""
+    app.connect("autodoc-process-docstring", _formulas_are_text, priority=1)
