@@ -15,6 +15,7 @@ from ambid.identify.blackbox.made import made
 from ambid.identify.blackbox.orders import Orders
 from ambid.identify.subspace.classical import Projection, classical_columns, projected, realised
 from ambid.identify.subspace.compress import each_left_out, triangular
+from ambid.identify.subspace.dependence import relation, told_apart
 from ambid.identify.subspace.jackknife import jackknife
 from ambid.identify.subspace.order import state_criterion
 from ambid.identify.subspace.plan import Method, Plan, planned
@@ -130,11 +131,8 @@ def first_model(
     n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
     if method != "pbsid" and horizon is None:
         plan = _with_horizons(plan, n, keep_past=past is not None)
+    told_apart(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
     given, found = decomposition(plan)
-    if n > found.values.size:
-        raise EstimationError(
-            f"{method}: the record shows {found.values.size} states, not {n}. Lower n, or excite the plant more"
-        )
     return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
 
 
@@ -216,7 +214,16 @@ def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
     Returns
     -------
     Realisation
+
+    Raises
+    ------
+    EstimationError
+        If the data show fewer states.
     """
+    shown = found.values.size
+    if n > shown:
+        states = "1 state" if shown == 1 else f"{shown} states"
+        raise EstimationError(f"{plan.method}: the record shows {states}, not {n}. Lower n, or excite the plant more")
     if isinstance(found, Prediction):
         return regressed(found, n, feedthrough=plan.feedthrough)
     return realised(found, n, feedthrough=plan.feedthrough)
@@ -267,6 +274,9 @@ def _result(
         warnings.append("no standard deviations: parts of the record do not show the same states. Lower n")
     if not full.stable_predictor:
         warnings.append("no gain was found with which the predictor is stable: its predictions run away. Change n")
+    related = relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
+    if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
+        warnings.append(f"{related}: pbsid may share their effects out wrongly. Use cva or n4sid, or leave one out")
     delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
     return made(
         method,

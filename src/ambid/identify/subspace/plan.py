@@ -13,6 +13,7 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.blackbox.orders import Orders, known_orders, left_open, per_input, single
 from ambid.identify.subspace.compress import Channels, Factors, channels, compress, merged, triangular
+from ambid.identify.subspace.dependence import told_apart
 from ambid.identify.subspace.order import autoregression_criterion
 
 Array = NDArray[np.float64]
@@ -98,7 +99,7 @@ def planned(
     Raises
     ------
     EstimationError
-        If orders or horizons break a rule, a channel is constant, or the record is too short.
+        If orders or horizons break a rule, a channel is constant, inputs move together, or the record is too short.
     """
     n, nk = _orders(method, data, orders)
     _numbers(data)
@@ -110,6 +111,7 @@ def planned(
     if tick is not None:
         tick()
     total = merged(factors.groups)
+    told_apart(factors, total, data.inputs, 1)
     criterion = autoregression_criterion(factors, total)
     wanted = wanted_lags = int(np.argmin(criterion))
     least = _shortest(data, largest, bool(n or n_max))

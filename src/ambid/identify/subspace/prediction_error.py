@@ -29,6 +29,7 @@ _PANEL = 32
 _STEPS = 100
 _NEAR = 1e-7  # fall of N log det that one more step promises, below which the search is done
 _ROUNDING = 1e-3  # the same, below which a step that does not succeed is rounding
+_EXACT = 1e-12  # errors beside outputs of unit deviation from which they are rounding
 _SHORTEST = 2.0**-30  # part of a step below which no stable predictor lies that way
 
 
@@ -54,6 +55,11 @@ class Point:
     constant: Array
     noise: Array
     cost: float
+
+    @property
+    def exact(self) -> bool:
+        """Whether the errors are rounding, with no noise to be seen."""
+        return bool(np.trace(self.noise) < 1.5 * _EXACT**2 * self.noise.shape[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,7 +142,7 @@ def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick 
         factor = _reduced(point, ways, u, y)
         promise = float(np.sum(factor[:-1, -1] ** 2))
         better = None
-        if promise > _NEAR and iterations < _STEPS:
+        if promise > _NEAR and not point.exact and iterations < _STEPS:
             better, damping = _step(point, ways, factor, damping, u, y, feedthrough=feedthrough)
         if better is None:
             break
@@ -147,7 +153,7 @@ def searched(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick 
         information=factor[k:-1, k:-1],
         n_numbers=factor.shape[1] - 1,
         iterations=iterations,
-        converged=promise < _ROUNDING,
+        converged=promise < _ROUNDING or point.exact,
         promise=promise,
     )
 
@@ -198,14 +204,16 @@ def _settled(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
 
 
 def _judged(model: StateSpaceModel, x0: Array, constant: Array, u: Array, y: Array) -> Point | None:
-    """Run the record through; None where the errors are not finite, or do not span the outputs."""
+    """Run the record through; None where the errors are not finite, or some outputs' alone are rounding."""
     triangle = np.zeros((y.shape[1], y.shape[1]))
     for _, e in _blocks(model, x0, u, y):
         if not np.all(np.isfinite(e)):
             return None
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, e - constant]), mode="r"))
-    size = np.abs(np.diag(triangle))
-    if not np.all(size > 1e-12 * np.sqrt(y.shape[0])):
+    size, least = np.abs(np.diag(triangle)), _EXACT * np.sqrt(y.shape[0])
+    if np.all(size <= least):  # no noise: errors are rounding, and count as this much
+        size, triangle = np.full(size.size, least), least * np.eye(size.size)
+    if not np.all(size >= least):
         return None
     noise = triangle.T @ triangle / y.shape[0]
     cost = float(y.shape[0] * (2 * np.sum(np.log(size)) - size.size * np.log(y.shape[0])))

@@ -163,7 +163,7 @@ def predicted(factor: Array, *, past: int, future: int, feedthrough: bool, like:
     state[:, :width] = right[:n_values] * unit
     to_state = (left[:, :n_values].T @ known) * (unit / values[:n_values, None])
     return Prediction(
-        values=values / unit,
+        values=values[:n_values] / unit,
         state=state,
         ahead=to_state @ r[:, n_z : width + n_z].T,
         u=r[:, width : width + n_u].T,

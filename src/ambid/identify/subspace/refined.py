@@ -137,7 +137,12 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
     covariance[np.ix_(places, places)] = 0.5 * (own + own.T)
     condition = _condition(found.information)
     warnings = []
-    if condition > _LOOSE:
+    if found.point.exact:
+        warnings.append(
+            "the record shows no noise: the errors are rounding, and so are the standard deviations. The noise model K "
+            "means nothing"
+        )
+    elif condition > _LOOSE:
         warnings.append(
             f"the record does not tell all {m.order} states apart (condition {condition:.1g}): standard deviations "
             "along what it does not show mean little. Lower n"
