@@ -74,7 +74,7 @@ def test_a_transient_is_reported_and_dropped_only_when_asked():
     assert any("transient" in w for w in kept.warnings)
     assert kept.details["dropped_periods"] == (0,)
     assert dropped.details["dropped_periods"][0] >= 1
-    assert any("are not used" in w for w in dropped.warnings)
+    assert any("not used" in w for w in dropped.warnings)
     truth = response(*slow, kept.frequency_hz)
     worse, better = (np.abs(f.G[:, 0, 0] - truth).max() for f in (kept, dropped))
     assert better < 0.2 * worse
@@ -182,3 +182,29 @@ def test_a_loop_needs_the_reference_where_its_noise_is_as_large_as_the_excitatio
     assert off[1] < 0.05
     assert any("under 10 dB above their noise" in w for w in direct.warnings)
     assert inside(joint, truth) > 0.9 > 0.6 > inside(direct, truth)
+
+
+def test_one_dropped_period_is_spoken_of_as_one():
+    rng = np.random.default_rng(16)
+    x = np.tile(one_period(rng, ODD, N), 6)
+    y = x + 0.01 * rng.standard_normal(x.size)
+    y[: N // 4] += 5.0
+    told = frf_periodic(x, y, 1.0, period=N, lines=ODD, drop_periods="auto").warnings
+    assert any("the first period holds a transient and is not used" in w for w in told)
+
+
+def test_remedies_name_the_options_of_the_command():
+    rng = np.random.default_rng(17)
+    x = one_period(rng, np.arange(1, 160), N)
+    with pytest.raises(EstimationError, match="--method local"):
+        frf_periodic(x, x + 0.1 * rng.standard_normal(N), 1.0, period=N, lines=np.arange(1, 160))
+    with pytest.raises(EstimationError, match="--method local"):
+        frf_periodic([np.stack([x, -x], axis=1)] * 3, [x] * 3, 1.0, period=N)
+    with pytest.raises(EstimationError, match=r"local or the random method \(--method\)"):
+        find_period(rng.standard_normal(400))
+    xs = [one_period(rng, np.arange(1, 160), N) for _ in range(3)]
+    ys = [x + 0.1 * rng.standard_normal(N) for x in xs]
+    assert any("--reference" in w and "--open-loop" in w for w in frf_periodic(xs, ys, 1.0, period=N).warnings)
+    flat = {"inputs": ["coil"], "outputs": ["gap"], "period": N}
+    with pytest.raises(EstimationError, match="output 'gap' is constant"):
+        frf_periodic(x, np.ones(N), 1.0, **flat)

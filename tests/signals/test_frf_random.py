@@ -162,6 +162,10 @@ def test_leakage_of_short_segments_is_told():
         return any("leakage" in w for w in frf_random(u, y, 1.0, segment=segment).warnings)
 
     assert sum(told(resonant, 128) for _ in range(10)) == 10
+    u = rng.standard_normal(16384)
+    short = frf_random(u, lfilter(*resonant, u), 1.0, segment=128).warnings
+    assert any("--method local" in w for w in short)
+    assert any("--reference" in w and "--open-loop" in w for w in short)
     assert sum(told(resonant, 4096) for _ in range(10)) == 0
     assert sum(told((B, A), 512) for _ in range(10)) == 0
 
@@ -174,3 +178,13 @@ def test_options_that_contradict_each_other_are_refused():
         frf_random(x[:, 0], x[:, 1], 1.0, noise_ratio=1.0)
     with pytest.raises(EstimationError, match="kind 'h3'"):
         frf_random(x[:, 0], x[:, 1], 1.0, kind="h3")
+
+
+@pytest.mark.parametrize("method", ["random", "local"])
+def test_bad_columns_are_called_by_their_names(method):
+    u = np.random.default_rng(20).standard_normal((4096, 2))
+    names = {"inputs": ["coil", "shaker"], "outputs": ["gap"], "method": method}
+    with pytest.raises(EstimationError, match="input 'shaker' is constant"):
+        frequency_response(u * [1.0, 0.0], u[:, 0], 1.0, **names)
+    with pytest.raises(EstimationError, match="output 'gap' is not finite at sample 7"):
+        frequency_response(u, np.where(np.arange(4096) == 7, np.nan, u[:, 0]), 1.0, **names)

@@ -16,15 +16,22 @@ from ambid.signals.frf import Complex
 
 FEEDBACK = (
     "without a reference the response is biased towards -1/controller where feedback carries the noise to the input; "
-    "give the reference r, or open_loop=True if there was no feedback"
+    "give the reference r (--reference), or open_loop=True (--open-loop) if there was no feedback"
 )
 
 
-def checked(u: Array, y: Array, r: Array | None, rate_hz: float) -> tuple[Array, Array, Array | None]:
+def checked(
+    u: Array,
+    y: Array,
+    r: Array | None,
+    rate_hz: float,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+) -> tuple[Array, Array, Array | None]:
     """Return u, y and r as columns, refused where their lengths differ or a value is not finite."""
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise EstimationError(f"a sampling rate of {rate_hz} Hz; it must be positive. Give the rate of the record")
-    u, y = columns(u, "input"), columns(y, "output")
+    u, y = columns(u, "input", inputs), columns(y, "output", outputs)
     r = None if r is None else columns(r, "reference")
     for what, x in (("outputs", y), ("references", r)):
         if x is not None and x.shape[0] != u.shape[0]:
@@ -37,18 +44,20 @@ def checked(u: Array, y: Array, r: Array | None, rate_hz: float) -> tuple[Array,
     return u, y, r
 
 
-def columns(x: Array, what: str) -> Array:
-    """Return `x` as shape (n_samples, n_columns), float64."""
+def columns(x: Array, what: str, names: Sequence[str] | None = None) -> Array:
+    """Return `x` as shape (n_samples, n_columns), float64; messages call its columns by name where they have one."""
     x = np.asarray(x)
     if np.iscomplexobj(x) or x.ndim not in (1, 2) or x.size == 0:
         raise EstimationError(f"the {what} has shape {x.shape}; it must be real, (n_samples, n). Reshape it")
     x = np.asarray(x[:, None] if x.ndim == 1 else x, dtype=np.float64)
+    named = names is not None and len(names) == x.shape[1]
+    called = [f"{what} {names[k]!r}" if names and named else f"{what} {k + 1}" for k in range(x.shape[1])]
     if not np.isfinite(x).all():
         row, column = np.argwhere(~np.isfinite(x))[0]
-        raise EstimationError(f"{what} {column + 1} is not finite at sample {row}. Repair it with replace_samples")
+        raise EstimationError(f"{called[column]} is not finite at sample {row}. Mend the record, or cut that part off")
     for k in range(x.shape[1]):
         if np.all(x[:, k] == x[0, k]):
-            raise EstimationError(f"{what} {k + 1} is constant; it has no frequency response. Leave it out")
+            raise EstimationError(f"{called[k]} is constant; it has no frequency response. Leave it out")
     return x
 
 

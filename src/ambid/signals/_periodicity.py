@@ -44,7 +44,7 @@ def find_period(x: Array) -> int:
     if not low.size or d[low].min() > 0.3:
         raise EstimationError(
             f"no period found in {x.shape[0]} samples of the excitation; a period and a part of the next must be in "
-            "it. Give the period, or use frf_local or frf_random"
+            "it. Give the period, or use the local or the random method (--method)"
         )
     deepest = float(d[low].min())
     # A multiple of the period is as deep but for noise: the first that is not clearly shallower is the period.

@@ -107,7 +107,7 @@ def frf_local(
     EstimationError
         If the record is shorter than a window, or the excitation does not tell G from leakage.
     """
-    u, y, r = checked(u, y, r, rate_hz)
+    u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     n, n_y, n_u = u.shape[0], y.shape[1], u.shape[1]
     x, z = (u, y) if r is None else (r, np.concatenate([y, u], axis=1))
     X, Z = (np.fft.rfft(s, axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for s in (x, z))

@@ -80,7 +80,7 @@ def frf_periodic(
     EstimationError
         If experiments do not fit together, or neither periods nor realisations nor free lines give a variance.
     """
-    experiments = _experiments(u, y, r, rate_hz)
+    experiments = _experiments(u, y, r, rate_hz, inputs, outputs)
     n_u, n_y = experiments[0][0].shape[1], experiments[0][1].shape[1]
     if period is None:
         period = find_period(experiments[0][0] if experiments[0][2] is None else experiments[0][2])
@@ -117,13 +117,18 @@ def frf_periodic(
 
 
 def _experiments(
-    u: Array | Sequence[Array], y: Array | Sequence[Array], r: Array | Sequence[Array] | None, rate_hz: float
+    u: Array | Sequence[Array],
+    y: Array | Sequence[Array],
+    r: Array | Sequence[Array] | None,
+    rate_hz: float,
+    inputs: Sequence[str] | None,
+    outputs: Sequence[str] | None,
 ) -> list[tuple[Array, Array, Array | None]]:
     us, ys = ([x] if isinstance(x, np.ndarray) else list(x) for x in (u, y))
     rs = [None] * len(us) if r is None else [r] if isinstance(r, np.ndarray) else list(r)
     if not us or not len(us) == len(ys) == len(rs):
         raise EstimationError(f"{len(us)} experiments of u, {len(ys)} of y and {len(rs)} of r. Give as many of each")
-    found = [checked(*e, rate_hz) for e in zip(us, ys, rs, strict=True)]
+    found = [checked(*e, rate_hz, inputs, outputs) for e in zip(us, ys, rs, strict=True)]
     shapes = {tuple(0 if x is None else x.shape[1] for x in e) for e in found}
     if len(shapes) > 1:
         raise EstimationError(f"experiments differ in their channels (u, y, r): {sorted(shapes)}. Use the same in all")
@@ -131,7 +136,7 @@ def _experiments(
     if len(found) % n_u or (n_r and n_r != n_u):
         raise EstimationError(
             f"{len(found)} experiments with {n_u} inputs and {n_r} references; each realisation takes {n_u} "
-            "experiments, and a reference for each input. Add experiments, or use frf_local"
+            "experiments, and a reference for each input. Add experiments, or use the local method (--method local)"
         )
     return found
 
@@ -154,12 +159,13 @@ def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int
     all_z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)[n % period :].reshape(count, period, -1)
     dropped = _transient_periods(all_z[:, :, :n_z]) if drop == "auto" else int(drop)
     if drop == "auto" and dropped:
-        warnings += (f"experiment {k + 1}: the first {dropped} periods hold a transient and are not used",)
+        first = "first period holds" if dropped == 1 else f"first {dropped} periods hold"
+        warnings += (f"experiment {k + 1}: the {first} a transient and {'is' if dropped == 1 else 'are'} not used",)
     used = all_z[dropped:]
     if used.shape[0] >= 3 and transient_ratio(used[:, :, :n_z]) > _TRANSIENT:
         warnings += (
             f"experiment {k + 1}: the first period differs from the others by more than noise: a transient, which "
-            "biases G and its variance. Give drop_periods",
+            "biases G and its variance. Cut it off (--from, or drop_periods)",
         )
     Z = np.fft.rfft(used, axis=1)[:, 1 : (period + 1) // 2] / period
     mean = Z.mean(axis=0)
@@ -226,7 +232,7 @@ def _total(
     if known is None and found.noise is None:
         raise EstimationError(
             "one period of one realisation without free lines gives no variance. Measure more periods or realisations, "
-            "leave out lines, or use frf_local"
+            "leave out lines, or use the local method (--method local)"
         )
     if known is None and found.noise is not None:
         return (

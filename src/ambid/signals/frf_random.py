@@ -89,7 +89,7 @@ def frf_random(
     RecordError
         If the segment does not fit the record.
     """
-    u, y, r = checked(u, y, r, rate_hz)
+    u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     _options_agree(kind, noise_ratio, r is not None)
     z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
     spectra = cross_spectra(z, rate_hz, segment=segment, overlap=overlap, window=window)
@@ -164,7 +164,7 @@ def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
     worst = float(np.sqrt(np.max(share)))
     return (
         f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which is "
-        "not in the variance. Give longer segments, or use frf_local",
+        "not in the variance. Give longer segments, or use the local method (--method local)",
     )
 
 
