@@ -98,9 +98,7 @@ def command(
     """
     from ambid.job import fit, physics, read_data
     from ambid.report.fit_text import fit_text, physics_text
-    from ambid.report.sensitivity import sensitivity_text
     from ambid.rig import load_rig
-    from ambid.validate.sensitivity import sensitivity_analysis
 
     with Outputs(record, second, rig) as outputs:
         outputs.claim(json_path(json), "--json")
@@ -135,7 +133,10 @@ def command(
             if plot is not None or stabilisation is not None or sensitivity:
                 part = (from_s, to_s)
                 data = read_data(record, inputs or (), output or (), part=part, rate_hz=rate, gaps=gaps, rig=bench)
-                matter = sensitivity_analysis(found, data) if sensitivity else None
+                if sensitivity:
+                    from ambid.validate.sensitivity import sensitivity_analysis
+
+                    matter = sensitivity_analysis(found, data)
                 _draw(found, data, outputs, plot, stabilisation, tick)
         written = _json_text(found, physical, matter)
         if (path := json_path(json)) is not None:
@@ -147,6 +148,8 @@ def command(
         if physical is not None:
             typer.echo("\n" + physics_text(physical, paint=painter()))
         if matter is not None:
+            from ambid.report.sensitivity import sensitivity_text
+
             typer.echo("\n" + sensitivity_text(matter, paint=painter()))
     if strict and not (found.passed and (physical is None or physical.passed)):
         raise typer.Exit(FAILED_CHECK)

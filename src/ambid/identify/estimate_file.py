@@ -17,7 +17,7 @@ from ambid.identify.estimate import (
     NoiseModel,
     OutputFit,
 )
-from ambid.identify.json_values import check_from_json, check_json, plain_json
+from ambid.identify.json_values import check_from_json, check_json, delay_json, plain_json
 from ambid.physics.models import model
 
 SCHEMA = "ambid.estimate/1"
@@ -60,16 +60,7 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
             "matrix": estimate.covariance.tolist(),
             "method": estimate.covariance_method,
         },
-        "delay": {
-            role: {
-                "samples": d.samples,
-                "fraction": d.fraction,
-                "total": d.samples + d.fraction,
-                "sd": d.sd,
-                "how": d.how,
-            }
-            for role, d in estimate.delay.items()
-        },
+        "delay": {role: delay_json(d) for role, d in estimate.delay.items()},
         "continuous": {
             "states": list(estimate.continuous.states),
             "A": estimate.continuous.A.tolist(),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.identify.estimate import Check
+from ambid.identify.estimate import Check, Delay
 
 
 def plain_json(value: Any) -> Any:
@@ -56,6 +56,27 @@ def check_json(check: Check) -> dict[str, Any]:
     """
     p = {} if check.p is None else {"p": check.p}
     return {"passed": check.passed, **p, **dict(check.values), "detail": check.detail}
+
+
+def delay_json(delay: Delay) -> dict[str, Any]:
+    """Return a delay as JSON.
+
+    Parameters
+    ----------
+    delay : Delay
+
+    Returns
+    -------
+    dict
+        ``samples``, ``fraction``, their sum ``total``, ``sd`` and ``how``.
+    """
+    return {
+        "samples": delay.samples,
+        "fraction": delay.fraction,
+        "total": delay.samples + delay.fraction,
+        "sd": delay.sd,
+        "how": delay.how,
+    }
 
 
 def check_from_json(document: Mapping[str, Any]) -> Check:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ambid.identify.estimate_file import parameter_json
-from ambid.identify.json_values import check_json, plain_json
+from ambid.identify.json_values import check_json, delay_json, plain_json
 from ambid.identify.physical import PhysicalFit
 
 
@@ -21,16 +21,13 @@ def physical_to_json(found: PhysicalFit) -> dict[str, Any]:
     dict
         ``model``, ``parameters``, ``covariance``, ``delay``, ``misfit``, ``band_hz``, ``warnings``; SI.
     """
-    d = found.delay
     document = {
         "model": found.model,
         "parameters": {p.name: parameter_json(p) for p in found.parameters},
         "covariance": {"names": found.covariance_names, "matrix": found.covariance},
-        "delay": {
-            "samples": d.samples, "fraction": d.fraction, "total": d.samples + d.fraction, "sd": d.sd, "how": d.how
-        },
+        "delay": delay_json(found.delay),
         "misfit": check_json(found.misfit),
         "band_hz": found.band_hz,
         "warnings": found.warnings,
-    }  # fmt: skip
+    }
     return {name: plain_json(value) for name, value in document.items()}

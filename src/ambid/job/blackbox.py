@@ -6,7 +6,7 @@ Read -> cut -> fit -> judge -> BlackBoxFit. The second record, if any, is only j
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -16,6 +16,7 @@ from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.structures import STRUCTURES, Structure, structure
+from ambid.job._progress import Tick, silent
 from ambid.job.bench_data import bench_data
 from ambid.physics.models import model
 from ambid.record import Record, read_record
@@ -26,8 +27,6 @@ from ambid.units import UNKNOWN
 if TYPE_CHECKING:
     from ambid.identify.physical import PhysicalFit
     from ambid.validate.comparison import Comparison
-
-Tick = Callable[[str], None]
 
 
 def fit(
@@ -103,7 +102,7 @@ def fit(
     from ambid.identify.threads import one_thread
     from ambid.validate.blackbox import judged
 
-    say = tick or _silent
+    say = tick or silent
     of = structure(structure_name)
     _check_criterion(criterion, orders)
     if validate is None and not (validate_from_s is None and validate_to_s is None):
@@ -230,7 +229,7 @@ def compare(
         )
         same_bench(data.units, data.dt, second)
     with one_thread():
-        return compared(data, candidates, holdout=holdout, second=second, tick=tick or _silent)
+        return compared(data, candidates, holdout=holdout, second=second, tick=tick or silent)
 
 
 def read_data(
@@ -338,8 +337,3 @@ def _check_use(
         raise EstimationError(
             f"structure {of.name} cannot be told that a record begins at rest; {some} can. Leave --at-rest out"
         )
-
-
-def _silent(stage: str) -> None:
-    """Report no progress."""
-    del stage

@@ -20,8 +20,9 @@ from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.response import Offsets
 from ambid.identify.frequency.measured import Measured
 from ambid.identify.frequency.physical_estimate import FrequencyEstimate
+from ambid.job._progress import Tick, silent
 from ambid.job.bench_data import bench_data
-from ambid.job.blackbox import Tick, read_data
+from ambid.job.blackbox import read_data
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig, load_rig
@@ -103,7 +104,7 @@ def frf(
     EstimationError
         If the response cannot be measured, or a model not be fitted to it.
     """
-    say = tick or _silent
+    say = tick or silent
     _agree(orders, state_space, feedthrough, domain, delay, rig)
     laps, last = dict[str, float](), time.perf_counter()
     rig = load_rig(rig) if isinstance(rig, str | Path) else rig
@@ -237,8 +238,3 @@ def _physical(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> Fre
     if delay is not None and known != "auto":
         known = float(known) * response.rate_hz
     return greybox_frf(response, plant, rig.parameters, delay=known)
-
-
-def _silent(stage: str) -> None:
-    """Report no progress."""
-    del stage

@@ -6,13 +6,14 @@ Read -> cut -> identify -> validate -> Estimate. Each arrow is one call below; w
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Check, Estimate
+from ambid.job._progress import Tick, silent
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.record import Record
@@ -22,8 +23,6 @@ from ambid.signals.samples import cut
 if TYPE_CHECKING:
     from ambid.identify.likelihood import Fit
     from ambid.identify.uncertainty import Uncertainty
-
-Tick = Callable[[str], None]
 
 
 def identify(
@@ -72,7 +71,7 @@ def identify(
     from ambid.identify.threads import one_thread
     from ambid.identify.uncertainty import uncertainty
 
-    say = tick or _silent
+    say = tick or silent
     clock = _Clock()
     rig = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
     bench = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
@@ -185,11 +184,6 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
             "and disagreement of refits included), and still cannot cover a bias that is the same everywhere"
         )
     return tuple(found)
-
-
-def _silent(stage: str) -> None:
-    """Report no progress."""
-    del stage
 
 
 class _Clock:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.spread import pole_covariance
 from ambid.identify.blackbox.structures import structure
 from ambid.report.numbers import quantity, sized
-from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain
+from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain, timing_line, warning_lines
 
 if TYPE_CHECKING:
     from ambid.identify.physical import PhysicalFit
@@ -44,8 +44,8 @@ def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> s
         [] if fit.validation is None else [paint("on the second record", "strong"), *validation_lines(fit.validation)],
         _criteria_lines(fit, width),
         check_lines(fit.checks, width=width, paint=paint),
-        _warning_lines(fit, width, paint),
-        [paint(_timing_line(fit), "dim")] if fit.timing_s else [],
+        warning_lines(_unsaid(fit), width=width, paint=paint),
+        [paint(timing_line(fit.timing_s), "dim")] if fit.timing_s else [],
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
@@ -74,7 +74,7 @@ def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain
         *parameter_lines(found, width=width, paint=paint),
         f"delay {total:.3g} sample{'' if total == 1 else 's'}, {d.how}; from {sized(low, 'Hz')} to {sized(high, 'Hz')}",
         *check_lines({"misfit": found.misfit}, width=width, paint=paint),
-        *_warnings([w for w in found.warnings if w != found.misfit.detail], width, paint),
+        *warning_lines([w for w in found.warnings if w != found.misfit.detail], width=width, paint=paint),
     ]
     return "\n".join(lines)
 
@@ -218,19 +218,7 @@ def _number(x: float | None) -> str:
     return "–" if x is None else f"{x:.4f}"
 
 
-def _warning_lines(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
+def _unsaid(fit: BlackBoxFit) -> list[str]:
+    """Warnings that are not the detail of a check, which stands with the checks."""
     said = {c.detail for c in fit.checks.values()}
-    return _warnings([w for w in fit.warnings if w not in said], width, paint)
-
-
-def _warnings(warnings: Sequence[str], width: int, paint: Paint) -> list[str]:
-    lines: list[str] = []
-    for warning in warnings:
-        first, *more = textwrap.wrap(warning, width - 9, break_long_words=False, break_on_hyphens=False)
-        lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
-    return lines
-
-
-def _timing_line(fit: BlackBoxFit) -> str:
-    parts = [f"{name} {seconds:.2g} s" for name, seconds in fit.timing_s.items()]
-    return f"{', '.join(parts)}; {sum(fit.timing_s.values()):.2g} s in all"
+    return [w for w in fit.warnings if w not in said]

@@ -16,7 +16,7 @@ from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.identify.frequency.measured import Measured
 from ambid.report.fit_text import coefficient_lines, pole_lines
 from ambid.report.numbers import prefixed, quantity, sized
-from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain
+from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain, timing_line, warning_lines
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ def frf_text(measured: Measured, *, width: int = WIDTH, paint: Paint = plain) ->
         _distortion_lines(measured, width),
         [] if fit is None else _fit_lines(fit, width, paint),
         [] if estimate is None else _estimate_lines(estimate, width, paint),
-        _warning_lines(measured, width, paint),
-        [paint(_timing_line(measured), "dim")] if measured.timing_s else [],
+        warning_lines(warnings_of(measured), width=width, paint=paint),
+        [paint(timing_line(measured.timing_s), "dim")] if measured.timing_s else [],
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
@@ -274,16 +274,3 @@ def warnings_of(measured: Measured) -> list[str]:
             if not warning.endswith(tuple(said)):
                 found.append(warning)
     return list(dict.fromkeys(found))
-
-
-def _warning_lines(measured: Measured, width: int, paint: Paint) -> list[str]:
-    lines: list[str] = []
-    for warning in warnings_of(measured):
-        first, *more = textwrap.wrap(warning, width - 9, break_long_words=False, break_on_hyphens=False)
-        lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
-    return lines
-
-
-def _timing_line(measured: Measured) -> str:
-    parts = [f"{name} {seconds:.2g} s" for name, seconds in measured.timing_s.items()]
-    return f"{', '.join(parts)}; {sum(measured.timing_s.values()):.2g} s in all"

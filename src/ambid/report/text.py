@@ -71,8 +71,8 @@ def estimate_text(estimate: Estimate, *, width: int = WIDTH, paint: Paint = plai
         columns(fit_rows(estimate)),
         check_lines(estimate.checks, width=width, paint=paint),
         [] if estimate.validation is None else validation_lines(estimate.validation, width=width, paint=paint),
-        _warning_lines(estimate, width, paint),
-        [paint(_timing_line(estimate), "dim")] if estimate.timing_s else [],
+        warning_lines(other_warnings(estimate), width=width, paint=paint),
+        [paint(timing_line(estimate.timing_s), "dim")] if estimate.timing_s else [],
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
@@ -319,9 +319,24 @@ def _wrapped(text: str, width: int, indent: int) -> list[str]:
     return textwrap.wrap(text, max(width - indent, 30), break_long_words=False, break_on_hyphens=False) or [""]
 
 
-def _warning_lines(estimate: Estimate, width: int, paint: Paint) -> list[str]:
+def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+    """Write warnings, one after the other.
+
+    Parameters
+    ----------
+    warnings : sequence of str
+    width : int
+        Columns of the terminal; longer ones go on under themselves.
+    paint : callable
+        Adds colour.
+
+    Returns
+    -------
+    list of str
+        Lines.
+    """
     lines: list[str] = []
-    for warning in other_warnings(estimate):
+    for warning in warnings:
         first, *more = _wrapped(warning, width, 9)
         lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
     return lines
@@ -344,6 +359,17 @@ def other_warnings(estimate: Estimate) -> list[str]:
     return [warning for warning in estimate.warnings if warning not in said]
 
 
-def _timing_line(estimate: Estimate) -> str:
-    parts = [f"{name} {seconds:.2g} s" for name, seconds in estimate.timing_s.items()]
-    return f"{', '.join(parts)}; {sum(estimate.timing_s.values()):.2g} s in all"
+def timing_line(timing_s: Mapping[str, float]) -> str:
+    """Say how long each stage took, and all together.
+
+    Parameters
+    ----------
+    timing_s : Mapping[str, float], s
+
+    Returns
+    -------
+    str
+        One line.
+    """
+    parts = [f"{name} {seconds:.2g} s" for name, seconds in timing_s.items()]
+    return f"{', '.join(parts)}; {sum(timing_s.values()):.2g} s in all"

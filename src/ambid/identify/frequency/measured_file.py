@@ -12,7 +12,7 @@ from ambid.identify.blackbox.fit_file import fit_to_json
 from ambid.identify.estimate_file import parameter_json
 from ambid.identify.frequency.measured import Measured
 from ambid.identify.frequency.physical_estimate import FrequencyEstimate
-from ambid.identify.json_values import check_json, plain_json
+from ambid.identify.json_values import check_json, delay_json, plain_json
 from ambid.signals.frf import FrequencyResponse
 
 SCHEMA = "ambid.frf/1"
@@ -91,7 +91,7 @@ def _covariance_json(frf: FrequencyResponse) -> dict[str, Any] | None:
 
 
 def _estimate_json(estimate: FrequencyEstimate) -> dict[str, Any]:
-    d, plant = estimate.delay, estimate.continuous
+    plant = estimate.continuous
     return {
         "status": estimate.status,
         "model": estimate.model,
@@ -101,13 +101,7 @@ def _estimate_json(estimate: FrequencyEstimate) -> dict[str, Any]:
             "matrix": estimate.covariance,
             "method": estimate.covariance_method,
         },
-        "delay": {
-            "samples": d.samples,
-            "fraction": d.fraction,
-            "total": d.samples + d.fraction,
-            "sd": d.sd,
-            "how": d.how,
-        },
+        "delay": delay_json(estimate.delay),
         "continuous": {
             "states": plant.states,
             "A": plant.A,
