@@ -1,0 +1,116 @@
+"""What a block of samples says of the tracked numbers: a triangle, whatever the length of the block.
+
+At a point `at` of the tracked numbers q the weighted innovations of a block are e + Ψ (q - at) up to second order, with
+unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length of what no change of q explains:
+-2 log-likelihood = rest + |r + J (q - at)|² + constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """One block's evidence. All tracked numbers are in units of their own magnitude, so that they are of order one.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The tracked numbers: physical parameters, then offsets and the like.
+    at : ndarray, shape (p,)
+        Where the predictor was linearised.
+    J : ndarray, shape (p, p)
+        Upper triangle; J^T J is the information of the block.
+    r : ndarray, shape (p,)
+        Explainable part of the weighted innovations at `at`, with unit covariance.
+    rest : float
+        Squared length of what no change of q explains: chi-squared with `freedom` degrees if the model is right.
+    n_samples, n_outputs : int
+        Samples used, and outputs of each.
+    first, last : int
+        Sample numbers of the stream: the block is first <= k < last.
+    """
+
+    names: tuple[str, ...]
+    at: Array
+    J: Array
+    r: Array
+    rest: float
+    n_samples: int
+    n_outputs: int
+    first: int
+    last: int
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of `rest`."""
+        return max(self.n_samples * self.n_outputs - self.r.size, 0)
+
+    @property
+    def information(self) -> Array:
+        """J^T J, shape (p, p)."""
+        return np.asarray(self.J.T @ self.J)
+
+    def residual(self, q: Array) -> Array:
+        """Return r + J (q - at), shape (p,), unit covariance if `q` is the truth.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        ndarray, shape (p,)
+        """
+        return np.asarray(self.r + self.J @ (q - self.at))
+
+    def loss(self, q: Array) -> float:
+        """Return the sum of squared weighted innovations at `q`, to second order around `at`.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        float
+        """
+        left = self.residual(q)
+        return float(self.rest + left @ left)
+
+
+def merge(parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence of several blocks as one, at the linearisation point of the last.
+
+    Parameters
+    ----------
+    parts : sequence of Evidence
+        Of the same numbers, in the order of time; at least one.
+
+    Returns
+    -------
+    Evidence
+    """
+    end = parts[-1]
+    p = end.r.size
+    rows = np.vstack([np.column_stack([part.J, part.residual(end.at)]) for part in parts])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    beyond = float(triangle[p, p] ** 2) if triangle.shape[0] > p else 0.0
+    return Evidence(
+        names=end.names,
+        at=end.at,
+        J=triangle[:p, :p],
+        r=triangle[:p, p],
+        rest=beyond + sum(part.rest for part in parts),
+        n_samples=sum(part.n_samples for part in parts),
+        n_outputs=end.n_outputs,
+        first=parts[0].first,
+        last=end.last,
+    )

@@ -1,0 +1,165 @@
+"""A track as it is written and looked at: one line per reporting interval, schema ``ambid.track/1`` (contracts.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+State = Literal["tracking", "frozen", "changed", "hold"]
+EventKind = Literal[
+    "change", "rejected", "accepted", "refused", "reverted", "frozen", "thawed", "operator", "disturbed"
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackedValue:
+    """One parameter at one time, as accepted.
+
+    Attributes
+    ----------
+    value, sd : float
+        SI.
+    stale : bool
+        Whether it is frozen for want of information: the value is the last that data showed.
+    """
+
+    value: float
+    sd: float
+    stale: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """Something that happened or was decided, with its reason.
+
+    Attributes
+    ----------
+    kind : str
+        ``change`` (a parameter moved), ``disturbed`` (offset, noise or something unexplained changed), ``rejected``
+        (samples were not used), ``accepted`` and ``refused`` (a candidate passed its validation or not), ``reverted``,
+        ``frozen`` and ``thawed`` (information went and came), ``operator`` (a flag was set).
+    t : float
+        When it happened, s of record; for a change the estimated onset.
+    why : str
+        One line for people.
+    parameter : str or None
+    samples : int or None
+        How many were rejected.
+    values : Mapping[str, float]
+        Numbers behind the decision.
+    """
+
+    kind: EventKind
+    t: float
+    why: str
+    parameter: str | None = None
+    samples: int | None = None
+    values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackHeader:
+    """First line of a track.
+
+    Attributes
+    ----------
+    rate_hz : float
+    limit : float
+        Of `TrackLine.error`.
+    method : str
+    model : str
+    units : Mapping[str, str]
+        SI unit of each tracked parameter.
+    every_s : float
+        Reporting interval, s.
+    start : Mapping[str, TrackedValue]
+        Parameters with which tracking began.
+    record : Mapping[str, object]
+        ``file``, ``sha256``, ``samples``.
+    """
+
+    rate_hz: float
+    limit: float
+    method: str
+    model: str
+    units: Mapping[str, str]
+    every_s: float
+    start: Mapping[str, TrackedValue]
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackLine:
+    """One reporting interval.
+
+    Attributes
+    ----------
+    t : float
+        Its end, s of record.
+    parameters : Mapping[str, TrackedValue]
+    error : float
+        Root mean square of the normalised innovations: 1 where the model predicts as well as when it was identified.
+    state : {"tracking", "frozen", "changed", "hold"}
+    events : tuple of Event
+        In the order in which they happened; the most important first.
+    extra : Mapping[str, TrackedValue]
+        Tracked numbers beside the parameters, such as unbalance amplitude and phase.
+    """
+
+    t: float
+    parameters: Mapping[str, TrackedValue]
+    error: float
+    state: State
+    events: tuple[Event, ...] = ()
+    extra: Mapping[str, TrackedValue] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Latency:
+    """How long blocks waited and were worked on, s.
+
+    Attributes
+    ----------
+    median, p99, largest : float
+        From the arrival of a block to the end of its work.
+    overruns : int
+        Blocks that were lost because the ring was full.
+    late : int
+        Blocks whose work ended after the next one had come.
+    """
+
+    median: float
+    p99: float
+    largest: float
+    overruns: int
+    late: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackSummary:
+    """Last line of a track.
+
+    Attributes
+    ----------
+    samples : int
+    seconds_of_record, computing_s : float
+    updates : int
+        Times that the published parameters moved.
+    rejected_samples : int
+    changes : tuple of Event
+        Of kind ``change``.
+    counts : Mapping[str, int]
+        How many events of each kind there were.
+    latency : Latency or None
+    """
+
+    samples: int
+    seconds_of_record: float
+    computing_s: float
+    updates: int
+    rejected_samples: int
+    changes: tuple[Event, ...]
+    counts: Mapping[str, int]
+    latency: Latency | None = None
