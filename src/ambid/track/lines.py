@@ -163,3 +163,19 @@ class TrackSummary:
     changes: tuple[Event, ...]
     counts: Mapping[str, int]
     latency: Latency | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """A whole track, as kept for a figure or read back from a file.
+
+    Attributes
+    ----------
+    header : TrackHeader
+    lines : tuple of TrackLine
+    summary : TrackSummary
+    """
+
+    header: TrackHeader
+    lines: tuple[TrackLine, ...]
+    summary: TrackSummary
