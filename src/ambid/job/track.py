@@ -38,7 +38,7 @@ def track(
     on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
     keep: bool = True,
     tick: Tick | None = None,
-) -> Track:
+) -> Track:  # noqa: ARG001
     """Follow the physical parameters of a bench through a record.
 
     Parameters

@@ -1,1 +1,1 @@
-"""What watches the tracking: error level, change detection, excitation, validation gate, flags and the log of it all."""
+"""What watches the tracking: error level, change detection, excitation, validation gate, flags, and the log."""
