@@ -153,6 +153,8 @@ class TrackSummary:
     counts : Mapping[str, int]
         How many events of each kind there were.
     latency : Latency or None
+    complete : bool
+        False where the run was stopped, or its file ends before the summary.
     """
 
     samples: int
@@ -163,6 +165,7 @@ class TrackSummary:
     changes: tuple[Event, ...]
     counts: Mapping[str, int]
     latency: Latency | None = None
+    complete: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
