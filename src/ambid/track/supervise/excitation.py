@@ -1,0 +1,189 @@
+"""Which parameters the recent data inform: without information no update, and what is published is marked stale.
+
+The triangles of recent blocks are gathered in an exponential window by QR; the standard deviation that this window
+alone would give each number, all others unknown, says how much the data tell of it now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError, nearest
+from ambid.track.evidence import Evidence
+from ambid.track.lines import Event
+
+Array = NDArray[np.float64]
+
+_RIDGE = 1e-3  # the numbers are of order one: one that nothing shows has a standard deviation of a thousand
+_WORSE = 1.5  # accuracy over `enough` at which a number is no longer fresh: hysteresis
+_FILLED = 0.5  # part of the window that has to be filled before anything is judged
+
+
+class ExcitationMonitor:
+    """Tell fresh parameters from frozen ones.
+
+    A parameter's information rate is 1/(sd² window), with sd the marginal standard deviation (relative, as all numbers
+    are of order one) that the exponential window alone would give, offsets and all other numbers unknown. It freezes
+    below `freeze` and thaws above `thaw` times the rate at identification, unless the window alone gives it better than
+    `enough`: then it is fresh.
+
+    Parameters
+    ----------
+    names : sequence of str
+        All numbers of the evidence.
+    reference_rate : Mapping[str, float]
+        Information rate of each parameter at identification, 1/(sd² T), 1/s: `rate_of`. Numbers that are not in it are
+        nuisance: they take their share of information and are not judged.
+    block_s : float
+        Duration of a block, s.
+    window_s : float
+        Time constant of the window, s.
+    freeze, thaw : float
+        Parts of the reference.
+    enough : float
+        Relative standard deviation.
+
+    Raises
+    ------
+    EstimationError
+        If a setting makes no sense.
+
+    Attributes
+    ----------
+    fresh : Mapping[str, bool]
+        Of each parameter; all are at the start.
+    sd, rate : Mapping[str, float]
+        What the window alone gives each parameter: relative standard deviation (about a thousand: nothing), and
+        information rate, 1/s.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        *,
+        reference_rate: Mapping[str, float],
+        block_s: float,
+        window_s: float = 1.0,
+        freeze: float = 0.02,
+        thaw: float = 0.05,
+        enough: float = 0.01,
+    ) -> None:
+        from ambid.track.supervise._kernels import inform
+
+        self.names, p = tuple(names), len(names)
+        for name, value in reference_rate.items():
+            if name not in self.names:
+                raise EstimationError(f"reference_rate names {name!r}, not tracked.{nearest(name, self.names)}")
+            if not (value >= 0 and math.isfinite(value)):
+                raise EstimationError(
+                    f"reference_rate of {name} is {value:g}; it is an information rate. Give 0 or more"
+                )
+        if not (0 < block_s < window_s and 0 < freeze <= thaw and enough >= 0):
+            raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Mend them")
+        self._inform, self._judged = inform, tuple(name for name in self.names if name in reference_rate)
+        self._at = tuple(self.names.index(name) for name in self._judged)
+        self._reference = np.array([reference_rate.get(name, -1.0) for name in self.names])
+        self._limits = np.array([freeze, thaw, enough, _WORSE, _RIDGE])
+        self._block, self._window, self._decay = block_s, window_s, math.exp(-block_s / window_s)
+        self._duration = 0.0
+        self._R, self._J, self._work = np.zeros((p, p)), np.zeros((p, p)), np.zeros((3, p, p))
+        self._fresh, self._out = np.ones(p, dtype=np.int64), np.zeros((2, p))
+        self._before = self._fresh.copy()
+        self._out[0] = 1.0 / _RIDGE
+
+    @property
+    def fresh(self) -> Mapping[str, bool]:  # noqa: D102
+        return MappingProxyType({n: bool(self._fresh[i]) for n, i in zip(self._judged, self._at, strict=True)})
+
+    @property
+    def sd(self) -> Mapping[str, float]:  # noqa: D102
+        return MappingProxyType({n: float(self._out[0, i]) for n, i in zip(self._judged, self._at, strict=True)})
+
+    @property
+    def rate(self) -> Mapping[str, float]:  # noqa: D102
+        return MappingProxyType({n: float(self._out[1, i]) for n, i in zip(self._judged, self._at, strict=True)})
+
+    def update(self, evidence: Evidence, t: float) -> tuple[Event, ...]:
+        """Take in a block.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        t : float
+            Its end, s of record.
+
+        Returns
+        -------
+        tuple of Event
+            ``frozen`` and ``thawed``, with the reason.
+
+        Raises
+        ------
+        EstimationError
+            If the evidence is not finite or of other numbers. It changed nothing then.
+        """
+        J = evidence.J
+        if J.shape != self._J.shape or not math.isfinite(J.sum()):
+            raise EstimationError(
+                f"the block at sample {evidence.first} is not finite or of other numbers. Leave it out"
+            )
+        self._J[:] = J
+        self._duration = self._duration * self._decay + self._block
+        enough = self._duration >= _FILLED * self._window
+        changed = self._inform(
+            self._R, self._J, self._decay, self._duration if enough else -self._duration, self._limits,
+            self._reference, self._fresh, self._out, self._work,
+        )  # fmt: skip
+        return self._events(t) if changed else ()
+
+    def _events(self, t: float) -> tuple[Event, ...]:
+        """Say which flags changed, and why."""
+        events = []
+        for j in np.flatnonzero(self._fresh != self._before):
+            name, thawed = self.names[j], bool(self._fresh[j])
+            sd, rate, reference = float(self._out[0, j]), float(self._out[1, j]), float(self._reference[j])
+            part = rate / reference if reference > 0 else math.inf
+            seen = f"the last {self._window:g} s alone would give {name} to {100 * sd:.3g} %"
+            if sd > 0.5 / _RIDGE:
+                seen = f"the last {self._window:g} s tell nothing of {name}"
+            events.append(
+                Event(
+                    kind="thawed" if thawed else "frozen",
+                    t=t,
+                    why=f"{seen}, {100 * part:.2g} % of the information rate at identification",
+                    parameter=name,
+                    values={"sd": sd, "rate": rate, "reference_rate": reference},
+                )
+            )
+        self._before = self._fresh.copy()
+        return tuple(events)
+
+
+def rate_of(sd: float, duration_s: float) -> float:
+    """Return the information rate behind an estimate.
+
+    Parameters
+    ----------
+    sd : float
+        Relative standard deviation.
+    duration_s : float
+        Of the data, s.
+
+    Returns
+    -------
+    float
+        1/(sd² duration), 1/s.
+
+    Raises
+    ------
+    EstimationError
+        If one of them is not positive.
+    """
+    if not (sd > 0 and duration_s > 0):
+        raise EstimationError(f"an information rate wants sd and duration over 0; got {sd:g} and {duration_s:g} s")
+    return 1.0 / (sd * sd * duration_s)
