@@ -1,0 +1,127 @@
+"""What a recursion says at any moment, in the form of an off-line result: model, operating point, spread, warnings."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.blackbox.response import Offsets
+from ambid.identify.blackbox.structures import structure
+from ambid.identify.polynomial.orders import shown_orders
+from ambid.track.polynomial.start import Identity
+from ambid.track.polynomial.state import State, covariance_of, noise_variance_of
+
+Array = NDArray[np.float64]
+
+_INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
+
+
+def model_of(who: Identity, full: Array) -> PolynomialModel:
+    """Return all coefficients as a model.
+
+    Parameters
+    ----------
+    who : Identity
+    full : ndarray, shape (n_theta,)
+
+    Returns
+    -------
+    PolynomialModel
+    """
+    return PolynomialModel(outputs=(who.layout.polynomials(full),), dt=who.dt)
+
+
+def offsets_of(model: PolynomialModel, state: State) -> Offsets:
+    """Turn the constant of A y = (B/F) u + constant into an operating point.
+
+    It is the output's, unless A sums to zero: an integrating plant has any level, and the constant stands for an offset
+    of its inputs.
+
+    Parameters
+    ----------
+    model : PolynomialModel
+    state : State
+
+    Returns
+    -------
+    Offsets
+    """
+    centre, constant, p = state.levels.copy(), float(state.at[-1]), model.outputs[0]
+    level = float(p.A.sum())
+    gain = np.array([b.sum() / f.sum() if f.sum() else np.inf for b, f in zip(p.B, p.F, strict=True)])
+    if abs(level) > _INTEGRATES * float(np.abs(p.A).sum()):
+        centre[0] += constant / level
+    elif gain.size and np.all(np.isfinite(gain)) and np.any(gain):
+        centre[1:] -= constant * gain / float(gain @ gain)
+    return Offsets(u=centre[1:], y=centre[:1])
+
+
+def warnings_of(who: Identity, state: State | None, *, open_loop: bool) -> tuple[str, ...]:
+    """Return what a reader of the estimate has to know.
+
+    Parameters
+    ----------
+    who : Identity
+    state : State or None
+        None where there is no estimate yet.
+    open_loop : bool
+        Whether the user says that no feedback is at work.
+
+    Returns
+    -------
+    tuple of str
+    """
+    name, found = who.structure, []
+    if state is None:
+        found.append(f"{name}: the first window is not full: there is no estimate yet")
+    if structure(name).feedback == "biased" and not open_loop:
+        found.append(
+            f"{name} is biased where a controller is at work, and nothing says that this loop is open: use bj or "
+            "armax, or say open_loop if there is no feedback"
+        )
+    if state is not None and not np.array_equal(state.theta, state.at):
+        found.append(
+            f"{name}: the data ask for an unstable C or F; stable coefficients are shown and their standard deviations "
+            "are not to be trusted. If the plant is unstable, use armax or arx"
+        )
+    return tuple(found)
+
+
+def fit_of(
+    who: Identity, model: PolynomialModel, state: State, *, samples: int, warnings: tuple[str, ...]
+) -> BlackBoxFit:
+    """Return the present estimate as a fit.
+
+    Parameters
+    ----------
+    who : Identity
+    model : PolynomialModel
+    state : State
+    samples : int
+        Taken in so far.
+    warnings : tuple of str
+
+    Returns
+    -------
+    BlackBoxFit
+    """
+    covariance, free = np.zeros((model.theta.size,) * 2), who.layout.free
+    covariance[np.ix_(free, free)] = covariance_of(state)[: free.size, : free.size]
+    return BlackBoxFit(
+        structure=who.structure,
+        orders=shown_orders(who.structure, who.layout),
+        model=model,
+        covariance=covariance,
+        n_estimated=free.size,
+        offsets=offsets_of(model, state),
+        noise_covariance=np.array([[noise_variance_of(state)]]),
+        inputs=who.inputs,
+        outputs=who.outputs,
+        units=dict(who.units),
+        dt=who.dt,
+        record={"samples": samples, "rate_hz": 1.0 / who.dt},
+        warnings=warnings,
+        details={"recursive": True, **state.counts()},
+    )

@@ -1,0 +1,257 @@
+"""What a recursive polynomial estimator carries from sample to sample, packed for the compiled recursion.
+
+P = U D U' is the covariance of the coefficients in units of the noise variance; S = sum of (product of the forgetting
+factors)^2 psi psi'. Where nothing is forgotten, the error of the estimate has covariance P; otherwise P S P.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.polynomial.orders import Layout
+
+Array = NDArray[np.float64]
+Table = NDArray[np.int64]
+
+COUNTED = (3, 4, 5, 6, 7)  # places in `State.count`: used, rejected, waited, projected, held
+_COLUMNS = 512  # samples that the buffer takes before its end becomes the next history
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forgetting:
+    """How fast old samples lose their weight: lambda(t) = final + growth (lambda(t - 1) - final).
+
+    Attributes
+    ----------
+    final : float
+        Weight of the last sample beside the present one in the long run; 1 forgets nothing. The memory is
+        1/(1 - final) samples.
+    first : float or None
+        The same at the beginning; None: `final`.
+    growth : float
+        Between 0 and 1: how slowly the one becomes the other.
+    """
+
+    final: float = 1.0
+    first: float | None = None
+    growth: float = 0.99
+
+    def __post_init__(self) -> None:
+        for name, value in (("final", self.final), ("first", self.first), ("growth", self.growth)):
+            if value is not None and not 0.0 < value <= 1.0:
+                raise EstimationError(f"forgetting: {name} = {value}; it must be above 0 and at most 1. Correct it")
+
+    @property
+    def forgets(self) -> bool:
+        """Whether any sample loses weight."""
+        return self.final < 1.0 or (self.first is not None and self.first < 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class State:
+    """Arrays that the compiled recursion works on, in the order of its arguments.
+
+    Attributes
+    ----------
+    orders, count : ndarray of int
+        See `_kernels`.
+    real : ndarray, shape (6 + n_inputs,)
+        Forgetting factors, squared errors and their weight, levels that are taken off.
+    theta : ndarray, shape (n,)
+        Estimate: free coefficients, then the constant.
+    at : ndarray, shape (n,)
+        The same, C and F kept stable: what the filters use.
+    UD, S : ndarray, shape (n, n)
+        S is empty where nothing is forgotten.
+    limit : ndarray, shape (n,)
+        Variances beyond which forgetting rests.
+    signals : ndarray, shape (n_rows, n_columns)
+    work : ndarray, shape (4, n)
+    """
+
+    orders: Table
+    count: Table
+    real: Array
+    theta: Array
+    at: Array
+    UD: Array
+    S: Array
+    limit: Array
+    signals: Array
+    work: Array
+
+    def arrays(self) -> tuple[Any, ...]:
+        """Return all arrays in the order in which the recursion takes them.
+
+        Returns
+        -------
+        tuple of ndarray
+        """
+        return tuple(getattr(self, f.name) for f in fields(self))
+
+    @property
+    def levels(self) -> Array:
+        """What is taken off output and inputs, shape (1 + n_inputs,)."""
+        return self.real[5:]
+
+    def counts(self) -> dict[str, int]:
+        """Return how many samples were used, rejected, waited, projected and held.
+
+        Returns
+        -------
+        dict of str to int
+        """
+        names = ("used", "rejected", "waited", "projected", "held")
+        return {name: int(self.count[k]) for name, k in zip(names, COUNTED, strict=True)}
+
+    def copy(self) -> State:
+        """Return a state that shares nothing with this one.
+
+        Returns
+        -------
+        State
+        """
+        return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+
+def table_of(layout: Layout) -> Table:
+    """Return the orders as the recursion takes them.
+
+    Parameters
+    ----------
+    layout : Layout
+
+    Returns
+    -------
+    ndarray of int
+    """
+    n = layout.free.size + 1
+    reach = max([1, layout.na, *(b + k for b, k in zip(layout.nb, layout.nk, strict=True))])
+    longest = reach + max([layout.nc, layout.nd, *layout.nf])
+    each = [x for i in range(layout.n_inputs) for x in (layout.nb[i], layout.nk[i], layout.nf[i])]
+    head = [layout.na, layout.nc, layout.nd, layout.n_inputs, 1, n, longest]
+    return np.array([*head, *each], dtype=np.int64)
+
+
+def new_state(
+    layout: Layout,
+    *,
+    theta: Array,
+    P: Array,
+    limit: Array,
+    noise_variance: float,
+    weight: float,
+    centre: Array,
+    forgetting: Forgetting,
+) -> State:
+    """Return a state with no past signals.
+
+    Parameters
+    ----------
+    layout : Layout
+    theta : ndarray, shape (n,)
+        Free coefficients, then the constant.
+    P : ndarray, shape (n, n)
+        Covariance over noise variance.
+    limit : ndarray, shape (n,)
+    noise_variance : float
+    weight : float
+        Samples that the noise variance is worth.
+    centre : ndarray, shape (1 + n_inputs,)
+        Levels of output and inputs that are taken off.
+    forgetting : Forgetting
+
+    Returns
+    -------
+    State
+    """
+    orders = table_of(layout)
+    n, longest = int(orders[5]), int(orders[6])
+    first = forgetting.final if forgetting.first is None else forgetting.first
+    factor = upper_root(P)
+    root = np.diag(factor).copy()
+    UD = (factor / root).T.copy()
+    np.fill_diagonal(UD, root**2)
+    count = np.zeros(16, dtype=np.int64)
+    count[0] = longest
+    inverse = np.linalg.inv(factor / np.sqrt(np.diag(P))[:, None]) / np.sqrt(np.diag(P))
+    return State(
+        orders=orders,
+        count=count,
+        real=np.concatenate(
+            [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight], np.asarray(centre)]
+        ),
+        theta=theta.copy(),
+        at=theta.copy(),
+        UD=UD,
+        S=np.asarray(inverse.T @ inverse) if forgetting.forgets else np.empty((0, 0)),
+        limit=limit.copy(),
+        signals=np.zeros((8 + 6 * layout.n_inputs, longest + _COLUMNS)),
+        work=np.zeros((4, n)),
+    )
+
+
+def upper_root(P: Array) -> Array:
+    """Return an upper triangle G with P = G G', to rounding.
+
+    Parameters
+    ----------
+    P : ndarray, shape (n, n)
+        Symmetric, its diagonal positive.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+    """
+    size = np.sqrt(np.diag(P))
+    unit = P / size[:, None] / size
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2)
+    rows = (vectors * np.sqrt(np.maximum(values, 1e-14))).T
+    # QR of the reversed root: unit = rows' rows, and J R' J is upper
+    R = np.asarray(np.linalg.qr(rows[:, ::-1], mode="r"))
+    G = R.T[::-1, ::-1]
+    G = G * np.sign(np.where(np.diag(G) == 0.0, 1.0, np.diag(G)))
+    return np.asarray(size[:, None] * G)
+
+
+def covariance_of(state: State) -> Array:
+    """Return the covariance of the coefficients, symmetric and positive definite by construction.
+
+    Parameters
+    ----------
+    state : State
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+    """
+    UD = state.UD
+    d = np.diag(UD)
+    G = np.triu(UD.T, 1) + np.eye(d.size)
+    G = G * np.sqrt(d)
+    if state.S.size:
+        lower = np.tril(state.S)
+        S = lower + np.tril(lower, -1).T
+        H = G.T @ S @ G
+        values, vectors = np.linalg.eigh((H + H.T) / 2)
+        G = G @ (vectors * np.sqrt(np.maximum(values, 1e-14)))
+    return np.asarray(noise_variance_of(state) * (G @ G.T))
+
+
+def noise_variance_of(state: State) -> float:
+    """Return the variance of the innovations.
+
+    Parameters
+    ----------
+    state : State
+
+    Returns
+    -------
+    float
+    """
+    return float(state.real[3] / state.real[4])
