@@ -67,10 +67,10 @@ def read_track(path: str | Path) -> Track:
         if isinstance(line, TrackSummary):
             summary = line
             continue
-        if line.parameters.keys() != header.units.keys():
-            other = sorted(line.parameters.keys() ^ header.units.keys())[0]
+        others = line.parameters.keys() ^ (lines[0].parameters if lines else header.start or line.parameters).keys()
+        if others:
             raise RecordError(
-                f"track {path}, line {k}: parameter {other!r} stands in the header or in the line, not in both."
+                f"track {path}, line {k}: parameter {min(others)!r} stands here or in the lines before, not in both."
                 " Restore the file"
             )
         if lines and not line.t > lines[-1].t:

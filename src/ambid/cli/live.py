@@ -1,0 +1,373 @@
+"""A run of the tracker as it is followed: written, counted, shown, and stopped without losing what it found.
+
+`Follower` takes the callbacks of the job; a thread of its own draws, so that the tracker never waits for a terminal.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from threading import Event as Signal
+from threading import Thread, current_thread, main_thread
+from types import FrameType
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+from ambid.cli.keys import Keys
+from ambid.cli.terminal import progress
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.report.track_history import TrackHistory
+    from ambid.report.track_view import TrackView
+    from ambid.track.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
+    from ambid.track.lines_json import TrackWriter
+    from ambid.track.tally import Tally
+
+T = TypeVar("T")
+Flag = Literal["track", "hold", "accept", "revert"]
+
+_FLAGS: dict[str, Flag] = {"h": "hold", "t": "track", "a": "accept", "r": "revert"}
+_FRAME_S = 0.1  # between two pictures at the least
+_SHARE = 0.02  # of the time may go into drawing
+_SLICE_S = 0.05  # after which the drawing thread looks whether the run has ended
+_RECENT = 600  # lines whose error is shown
+_TOLD = 200  # decisions that are kept for the table
+
+
+class Stopped(KeyboardInterrupt):
+    """The operator ended a run that has begun to give lines.
+
+    Parameters
+    ----------
+    code : int
+        Exit code: 0 for the key q, 130 for Ctrl-C, 143 for a signal to terminate.
+    """
+
+    def __init__(self, code: int) -> None:
+        """Keep the exit `code`."""
+        super().__init__("stopped")
+        self.code = code
+
+
+class Follower:
+    """Follows one run.
+
+    Parameters
+    ----------
+    writer : TrackWriter or None
+        Where lines are written.
+    keep : bool
+        Keep columns for a figure.
+    live : bool
+        Show the live view on standard error.
+    real_time : bool
+        Whether the record is replayed as it was taken.
+    """
+
+    def __init__(self, writer: TrackWriter | None, *, keep: bool, live: bool, real_time: bool) -> None:
+        """Begin before the run."""
+        self.header: TrackHeader | None = None
+        self.last: TrackLine | None = None
+        self.history: TrackHistory | None = None
+        self.decisions: deque[Event] = deque(maxlen=_TOLD)
+        self.code = 0
+        self._writer, self._keep, self._live, self._real_time = writer, keep, live, real_time
+        self._tally: Tally | None = None
+        self._rejected: Event | None = None
+        self._errors: deque[float] = deque(maxlen=_RECENT)
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self._flags: deque[Flag] = deque()
+        self._pressed = ""
+        self._stop: int | None = None
+        self._begin_wall = self._begin_s = 0.0
+        self._before_header = ExitStack()
+        self._say: Callable[[str], object] = str  # says nothing until there is a line of progress
+        self._picture: _Picture | None = None
+
+    def run(self, job: Callable[[], Track]) -> TrackSummary | None:
+        """Let the job run to its end, or until it is stopped, and write the summary.
+
+        Parameters
+        ----------
+        job : callable
+            Runs the tracker with the callbacks of this object.
+
+        Returns
+        -------
+        TrackSummary or None
+            `complete` is False where the run was stopped; None where it was stopped before its first line.
+        """
+        found: TrackSummary | None = None
+        with self._before_header, _signals(self._signalled):
+            self._say = self._before_header.enter_context(progress("track"))
+            try:
+                found = job().summary
+            except KeyboardInterrupt as stop:
+                if self.header is None:
+                    raise
+                self.code = stop.code if isinstance(stop, Stopped) else 130
+            except Exception as error:
+                if not any(isinstance(e, KeyboardInterrupt) for e in (error.__cause__, error.__context__)):
+                    self._abandon()
+                    raise
+                if self.header is None:
+                    raise
+                self.code = 130  # compiled code turns Ctrl-C into an error of its own
+            finally:
+                self._end_picture()
+        return self._closed(found)
+
+    def _closed(self, found: TrackSummary | None) -> TrackSummary | None:
+        if found is None and self._tally is not None:
+            taken = float("nan") if self._real_time else time.perf_counter() - self._begin_wall
+            found = self._tally.summary(computing_s=taken, complete=False)
+        if self._writer is not None and found is not None:
+            self._writer.summary(found)
+            self._writer.close()
+        return None if self.last is None else found
+
+    def _abandon(self) -> None:
+        """After an error: leave a file that says that it is not complete, if it can still be written."""
+        if self._writer is not None and self._tally is not None:
+            with suppress(AmbidError, OSError, ValueError):
+                self._writer.summary(self._tally.summary(complete=False))
+            with suppress(OSError, ValueError):
+                self._writer.close()
+
+    def _end_picture(self) -> None:
+        if self._picture is not None:
+            self._picture.end()
+            self._picture = None
+
+    @property
+    def open_changes(self) -> tuple[Event, ...]:
+        """Changes that were not answered by accepted values."""
+        return () if self._tally is None else self._tally.open_changes
+
+    @property
+    def told(self) -> tuple[Event, ...]:
+        """Decisions in their order, and of the rejections the last."""
+        last = [] if self._rejected is None else [self._rejected]
+        return tuple(sorted([*self.decisions, *last], key=lambda e: e.t))
+
+    def tick(self, stage: str) -> None:
+        """Take a sign of life from the job.
+
+        Parameters
+        ----------
+        stage : str
+
+        Raises
+        ------
+        Stopped
+            If the run is to end.
+        """
+        if self._stop is not None:
+            raise Stopped(self._stop)
+        if self.header is None:
+            self._say(stage)
+
+    def on_header(self, header: TrackHeader) -> None:
+        """Take the header: the file begins, and the live view.
+
+        Parameters
+        ----------
+        header : TrackHeader
+        """
+        from ambid.track.tally import Tally
+
+        self._before_header.close()
+        self._tally = Tally(header)
+        if self._keep:
+            from ambid.report.track_history import TrackHistory
+
+            self.history = TrackHistory(header)
+        if self._writer is not None:
+            self._writer.header(header)
+        self._begin_wall = time.perf_counter()
+        self.header = header
+        if self._live:
+            self._picture = _Picture(self._view, self._key)
+
+    def on_line(self, line: TrackLine) -> Sequence[Flag] | None:
+        """Take a line: written, counted and kept; drawing looks at it later.
+
+        Parameters
+        ----------
+        line : TrackLine
+
+        Returns
+        -------
+        sequence of str or None
+            Flags that the operator has set since the last line.
+
+        Raises
+        ------
+        Stopped
+            If the run is to end; the line is kept.
+        """
+        assert self.header is not None
+        assert self._tally is not None
+        if self._writer is not None:
+            self._writer.line(line)
+        if self.last is None:
+            self._begin_s = line.t - self.header.every_s
+        self._tally.add(line)
+        if self.history is not None:
+            self.history.add(line)
+        self._errors.append(line.error)
+        self.last = line
+        if line.events:
+            for event in line.events:
+                if event.kind == "rejected":
+                    self._rejected = event
+                else:
+                    self.decisions.append(event)
+        if self._stop is not None:
+            raise Stopped(self._stop)
+        if not self._flags:
+            return None
+        return [self._flags.popleft() for _ in range(len(self._flags))]
+
+    def _signalled(self, number: int) -> None:
+        """Stop after the present line; at once where there is none yet, or when asked a second time."""
+        if self.header is None or self._stop is not None:
+            raise KeyboardInterrupt
+        self._stop = 128 + number
+
+    def _key(self, key: str) -> None:
+        if key == "q":
+            self._stop = 0
+            self._pressed = "end"
+        elif key in _FLAGS:
+            self._flags.append(_FLAGS[key])
+            self._pressed = _FLAGS[key]
+
+    def _view(self, keys: bool) -> TrackView | None:
+        """What is shown now; None before the first line. Called by the drawing thread."""
+        from ambid.report.track_view import TrackView
+
+        header, line, tally = self.header, self.last, self._tally
+        if header is None or line is None or tally is None:
+            return None
+        self._widen(line)
+        wall = time.perf_counter() - self._begin_wall
+        samples = header.record.get("samples")
+        behind = wall - (line.t - self._begin_s) if self._real_time else None
+        return TrackView(
+            header=header,
+            line=line,
+            errors=_copied(self._errors),
+            decisions=tuple(sorted([*_copied(self.decisions), *([self._rejected] if self._rejected else [])], key=_t)),
+            ranges=dict(self._ranges),
+            begin_s=self._begin_s,
+            length_s=samples / header.rate_hz if isinstance(samples, (int, float)) else None,
+            wall_s=wall,
+            behind_s=behind,
+            rejected=tally.rejected_samples,
+            updates=tally.updates,
+            open_changes=len(tally.open_changes),
+            keys=keys,
+            pressed=self._pressed,
+        )
+
+    def _widen(self, line: TrackLine) -> None:
+        """Keep the ends of the bars where they are, and move them out where an interval passes them."""
+        for name, v in {**line.parameters, **line.extra}.items():
+            reach = max(2.5 * v.sd, 0.02 * abs(v.value))
+            low, high = v.value - reach, v.value + reach
+            if not (low < high < float("inf")):
+                continue
+            if name not in self._ranges:
+                self._ranges[name] = (low - reach, high + reach)
+            else:
+                before = self._ranges[name]
+                self._ranges[name] = (min(before[0], low), max(before[1], high))
+
+
+def _t(event: Event) -> float:
+    return event.t
+
+
+def _copied(things: deque[T]) -> tuple[T, ...]:
+    """Copy what the other thread adds to meanwhile."""
+    while True:
+        with suppress(RuntimeError):
+            return tuple(things)
+
+
+class _Picture:
+    """The thread that draws the live view and reads keys."""
+
+    def __init__(self, view: Callable[[bool], TrackView | None], key: Callable[[str], None]) -> None:
+        self._view, self._key = view, key
+        self._done = Signal()
+        self._failure: Exception | None = None
+        self._thread = Thread(target=self._run, name="live view", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        self._done.set()
+        self._thread.join()
+        if self._failure is not None:
+            print(f"ambid: the live view ended early: {self._failure}", file=sys.stderr)
+
+    def _run(self) -> None:
+        try:
+            self._draw()
+        except Exception as failure:  # what is shown may fail; the run goes on
+            self._failure = failure
+
+    def _draw(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        from ambid.report.track_view import live_view
+
+        console = Console(stderr=True)
+        ascii_only = console.options.ascii_only
+        # standard output is left alone: lines of JSON may go there
+        shown = Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False, redirect_stderr=False)
+        with Keys() as keys, shown as live:
+            wait_s = 0.0
+            while not self._wait(keys, wait_s):
+                begin = time.perf_counter()
+                view = self._view(keys.available)
+                if view is not None:
+                    live.update(live_view(view, ascii_only=ascii_only), refresh=True)
+                wait_s = max(_FRAME_S, (time.perf_counter() - begin) / _SHARE)
+
+    def _wait(self, keys: Keys, seconds: float) -> bool:
+        """Take keys until it is time for the next picture; True when the run has ended."""
+        until = time.perf_counter() + seconds
+        while not self._done.is_set():
+            left = until - time.perf_counter()
+            if left <= 0:
+                return False
+            for key in keys.read(min(left, _SLICE_S)):
+                self._key(key)
+        return True
+
+
+@contextmanager
+def _signals(take: Callable[[int], None]) -> Iterator[None]:
+    """Give Ctrl-C, and the signal to terminate, to a function; as before afterwards."""
+    if current_thread() is not main_thread():
+        yield
+        return
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del frame
+        take(number)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old if old is not None else signal.SIG_DFL)

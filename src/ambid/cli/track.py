@@ -1,0 +1,304 @@
+"""``ambid track``: on-line identification, a record replayed through the supervised tracker."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from ambid.cli import INTERRUPTED
+from ambid.cli.options import FAILED_CHECK, From, Rate, RecordFile, RigFile, To, json_path
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter
+from ambid.errors import AmbidError, nearest
+
+if TYPE_CHECKING:
+    from ambid.cli.live import Flag, Follower
+    from ambid.track.lines import TrackSummary
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+_FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
+
+
+def command(
+    record: RecordFile,
+    rig: RigFile = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            "--start",
+            metavar="ESTIMATE.json",
+            help="Begin with this estimate; by default one is identified from the beginning of the record.",
+            show_default=False,
+        ),
+    ] = None,
+    start_seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--start-seconds", metavar="S", help="Identify the start from that much of the record.", show_default=False
+        ),
+    ] = None,
+    every: Annotated[float, typer.Option("--every", metavar="S", help="Reporting interval, s of record.")] = 0.01,
+    limit: Annotated[
+        float, typer.Option("--limit", metavar="X", help="Acceptable model error; 1 is that at identification.")
+    ] = 1.5,
+    memory: Annotated[
+        str,
+        typer.Option(
+            "--memory",
+            metavar="auto|all|S",
+            help="How long data count: found from the data, for ever, or a time constant in s.",
+        ),
+    ] = "auto",
+    pace: Annotated[
+        Literal["fastest", "real-time"], typer.Option("--pace", help="Replay as fast as possible, or as it was taken.")
+    ] = "fastest",
+    flag: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--flag",
+            metavar="T:hold",
+            help="Set a flag at a time of the record: track, hold, accept or revert; repeat.",
+            show_default=False,
+        ),
+    ] = None,
+    from_s: From = None,
+    to_s: To = None,
+    rate: Rate = None,
+    json: Annotated[
+        str | None,
+        typer.Option(
+            "--json",
+            metavar="FILE",
+            help="Write the track as lines of JSON while it comes; - for standard output.",
+            show_default=False,
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            "--plot",
+            metavar="FILE.png",
+            help="Draw the tracks, beside the truth where the record has columns true_NAME.",
+            show_default=False,
+        ),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--no-live", "--quiet", help="No live view, also on a terminal.")] = False,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="End with exit code 3 if a change stays unanswered, or the end is frozen or off the limit."
+        ),
+    ] = False,
+) -> None:
+    """Follow the physical parameters of a bench through a record, as the tracker does beside a running machine.
+
+    On a terminal a live view shows parameters, error, state and decisions; h, t, a and r set flags, q ends.
+    """
+    from ambid.cli.live import Follower
+    from ambid.job.track import track
+    from ambid.rig import default_rig, load_rig
+    from ambid.track.lines_json import TrackWriter
+
+    _check(every, limit, start, start_seconds)
+    remembered, flags = memory_of(memory), flags_of(flag)
+    with Outputs(record, rig, start) as outputs:
+        path = json_path(json)
+        outputs.claim(path, "--json")
+        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+        bench = default_rig() if rig is None else load_rig(rig)
+        writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None
+        same = json == "-" and sys.stdout.isatty()
+        live = not quiet and sys.stderr.isatty() and not same
+        follower = Follower(writer, keep=plot is not None, live=live, real_time=pace == "real-time")
+        summary = follower.run(
+            lambda: track(
+                record,
+                bench,
+                start=start,
+                start_s=start_seconds,
+                every_s=every,
+                limit=limit,
+                memory=remembered,
+                pace=pace,
+                flags=flags,
+                from_s=from_s,
+                to_s=to_s,
+                rate_hz=rate,
+                on_header=follower.on_header,
+                on_line=follower.on_line,
+                keep=False,
+                tick=follower.tick,
+            )
+        )
+        if plot is not None and summary is not None:
+            try:
+                _draw(follower, record, rate, plot, outputs)
+            except KeyboardInterrupt:
+                kept = f"; {path} holds the track" if path else ""
+                print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
+                raise typer.Exit(INTERRUPTED) from None
+    _finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict)
+
+
+def _check(every: float, limit: float, start: Path | None, start_seconds: float | None) -> None:
+    for option, x in (("--every", every), ("--limit", limit), ("--start-seconds", start_seconds)):
+        if x is not None and not (math.isfinite(x) and x > 0):
+            raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
+    if start is not None and start_seconds is not None:
+        raise AmbidError(
+            "--start-seconds is for a start identified from the record; --start gives one. Leave one of them out"
+        )
+
+
+def memory_of(text: str) -> float | Literal["auto", "all"]:
+    """Read ``--memory``.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    float, "auto" or "all"
+
+    Raises
+    ------
+    AmbidError
+        If it is none of them.
+    """
+    if text == "auto":
+        return "auto"
+    if text == "all":
+        return "all"
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise AmbidError(f"--memory {text} is neither auto nor all nor a positive number of seconds. Correct it")
+    return seconds
+
+
+def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
+    """Read ``--flag``.
+
+    Parameters
+    ----------
+    texts : list of str or None
+        Each a time in s, a colon and a flag.
+
+    Returns
+    -------
+    tuple of (float, str)
+        In the order of their times.
+
+    Raises
+    ------
+    AmbidError
+        If one is not of that form.
+    """
+    found: list[tuple[float, Flag]] = []
+    for text in texts or []:
+        time, colon, name = text.partition(":")
+        flag = next((f for f in _FLAGS if f == name), None)
+        if colon and flag is None:
+            raise AmbidError(
+                f"--flag {text}: flag {name!r} is unknown; known: {', '.join(_FLAGS)}{nearest(name, _FLAGS)}"
+            )
+        try:
+            t = float(time)
+        except ValueError:
+            t = math.nan
+        if flag is None or not math.isfinite(t):
+            raise AmbidError(f"--flag {text} is not of the form T:FLAG, such as 12.5:hold. Correct it")
+        found.append((t, flag))
+    return tuple(sorted(found, key=lambda f: f[0]))
+
+
+def _draw(follower: Follower, record: Path, rate: float | None, plot: Path, outputs: Outputs) -> None:
+    from ambid.report.figures import save
+    from ambid.report.track_figure import track_figure
+
+    assert follower.header is not None
+    assert follower.history is not None
+    truth = truth_columns(record, rate, follower.header.units)
+    page = track_figure(follower.history, truth=truth)
+    outputs.stage(plot, lambda path: save(page, path))
+
+
+def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
+    """Read the truth that a simulated record holds: columns ``true_NAME``.
+
+    Parameters
+    ----------
+    record : Path
+    rate : float or None
+        Sampling rate in Hz, for a record without time.
+    units : Mapping[str, str]
+        SI unit of each parameter.
+
+    Returns
+    -------
+    dict of str to (t, values)
+        ndarrays of shape (n_samples,), s of record and SI; without parameters that have no such column, or one in
+        another unit.
+    """
+    from ambid.record import read_record
+
+    if not _may_hold_truth(record):
+        return {}
+    try:
+        raw = read_record(record, rate_hz=rate, gaps="interpolate")
+    except AmbidError as refused:
+        print(f"ambid: drawn without the truth: {refused}", file=sys.stderr)
+        return {}
+    found = {}
+    for channel in raw.channels:
+        name = channel.name.removeprefix("true_")
+        if name == channel.name or name not in units:
+            continue
+        if channel.unit != units[name]:
+            line = f"column {channel.name!r} is in [{channel.unit}], the parameter in [{units[name]}]: it is not drawn"
+            print(f"ambid: {line}", file=sys.stderr)
+            continue
+        found[name] = (raw.time_s, channel.values)
+    return found
+
+
+def _may_hold_truth(record: Path) -> bool:
+    """Look at the beginning of a text file, so that a long record is not read again for nothing."""
+    import gzip
+
+    if not record.name.lower().endswith((".csv", ".csv.gz")):
+        return True
+    try:
+        with gzip.open(record) if record.name.lower().endswith(".gz") else record.open("rb") as file:
+            return b"true_" in file.read(65536)
+    except (OSError, EOFError):
+        return False
+
+
+def _finish(follower: Follower, summary: TrackSummary | None, written: list[str], *, table: bool, strict: bool) -> None:
+    """Print the table, say what was interrupted, and end with the exit code."""
+    header, last = follower.header, follower.last
+    if summary is None or header is None or last is None:
+        if follower.code:
+            print("ambid: interrupted before the first line of the track", file=sys.stderr)
+            raise typer.Exit(follower.code)
+        raise AmbidError("the record ends before the first reporting interval. Take a longer one, or a shorter --every")
+    from ambid.report.track_text import track_text, troubles_of
+
+    troubles = troubles_of(header, last, follower.open_changes)
+    if table:
+        typer.echo(track_text(header, last, summary, events=follower.told, troubles=troubles, paint=painter()))
+    if follower.code:
+        kept = f"; {' and '.join(written)} hold{'s' if len(written) == 1 else ''} the track so far" if written else ""
+        print(f"ambid: interrupted at {last.t:.4g} s of record{kept}", file=sys.stderr)
+        raise typer.Exit(follower.code)
+    if strict and troubles:
+        raise typer.Exit(FAILED_CHECK)

@@ -1,0 +1,339 @@
+"""Figure of a track: each parameter with its 95 % band over time, beside the truth where it is known.
+
+Below them the model error against its limit, and the supervisor's state. Long tracks are drawn as their extremes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.report._drawing import BAND, MEASURED, NORMAL_95, PREDICTED, grid
+from ambid.report.numbers import prefixed
+from ambid.report.track_history import STATES, TrackHistory
+from ambid.track.lines import Event, Track
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+Truth = Mapping[str, tuple[Array, Array]]
+
+_TRUTH, _MARK, _STALE, _OVER = "#000000", "#d55e00", "#d9d9d9", "#d55e00"
+_STATE_COLOURS = {"tracking": "#009e73", "changed": "#d55e00", "hold": "#56b4e9", "frozen": "#bdbdbd"}
+_STATE_HATCHES = {"tracking": "", "changed": "xxx", "hold": "...", "frozen": "///"}
+_MARKED: dict[str, Any] = {
+    "change": "-.",
+    "reverted": ":",
+    "disturbed": "--",
+}  # events that get a vertical mark, and its line style
+_BINS = 1200  # a longer track is drawn as the extremes of that many stretches
+_LEAST = 0.004  # part of the width that the shortest state is drawn with, so that none is lost
+_LEVELS = 3  # rows in which names of events stand over each other
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Curve:
+    """Value and 95 % band, or their extremes over stretches of lines."""
+
+    t: Array
+    low: Array
+    high: Array
+    band_low: Array
+    band_high: Array
+    thinned: bool
+
+
+def track_figure(track: Track | TrackHistory, *, truth: Truth | None = None, title: str | None = None) -> Figure:
+    """Draw a track.
+
+    Parameters
+    ----------
+    track : Track or TrackHistory
+        With one line at least.
+    truth : Mapping of parameter to (t, values), optional
+        Each of shape (n,), s of record and SI.
+    title : str, optional
+        Default: the record's name, the model and the method.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One panel for each parameter, the error against its limit, the states.
+    """
+    from matplotlib.figure import Figure
+
+    history = track if isinstance(track, TrackHistory) else TrackHistory.of(track)
+    names, truth = history.names, truth or {}
+    heights = [*([1.55] * len(names)), 1.35, 0.34]
+    page = Figure(figsize=(11, sum(heights) + 1.4), layout="constrained")
+    axes = page.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    head = history.header
+    page.suptitle(title or f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}", fontsize=13)
+    marks = [e for e in history.events if e.kind in _MARKED and np.isfinite(e.t)]
+    for panel, name in zip(axes[: len(names)], names, strict=True):
+        _parameter_panel(panel, history, name, truth.get(name))
+        _event_marks(panel, marks, name, history)
+    _error_panel(axes[-2], history)
+    _event_marks(axes[-2], marks, None, history)
+    _state_strip(axes[-1], history)
+    axes[-1].set_xlabel("time [s of record]")
+    axes[0].set_xlim(*_extent(history))
+    page.align_ylabels(axes[:-1])
+    _legend(page, history, bool(set(truth) & set(names)), marks)
+    return page
+
+
+def _extent(history: TrackHistory) -> tuple[float, float]:
+    t = history.t
+    return float(t[0]) - history.header.every_s, float(t[-1])
+
+
+def _parameter_panel(axes: Axes, history: TrackHistory, name: str, truth: tuple[Array, Array] | None) -> None:
+    value, sd, stale = history.values(name)
+    t, half = history.t, NORMAL_95 * sd
+    low, high = _limits(value, sd, truth, history)
+    scale, unit = prefixed(max(abs(low), abs(high)), history.header.units.get(name, ""))
+    for first, last in runs(stale):
+        axes.axvspan(t[first] - history.header.every_s, t[last], color=_STALE, linewidth=0, zorder=0)
+    c = _thinned(t, value, half)
+    axes.fill_between(c.t, c.band_low / scale, c.band_high / scale, color=BAND, linewidth=0, zorder=1)
+    if c.thinned:
+        axes.fill_between(c.t, c.low / scale, c.high / scale, color=PREDICTED, linewidth=1.0, zorder=3)
+    elif t.size == 1:
+        axes.errorbar(t, value / scale, half / scale, color=PREDICTED, marker="o", capsize=4, zorder=3)
+    else:
+        axes.plot(c.t, c.low / scale, color=PREDICTED, linewidth=1.4, zorder=3)
+    if truth is not None:
+        axes.plot(truth[0], truth[1] / scale, color=_TRUTH, linewidth=1.1, linestyle=(0, (4, 2)), zorder=4)
+        _say(axes, truth_words(t, value, sd, stale, truth))
+    axes.set_ylim(low / scale, high / scale)
+    axes.set_ylabel(f"{name} [{unit}]" if unit else name)
+    axes.ticklabel_format(axis="y", style="plain", useOffset=False)
+    axes.set_axisbelow(True)
+    grid(axes)
+    _relative_axis(axes, history, name, scale)
+
+
+def _limits(value: Array, sd: Array, truth: tuple[Array, Array] | None, history: TrackHistory) -> tuple[float, float]:
+    """Values, truth and the band where it is usual: a band that begins wide may leave the panel."""
+    known = value[np.isfinite(value)]
+    usual = sd[np.isfinite(sd)]
+    reach = 1.15 * NORMAL_95 * float(np.median(usual)) if usual.size else 0.0
+    parts = [known - reach, known + reach]
+    if truth is not None:
+        first, last = _extent(history)
+        inside = (truth[0] >= first) & (truth[0] <= last) & np.isfinite(truth[1])
+        parts.append(truth[1][inside])
+    every = np.concatenate(parts)
+    if not every.size:
+        return 0.0, 1.0
+    low, high = float(every.min()), float(every.max())
+    if not high > low:
+        spread = 0.01 * abs(low) or 1.0
+        return low - spread, high + spread
+    return low - 0.06 * (high - low), high + 0.22 * (high - low)  # names of events stand at the top
+
+
+def _relative_axis(axes: Axes, history: TrackHistory, name: str, scale: float) -> None:
+    """A second axis at the right: change since the start in per cent."""
+    begin = history.header.start.get(name)
+    if begin is None or not np.isfinite(begin.value) or begin.value == 0:
+        return
+    zero, one = begin.value / scale, begin.value / scale / 100
+
+    def percent(y: Any) -> Any:
+        return (y - zero) / one
+
+    def own_unit(p: Any) -> Any:
+        return zero + p * one
+
+    beside = axes.secondary_yaxis("right", functions=(percent, own_unit))
+    beside.tick_params(labelsize=8, colors="#555555")
+    beside.set_ylabel("% from start", fontsize=8, color="#555555")
+
+
+def _thinned(t: Array, value: Array, half: Array) -> _Curve:
+    low, high = value - half, value + half
+    if t.size <= 2 * _BINS:
+        return _Curve(t=t, low=value, high=value, band_low=low, band_high=high, thinned=False)
+    edges = np.linspace(0, t.size, _BINS + 1).astype(int)[:-1]
+    return _Curve(
+        t=t[edges],
+        low=np.fmin.reduceat(value, edges),
+        high=np.fmax.reduceat(value, edges),
+        band_low=np.fmin.reduceat(low, edges),
+        band_high=np.fmax.reduceat(high, edges),
+        thinned=True,
+    )
+
+
+def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
+    """Say how a track keeps to the truth.
+
+    Parameters
+    ----------
+    t, value, sd : ndarray, shape (n_lines,), s and SI
+    stale : ndarray, shape (n_lines,)
+        Lines that are left out.
+    truth : (t, values), ndarrays, shape (n,)
+
+    Returns
+    -------
+    str
+        Share of the lines whose interval holds the truth, and the median distance; empty where nothing can be said.
+    """
+    use = ~stale & np.isfinite(value) & np.isfinite(sd) & (t >= truth[0][0]) & (t <= truth[0][-1] + 1e-9)
+    if not use.any():
+        return ""
+    true = np.interp(t[use], truth[0], truth[1])
+    off = np.abs(value[use] - true)
+    inside = 100 * float(np.mean(off <= NORMAL_95 * sd[use]))
+    size = float(np.median(np.abs(true)))
+    away = f", median distance {100 * float(np.median(off)) / size:.2g} %" if size else ""
+    return f"truth inside the band in {inside:.0f} % of the lines{away}"
+
+
+def _say(axes: Axes, text: str) -> None:
+    """Write above the panel, where nothing is hidden."""
+    axes.set_title(text, fontsize=8, loc="right", color="#333333", pad=2)
+
+
+def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: TrackHistory) -> None:
+    """Draw a vertical line for each, and in the panel of the parameter that moved its name."""
+    first, last = _extent(history)
+    taken: list[float] = [-np.inf] * _LEVELS
+    for e in marks:
+        if not first <= e.t <= last:
+            continue
+        own = e.parameter == name if e.parameter in history.names else name is None
+        axes.axvline(e.t, color=_MARK, linewidth=1.0, linestyle=_MARKED[e.kind], alpha=1.0 if own else 0.35, zorder=2)
+        if not own:
+            continue
+        text, at = event_words(e), (e.t - first) / max(last - first, 1e-300)
+        wide = 0.0068 * len(text)
+        left = at + wide > 0.99
+        begin = at - wide if left else at
+        level = next((k for k, end in enumerate(taken) if end < begin), None)
+        if level is None:
+            continue
+        taken[level] = begin + wide
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
+        axes.annotate(
+            text, (at, 0.96 - 0.14 * level), xycoords="axes fraction", xytext=(-4 if left else 4, 0),
+            textcoords="offset points", fontsize=8, color=_MARK, ha="right" if left else "left", va="top", bbox=box,
+            zorder=6,
+        )  # fmt: skip
+
+
+def event_words(event: Event) -> str:
+    """Name an event in a few words.
+
+    Parameters
+    ----------
+    event : Event
+
+    Returns
+    -------
+    str
+        Such as ``"k_i change at 20.03 s"``.
+    """
+    who = f"{event.parameter} " if event.parameter else ""
+    return f"{who}{event.kind} at {event.t:.4g} s"
+
+
+def _error_panel(axes: Axes, history: TrackHistory) -> None:
+    t, error, limit = history.t, history.error, history.header.limit
+    c = _thinned(t, error, np.zeros_like(error))
+    if c.thinned:
+        axes.fill_between(c.t, c.low, c.high, color=MEASURED, linewidth=0.8)
+    else:
+        axes.plot(c.t, c.low, color=MEASURED, linewidth=1.0, marker="o" if t.size == 1 else None)
+    axes.fill_between(c.t, limit, c.high, where=list(c.high > limit), color=_OVER, alpha=0.55, linewidth=0, step="mid")
+    axes.axhline(limit, color=_OVER, linewidth=1.2, linestyle="--")
+    known = error[np.isfinite(error)]
+    top = max(1.25 * limit, 1.05 * float(known.max(initial=0.0)))
+    if top > 10 * limit and float(known.min(initial=1.0)) > 0:
+        axes.set_yscale("log")
+        axes.set_ylim(0.5 * float(known.min()), 3 * top)
+    else:
+        axes.set_ylim(0, 1.2 * top)
+    axes.set_ylabel("model error")
+    over = 100 * float(np.mean(known > limit)) if known.size else 0.0
+    unknown = 100 * float(np.mean(~np.isfinite(error)))
+    missing = f", not known in {unknown:.2g} %" if unknown else ""
+    _say(axes, f"beyond the limit in {over:.2g} % of the lines{missing}")
+    axes.set_axisbelow(True)
+    grid(axes)
+
+
+def _state_strip(axes: Axes, history: TrackHistory) -> None:
+    t, state = history.t, history.state
+    begin_s, end_s = _extent(history)
+    least = _LEAST * (end_s - begin_s)
+    for code, name in enumerate(STATES):
+        for first, last in runs(state == code):
+            begin = t[first - 1] if first else begin_s
+            short = t[last] < begin + least
+            axes.axvspan(
+                begin,
+                begin + least if short else t[last],
+                facecolor=_STATE_COLOURS[name],
+                hatch=_STATE_HATCHES[name],
+                edgecolor="white",
+                linewidth=0,
+                zorder=2 if short else 1,
+            )
+    axes.set_yticks([])
+    axes.set_ylim(0, 1)
+    axes.set_ylabel("state", rotation=0, ha="right", va="center")
+    axes.tick_params(labelsize=9)
+
+
+def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequence[Event]) -> None:
+    """One legend for the whole page, below it: nothing is hidden by it."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    thin = f", extremes of {history.n_lines // _BINS} lines each" if history.n_lines > 2 * _BINS else ""
+    entries: list[Any] = [
+        Line2D([], [], color=PREDICTED, linewidth=1.4, label=f"accepted value{thin}"),
+        Patch(color=BAND, label="95 % band"),
+    ]
+    if has_truth:
+        entries.append(Line2D([], [], color=_TRUTH, linestyle=(0, (4, 2)), linewidth=1.1, label="truth"))
+    if any(history.values(name)[2].any() for name in history.names):
+        entries.append(Patch(color=_STALE, label="stale: no information"))
+    entries += [
+        Line2D([], [], color=_MARK, linestyle=_MARKED[kind], linewidth=1.0, label=kind)
+        for kind in dict.fromkeys(e.kind for e in marks)
+    ]
+    entries.append(Line2D([], [], color=_OVER, linestyle="--", linewidth=1.2, label="limit of the error"))
+    for code, name in enumerate(STATES):
+        if (history.state == code).any():
+            entries.append(
+                Patch(facecolor=_STATE_COLOURS[name], hatch=_STATE_HATCHES[name], edgecolor="white", label=name)
+            )
+    page.legend(handles=entries, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+
+
+def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Yield the stretches in which a flag is set.
+
+    Parameters
+    ----------
+    flags : ndarray, shape (n,)
+
+    Yields
+    ------
+    first, last : int
+        Both inside the stretch.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    for k in range(0, edges.size, 2):
+        yield int(edges[k]), int(edges[k + 1]) - 1
