@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import RigError
+from ambid.physics.loop import Loop
 from ambid.physics.models import model
 from ambid.physics.nonlinear import OperatingPoint
 from ambid.record.record import Channel, Record, Step
@@ -18,6 +19,9 @@ from ambid.simulate.plant import LinearPlant
 from ambid.units import parse_unit
 
 Array = NDArray[np.float64]
+
+TURNING = {"speed": "rad/s", "angle": "rad"}
+"""Columns of a turning rotor, with their units."""
 
 if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
     from ambid.rig.rig import Rig, RigChannel
@@ -63,6 +67,48 @@ def simulate_rig(
     ModelError
         As `ambid.simulate.simulate`.
     """
+    plant, loop, point = parts_of_rig(rig, closed)
+    done = simulate(
+        plant,
+        excitation,
+        rate_hz=rate_hz,
+        seed=seed,
+        loop=loop,
+        limits=rig.limits,
+        noise=rig.noise,
+        operating_point=point,
+        setpoint=setpoint,
+    )
+    wanted = np.broadcast_to(
+        np.asarray(point.position if setpoint is None else setpoint, dtype=np.float64), done.record.n_samples
+    )
+    return replace(done, record=as_columns(done.record, rig, wanted))
+
+
+def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | None, OperatingPoint]:
+    """Return what a rig gives a simulation.
+
+    Parameters
+    ----------
+    rig : Rig
+        Every parameter needs a value, whatever its role.
+    closed : bool or None
+        Closed or open loop; None: closed where the rig has a loop and does not say ``open_loop``.
+
+    Returns
+    -------
+    plant : LinearPlant
+        With the rig's parameters.
+    loop : Loop or None
+        The controller, or its delay alone.
+    point : OperatingPoint
+        A value that the rig does not give is zero; a voltage that it does not give is R times the current.
+
+    Raises
+    ------
+    RigError
+        If a parameter has no value, or a closed loop is asked for and the rig has none.
+    """
     values = {p.name: p.value for p in rig.parameters}
     parameters = {name: value for name, value in values.items() if value is not None}
     missing = [name for name in values if name not in parameters]
@@ -79,30 +125,41 @@ def simulate_rig(
     rest = dict(rig.operating_point)
     rest.setdefault("voltage", parameters.get("R", 0.0) * rest.get("current", 0.0))
     point = OperatingPoint(**{name: rest.get(name, 0.0) for name in OperatingPoint._fields})
-    done = simulate(
-        plant,
-        excitation,
-        rate_hz=rate_hz,
-        seed=seed,
-        loop=loop,
-        limits=rig.limits,
-        noise=rig.noise,
-        operating_point=point,
-        setpoint=setpoint,
-    )
-    wanted = np.broadcast_to(
-        np.asarray(point.position if setpoint is None else setpoint, dtype=np.float64), done.record.n_samples
-    )
-    return replace(done, record=_as_columns(done.record, rig, wanted))
+    return plant, loop, point
 
 
-def _as_columns(record: Record, rig: Rig, setpoint: Array) -> Record:
-    """Name the roles by the rig's columns and undo their calibrations."""
+def as_columns(record: Record, rig: Rig, setpoint: Array) -> Record:
+    """Name the roles by the rig's columns and undo their calibrations.
+
+    Parameters
+    ----------
+    record : Record
+        Channels named by role; others, such as the truth, are passed on as they are.
+    rig : Rig
+        Its channels. Speed and angle are zero where the record has none: the rotor does not turn.
+    setpoint : ndarray, shape (n_samples,), in m
+        The role ``reference``.
+
+    Returns
+    -------
+    Record
+        The rig's columns, then what has no role.
+
+    Raises
+    ------
+    RigError
+        If a calibration cannot be undone.
+    """
     roles = {c.name: c for c in record.channels}
     roles["reference"] = Channel(name="reference", unit="m", values=setpoint)
+    for name, unit in TURNING.items():
+        roles.setdefault(name, Channel(name=name, unit=unit, values=np.zeros(record.n_samples)))
+    of = model(rig.model)
+    taken = {c.role for c in rig.channels} | set(of.inputs) | set(of.outputs)
+    others = [c for c in record.channels if c.name not in taken]
     channels = tuple(_raw(roles[c.role], c) for c in rig.channels)
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
-    return record.with_step(Step(name="uncalibrate", settings=columns), channels=channels)
+    return record.with_step(Step(name="uncalibrate", settings=columns), channels=(*channels, *others))
 
 
 def _raw(channel: Channel, c: RigChannel) -> Channel:
