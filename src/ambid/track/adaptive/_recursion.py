@@ -1,0 +1,274 @@
+"""What all recursions of this package share: one array of state, checks of shapes, a cheap way for single samples."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.errors import EstimationError
+from ambid.track.adaptive import _layout as at
+
+Array = NDArray[np.float64]
+Kernel = Callable[[Array, Array, Array, Array], None]
+
+_SMALLEST_VARIANCE = 1e-200  # exact data; a variance of 0 would not be positive definite
+_ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
+_FLOAT = np.dtype(np.float64)
+
+
+class Recursion:
+    """State and interface of a recursion; its kernel is the only thing that differs.
+
+    Attributes
+    ----------
+    names : tuple of str
+    estimate : ndarray, shape (p,)
+    n_used, n_rejected : int
+    noise_variance : float
+        Tracked or given variance of e; the square of `noise_start` until one degree of freedom has shown it.
+    """
+
+    _kernel = "least_squares"
+
+    def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None, guess: float):
+        self._names = coefficient_names(names)
+        p = len(self._names)
+        self._known_noise = None if noise_sd is None else positive("noise_sd", noise_sd) ** 2
+        self._guess = positive("noise_start", guess) ** 2
+        self._s = at.allocate(p)
+        self._s[at.HEAD : at.HEAD + p] = numbers("start", 0.0 if start is None else start, p)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Make what is not state: work space and the compiled kernel."""
+        from ambid.track.adaptive import _kernels
+
+        p = len(self._names)
+        self._run: Kernel = getattr(_kernels, self._kernel)
+        self._shape = (p,)
+        self._row, self._y, self._e = np.zeros((1, p)), np.zeros(1), np.zeros(1)
+        self._error = self._e.reshape(())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what `_prepare` makes."""
+        made = {"_run", "_row", "_y", "_e", "_error", "_shape"}
+        return {key: value for key, value in self.__dict__.items() if key not in made}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return self._names
+
+    @property
+    def estimate(self) -> Array:
+        """A copy, shape (p,)."""
+        return self._s[at.HEAD : at.HEAD + len(self._names)].copy()
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used."""
+        return int(self._s[at.USED])
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that were not, for a number that is not finite or leads beyond 1e200."""
+        return int(self._s[at.REJECTED])
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of e, in squared units of the output."""
+        if self._known_noise is not None:
+            return self._known_noise
+        if self._s[at.NOISE_WEIGHT] < _ENOUGH:
+            return self._guess
+        return max(float(self._s[at.NOISE_SUM] / self._s[at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
+
+    def update(self, phi: ArrayLike, y: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        phi : array_like, shape (p,), or (n_samples, p) for a block
+            Regressors.
+        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
+
+        Returns
+        -------
+        ndarray, shape of `y`
+            y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        if isinstance(y, float) and type(phi) is np.ndarray and phi.shape == self._shape and phi.dtype is _FLOAT:
+            self._row[0] = phi
+            self._y[0] = y
+            self._run(self._s, self._row, self._y, self._e)
+            return self._error.copy()
+        rows, values, shape = samples(phi, y, self._shape[0])
+        out = np.empty(values.size)
+        self._run(self._s, rows, values, out)
+        return out.reshape(shape)
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        Recursion
+        """
+        return copy.deepcopy(self)
+
+    def _factors(self, which: int) -> tuple[Array, Array]:
+        """Return D (p,) and V (p, p) of P (0), of its companion (1), or of both at the start (2, 3)."""
+        p = len(self._names)
+        first = at.HEAD + p + which * (p + p * p)
+        return self._s[first : first + p], self._s[first + p : first + p + p * p].reshape(p, p)
+
+    def _set_factors(self, which: int, matrix: Array) -> None:
+        for place, value in zip(self._factors(which), at.factors(matrix), strict=True):
+            place[...] = value
+
+
+def samples(phi: ArrayLike, y: ArrayLike, p: int) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return regressors (n, p) and outputs (n,) as the kernels want them, and the shape of `y`.
+
+    Parameters
+    ----------
+    phi : array_like, shape (p,) or (n_samples, p)
+    y : array_like, shape (), (1,), (n_samples,) or (n_samples, 1)
+    p : int
+
+    Returns
+    -------
+    rows : ndarray, shape (n_samples, p)
+    values : ndarray, shape (n_samples,)
+    shape : tuple of int
+
+    Raises
+    ------
+    EstimationError
+        If the shapes do not fit, or these are not real numbers.
+    """
+    rows, values = np.asarray(phi), np.asarray(y)
+    if rows.dtype.kind not in "fiub" or values.dtype.kind not in "fiub":
+        raise EstimationError(f"regressor ({rows.dtype}) and output ({values.dtype}) must be real numbers")
+    shape = values.shape
+    n = values.size
+    one = shape in ((), (1,)) and rows.shape in (((p,), ()) if p == 1 else ((p,),))
+    block = shape in ((n,), (n, 1)) and rows.shape in (((n, 1), (n,)) if p == 1 else ((n, p),))
+    if not (one or block):
+        raise EstimationError(
+            f"regressors of shape {rows.shape} with outputs of shape {shape} do not fit {p} coefficients. "
+            f"Give ({p},) with a number, or (n, {p}) with (n,)"
+        )
+    # a writable array in C order: for others the kernels would be compiled anew
+    rows = np.require(rows.reshape(n, p), np.float64, ["C", "W"])
+    return rows, np.require(values.reshape(n), np.float64, ["C", "W"]), shape
+
+
+def coefficient_names(names: Sequence[str] | int) -> tuple[str, ...]:
+    """Return the names of the coefficients, ``theta1``, ... where only their number is given.
+
+    Parameters
+    ----------
+    names : sequence of str, or int
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    EstimationError
+        If there is none, or one comes twice.
+    """
+    found = tuple(f"theta{i + 1}" for i in range(names)) if isinstance(names, int) else tuple(names)
+    if not found or len(set(found)) < len(found):
+        raise EstimationError(f"names is {names!r}; give at least one coefficient, each name once")
+    return found
+
+
+def positive(name: str, value: float) -> float:
+    """Return `value` where it is positive and finite.
+
+    Parameters
+    ----------
+    name : str
+        For the message.
+    value : float
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    EstimationError
+    """
+    if not (np.isfinite(value) and value > 0):
+        raise EstimationError(f"{name} is {value!r}; it must be positive and finite")
+    return float(value)
+
+
+def numbers(name: str, value: ArrayLike, p: int) -> Array:
+    """Return `value` as p finite numbers, a single one for all.
+
+    Parameters
+    ----------
+    name : str
+        For the message.
+    value : array_like, shape () or (p,)
+    p : int
+
+    Returns
+    -------
+    ndarray, shape (p,)
+
+    Raises
+    ------
+    EstimationError
+    """
+    found = np.asarray(value, dtype=np.float64)
+    if found.shape not in ((), (p,)) or not np.isfinite(found).all():
+        raise EstimationError(f"{name} must be a finite number or {p} of them, not {value!r}")
+    return np.full(p, found) if found.ndim == 0 else found.copy()
+
+
+def covariance_of(name: str, value: ArrayLike, p: int) -> Array:
+    """Return `value`, a variance, p variances or a matrix, as a positive definite matrix.
+
+    Parameters
+    ----------
+    name : str
+        For the message.
+    value : array_like, shape (), (p,) or (p, p)
+    p : int
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+
+    Raises
+    ------
+    EstimationError
+        If it is not symmetric and positive definite.
+    """
+    found = np.asarray(value, dtype=np.float64)
+    matrix = found if found.shape == (p, p) else np.diag(numbers(name, found, p))
+    sd = np.sqrt(np.diag(matrix)) if (np.diag(matrix) > 0).all() and np.isfinite(matrix).all() else np.zeros(p)
+    if not sd.all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
+        raise EstimationError(f"{name} must be symmetric with positive variances")
+    if np.linalg.eigvalsh(matrix / np.outer(sd, sd))[0] < 1e-12:
+        raise EstimationError(f"{name} must be positive definite; a combination of its coefficients has no variance")
+    return matrix

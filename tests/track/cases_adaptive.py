@@ -1,0 +1,43 @@
+"""The recursive estimators of linear regressions, as the suite over all estimators makes and feeds them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.track.adaptive.gradient import Lms, Nlms
+from ambid.track.adaptive.least_squares import RecursiveLeastSquares
+from tests.track.cases import Case
+
+Array = NDArray[np.float64]
+
+
+def regression(n: int, seed: int) -> tuple[Array, Array]:
+    """Regressors with an offset column and correlated columns, four coefficients, noise 0.1."""
+    rng = np.random.default_rng([seed, 4])
+    draws = rng.normal(size=(n, 4))
+    phi = np.column_stack([draws[:, 0], draws[:, 0] + 0.3 * draws[:, 1], 10 * draws[:, 2], np.ones(n)])
+    return phi, phi @ [1.0, -2.0, 0.3, 0.5] + 0.1 * draws[:, 3]
+
+
+def three(n: int, seed: int) -> tuple[Array, Array]:
+    """Three of the four."""
+    phi, y = regression(n, seed)
+    return phi[:, :3], y - 0.5
+
+
+CASES = [
+    Case(name="lms", make=lambda: Lms(4, step=0.01), signals=regression),
+    Case(name="nlms", make=lambda: Nlms(("a", "b", "c"), step=0.5, small=1e-3), signals=three),
+    Case(name="rls", make=lambda: RecursiveLeastSquares(4), signals=regression),
+    Case(name="rls-3", make=lambda: RecursiveLeastSquares(3), signals=three),
+    Case(name="rls-forgetting", make=lambda: RecursiveLeastSquares(4, memory=100), signals=regression),
+    Case(name="rls-forgetting-3", make=lambda: RecursiveLeastSquares(3, factor=0.6), signals=three),
+    Case(
+        name="rls-directional",
+        make=lambda: RecursiveLeastSquares(4, forgetting="directional", factor=0.98),
+        signals=regression,
+    ),
+    Case(name="rls-reset", make=lambda: RecursiveLeastSquares(4, memory=500, reset_every=90), signals=regression),
+    Case(name="rls-walk", make=lambda: RecursiveLeastSquares(4, walk=[1e-4, 1e-3, 0, 1e-4]), signals=regression),
+]
