@@ -28,6 +28,10 @@ class Predictor:
         Exact derivative by every estimated number; size 0 where it was not asked for.
     A : ndarray, shape (n, n)
         Transition matrix of the plant over one step (`stride` samples).
+    E : ndarray, shape (n, n_disturbances)
+        What constant disturbances do over one step.
+    dE : ndarray, shape (n, n_disturbances, size)
+        Exact derivative of `E`.
     C : ndarray, shape (n_outputs, n)
     x0 : ndarray, shape (n,)
     gain : ndarray, shape (n, n_outputs)
@@ -38,6 +42,8 @@ class Predictor:
     M: Array
     dM: Array
     A: Array
+    E: Array
+    dE: Array
     C: Array
     x0: Array
     gain: Array
@@ -96,10 +102,12 @@ def assemble(
         return None
     M = np.hstack([F, step.inputs, K, (step.E @ offset)[:, None]])
     dM = np.zeros((*M.shape, problem.size if with_derivatives else 0))
+    dE = np.zeros((*step.E.shape, dM.shape[2]))
     if with_derivatives:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
             dM[:, :n, q], dM[:, n:first_y, q], dM[:, -1, q] = d.A, d.inputs, d.E @ offset
+            dE[:, :, q] = d.E
         # dK holds physical parameters, delay and noise in the order of the vector
         dM[:, :n, : len(dK)] -= np.moveaxis(dK @ plant.C, 0, 2)
         dM[:, first_y:-1, : len(dK)] += np.moveaxis(dK, 0, 2)
@@ -108,6 +116,8 @@ def assemble(
         M=M,
         dM=dM,
         A=step.A,
+        E=step.E,
+        dE=dE,
         C=np.ascontiguousarray(plant.C),
         x0=vector[sl["initial"]].copy(),
         gain=K,

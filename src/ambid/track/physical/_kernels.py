@@ -1,0 +1,344 @@
+"""Compiled loops of the tracker: predictor with exact sensitivities, folded block by block into a triangle; and the
+square-root filter of the tracked numbers.
+
+One step of the predictor is x+ = M w, w = [x; inputs at their lags; y; 1; unbalance forcing]; the derivative by number
+q is s_q+ = F s_q + D_q w. Weighted innovations and their derivatives are the rows that Householder reflections take
+into the triangle, at fixed counts of samples, so that numbers do not depend on how the stream is cut into calls.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def advance(
+    u: Array,
+    y: Array,
+    forcing: Array,
+    M: Array,
+    D: Array,
+    C: Array,
+    W: Array,
+    scale: Array,
+    lags: Integers,
+    history: Array,
+    x: Array,
+    s: Array,
+    rows: Array,
+    triangle: Array,
+    moment: Array,
+    counts: Integers,
+    errors: Array,
+) -> int:
+    """Run until a block is complete, samples are used up, or one is not finite; return how many were used.
+
+    `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `errors` (n_samples, n_y) gets
+    innovations in scaled units, `W` weights them, `moment` sums their products. `rows` (p + 1, room) holds rows that
+    are not folded yet. `counts`: place of the next input in `history`, rows and samples of the present block, samples
+    still to settle, samples of a block.
+    """
+    (n_x, n_l), (n_u, n_y), p = M.shape, (u.shape[1], y.shape[1]), s.shape[1]
+    depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
+    w, f, H = np.empty(n_l), np.empty((n_x, p)), np.zeros((n_y, n_x))
+    for i in range(n_y):
+        for j in range(n_y):
+            for q in range(n_x):
+                H[i, q] += W[i, j] * C[j, q]
+    for k in range(y.shape[0]):
+        finite = True
+        for j in range(n_u):
+            finite = finite and math.isfinite(u[k, j])
+        for j in range(n_y):
+            finite = finite and math.isfinite(y[k, j])
+        for j in range(n_f):
+            finite = finite and math.isfinite(forcing[k, j])
+        if not finite:
+            return k
+        now = counts[0]
+        for j in range(n_u):
+            history[now, j] = (u[k, j] - scale[0, j]) / scale[1, j]
+        column = 0
+        for j in range(n_x):
+            w[j] = x[j]
+        column = n_x
+        for lag in lags:
+            at = (now - lag) % depth
+            for j in range(n_u):
+                w[column] = history[at, j]
+                column += 1
+        for j in range(n_y):
+            w[column] = (y[k, j] - scale[0, n_u + j]) / scale[1, n_u + j]
+            column += 1
+        w[column] = 1.0
+        column += 1
+        for j in range(n_f):
+            w[column] = forcing[k, j]
+            column += 1
+        counts[0] = (now + 1) % depth
+        first_y = n_x + lags.size * n_u
+        for i in range(n_y):
+            v = w[first_y + i]
+            for j in range(n_x):
+                v -= C[i, j] * x[j]
+            errors[k, i] = v
+        if counts[3] > 0:
+            counts[3] -= 1
+        else:
+            r = counts[1]
+            for i in range(n_y):
+                for q in range(p):
+                    v = 0.0
+                    for j in range(n_x):
+                        v -= H[i, j] * s[j, q]
+                    rows[q, r + i] = v
+                v = 0.0
+                for j in range(n_y):
+                    v += W[i, j] * errors[k, j]
+                rows[p, r + i] = v
+                for j in range(n_y):
+                    moment[i, j] += errors[k, i] * errors[k, j]
+            counts[1] = r + n_y
+            counts[2] += 1
+        # next state and sensitivities
+        for i in range(n_x):
+            for q in range(p):
+                f[i, q] = 0.0
+        for c in range(n_l):
+            v = w[c]
+            for i in range(n_x):
+                for q in range(p):
+                    f[i, q] += v * D[c, i, q]
+        for i in range(n_x):
+            for j in range(n_x):
+                v = M[i, j]
+                for q in range(p):
+                    f[i, q] += v * s[j, q]
+        for i in range(n_x):
+            for q in range(p):
+                s[i, q] = f[i, q]
+        for i in range(n_x):
+            v = 0.0
+            for c in range(n_l):
+                v += M[i, c] * w[c]
+            x[i] = v
+        if counts[1] + n_y > room or counts[2] == counts[4]:
+            fold(triangle, rows, counts[1])
+            counts[1] = 0
+            if counts[2] == counts[4]:
+                return k + 1
+    return len(y)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def fold(R: Array, w: Array, n: int) -> None:
+    """Take the first `n` samples of rows `w` (p, room) into the upper triangle R (p, p); `w` is used up."""
+    p = R.shape[0]
+    for j in range(p):
+        v = w[j]
+        s = 0.0
+        for t in range(n):
+            s += v[t] * v[t]
+        if s == 0.0:
+            continue
+        a = R[j, j]
+        b = -math.sqrt(a * a + s) if a > 0 else math.sqrt(a * a + s)
+        size, tau = 1.0 / (a - b), (b - a) / b
+        R[j, j] = b
+        for k in range(j + 1, p):
+            x = w[k]
+            dot = 0.0
+            for t in range(n):
+                dot += v[t] * x[t]
+            g = tau * (R[j, k] + dot * size)
+            R[j, k] -= g
+            g *= size
+            for t in range(n):
+                x[t] -= g * v[t]
+
+
+@njit(cache=True, nogil=True)
+def lower(W: Array) -> None:
+    """Turn W (p, m), m >= p, into [L 0] with the same W W^T, L lower triangular, its diagonal not negative."""
+    p, m = W.shape
+    for i in range(p):
+        s = 0.0
+        for t in range(i + 1, m):
+            s += W[i, t] * W[i, t]
+        if s > 0.0:
+            a = W[i, i]
+            b = -math.sqrt(a * a + s) if a > 0 else math.sqrt(a * a + s)
+            tau, size = (b - a) / b, 1.0 / (a - b)
+            for k in range(i + 1, p):
+                dot = W[k, i]
+                for t in range(i + 1, m):
+                    dot += W[k, t] * W[i, t] * size
+                g = tau * dot
+                W[k, i] -= g
+                g *= size
+                for t in range(i + 1, m):
+                    W[k, t] -= g * W[i, t]
+            W[i, i] = b
+            for t in range(i + 1, m):
+                W[i, t] = 0.0
+        if W[i, i] < 0.0:
+            for k in range(i, p):
+                W[k, i] = -W[k, i]
+
+
+@njit(cache=True, nogil=True)
+def absorb(q: Array, S: Array, J: Array, rho: Array, active: NDArray[np.bool_], noise: float) -> float:
+    """Update q and its square-root covariance S by the rows rho + J (q* - q) ~ N(0, noise I); return rho^T V^-1 rho.
+
+    The gain is optimal for the numbers that are active and zero for the others (Schmidt), the covariance is Joseph's,
+    so that it is right for any gain. V = noise I + J P J^T.
+    """
+    p, m = q.size, rho.size
+    JS = np.zeros((m, p))
+    for i in range(m):
+        for j in range(p):
+            v = J[i, j]
+            if v != 0.0:
+                for k in range(p):
+                    JS[i, k] += v * S[j, k]
+    V = np.zeros((m, m))
+    for i in range(m):
+        for j in range(i + 1):
+            v = 0.0
+            for k in range(p):
+                v += JS[i, k] * JS[j, k]
+            V[i, j] = v
+        V[i, i] += noise
+    # Cholesky in place
+    for i in range(m):
+        for j in range(i + 1):
+            v = V[i, j]
+            for k in range(j):
+                v -= V[i, k] * V[j, k]
+            V[i, j] = math.sqrt(v) if i == j else v / V[j, j]
+    left = np.empty(m)
+    total = 0.0
+    for i in range(m):
+        v = rho[i]
+        for k in range(i):
+            v -= V[i, k] * left[k]
+        left[i] = v / V[i, i]
+        total += left[i] * left[i]
+    K = np.zeros((p, m))
+    row = np.empty(m)
+    for a in range(p):
+        if not active[a]:
+            continue
+        for i in range(m):
+            v = 0.0
+            for k in range(p):
+                v += S[a, k] * JS[i, k]
+            for k in range(i):
+                v -= row[k] * V[i, k]
+            row[i] = v / V[i, i]
+        step = 0.0
+        for i in range(m):
+            step += row[i] * left[i]
+        q[a] -= step
+        for i in range(m - 1, -1, -1):
+            v = row[i]
+            for k in range(i + 1, m):
+                v -= V[k, i] * K[a, k]
+            K[a, i] = v / V[i, i]
+    W = np.empty((p, p + m))
+    root = math.sqrt(noise)
+    for a in range(p):
+        for k in range(p):
+            v = S[a, k]
+            for i in range(m):
+                v -= K[a, i] * JS[i, k]
+            W[a, k] = v
+        for i in range(m):
+            W[a, p + i] = root * K[a, i]
+    lower(W)
+    for a in range(p):
+        for k in range(p):
+            S[a, k] = W[a, k]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def spread(S: Array, step: Array) -> None:
+    """Let the numbers walk: S S^T grows by diag(step^2)."""
+    p = S.shape[0]
+    W = np.zeros((p, 2 * p))
+    for a in range(p):
+        for k in range(p):
+            W[a, k] = S[a, k]
+        W[a, p + a] = step[a]
+    lower(W)
+    for a in range(p):
+        for k in range(p):
+            S[a, k] = W[a, k]
+
+
+@njit(cache=True, nogil=True)
+def walk_score(
+    J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float
+) -> tuple[Array, Array]:
+    """Return sums of lambda_j^2 and N_jj over a ring of `count` blocks: their difference is twice the score.
+
+    Kalman filter forward over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from
+    one block to the next; then the disturbance smoother backward (Koopman and Shephard 1992; Durbin and Koopman 2012,
+    sec. 4.5 and 6.4).
+    """
+    size, m, p = J.shape
+    K, error, variance = np.empty((count, m, p)), np.empty((count, m)), np.empty((count, m))
+    q, P = q0.copy(), P0.copy()
+    for b in range(count):
+        block = (first + b) % size
+        for i in range(m):
+            z = J[block, i]
+            v, F = r[block, i], noise
+            for a in range(p):
+                v += z[a] * (q[a] - at[block, a])
+            for a in range(p):
+                g = 0.0
+                for c in range(p):
+                    g += P[a, c] * z[c]
+                K[b, i, a] = g
+                F += g * z[a]
+            error[b, i], variance[b, i] = v, F
+            for a in range(p):
+                g = K[b, i, a]
+                q[a] -= g * v / F
+                for c in range(p):
+                    P[a, c] -= g * K[b, i, c] / F
+        for a in range(p):
+            P[a, a] += step[a] * step[a]
+    lam, N, drop = np.zeros(p), np.zeros((p, p)), np.zeros(p)
+    squares, powers = np.zeros(p), np.zeros(p)
+    for b in range(count - 1, -1, -1):
+        block = (first + b) % size
+        if b < count - 1:
+            for a in range(p):
+                squares[a] += lam[a] * lam[a]
+                powers[a] += N[a, a]
+        for i in range(m - 1, -1, -1):
+            z, F = J[block, i], variance[b, i]
+            # L = I - K z / F:  lambda <- -z error / F + L^T lambda,  N <- z z^T / F + L^T N L
+            dot, twice = 0.0, 0.0
+            for a in range(p):
+                dot += K[b, i, a] * lam[a]
+                g = 0.0
+                for c in range(p):
+                    g += N[a, c] * K[b, i, c]
+                drop[a] = g
+                twice += g * K[b, i, a]
+            for a in range(p):
+                lam[a] -= z[a] * (error[b, i] + dot) / F
+                for c in range(p):
+                    N[a, c] += z[a] * z[c] * (1.0 / F + twice / (F * F)) - (z[a] * drop[c] + drop[a] * z[c]) / F
+    return squares, powers

@@ -1,0 +1,128 @@
+"""How fast each tracked number walks, found from the data by maximum likelihood.
+
+Over a window of merged evidence the score of the likelihood by each walk variance w_j is half the difference of
+sum(lambda_j^2) and sum(N_jj) of the disturbance smoother (Koopman and Shephard 1992). At the maximum the two agree;
+their ratio, raised to a power below one, therefore takes each w_j towards it and keeps it positive.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.track.evidence import Evidence, merge
+from ambid.track.physical.parameter_filter import ParameterFilter
+
+Array = NDArray[np.float64]
+
+CHUNK_S = 0.05  # evidence is merged to this length: the fastest drift that is told from a jump
+_WINDOW = 400  # chunks
+_FEWEST = 20  # chunks before the first adaptation
+_EVERY = 5  # chunks between looks at the recent past
+_SELDOM = 20  # chunks between looks at the whole window
+_SURE = 9.0  # ratio in the recent past that chance hardly makes: three standard deviations
+_RECENT = (20, 60)  # chunks that alone may show that something has begun to drift
+_POWER = 0.5
+_SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a variance
+
+
+class DriftRates:
+    """Variances per second of the walks.
+
+    Parameters
+    ----------
+    start : ndarray, shape (p,)
+        First variances per second.
+    floor, ceiling : ndarray, shape (p,)
+        Bounds; where floor equals ceiling nothing is adapted.
+    block_s : float
+        Length of the evidence that will come, s.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (p,)
+        Per second.
+    """
+
+    def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
+        from ambid.track.physical._kernels import walk_score
+
+        p = start.size
+        self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
+        self.adapts = bool(np.any(ceiling > floor))
+        self._parts: list[Evidence] = []
+        self._per_chunk = max(1, round(CHUNK_S / block_s))
+        self._chunk_s = self._per_chunk * block_s
+        self._J, self._r, self._at = np.zeros((_WINDOW, p, p)), np.zeros((_WINDOW, p)), np.zeros((_WINDOW, p))
+        self._q, self._P = np.zeros((_WINDOW, p)), np.zeros((_WINDOW, p, p))
+        self._count = self._next = self._since = self._looks = 0
+        self._score = walk_score
+
+    def add(self, evidence: Evidence, before: ParameterFilter, noise: float) -> None:
+        """Take in a block, and adapt the variances now and then.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        before : ParameterFilter
+            The numbers as they were known before this block.
+        noise : float
+            Variance of the evidence's residual.
+        """
+        if not self.adapts:
+            return
+        if not self._parts:
+            self._q[self._next], self._P[self._next] = before.q, before.covariance
+        self._parts.append(evidence)
+        if len(self._parts) < self._per_chunk:
+            return
+        chunk, self._parts = merge(self._parts), []
+        self._J[self._next], self._r[self._next], self._at[self._next] = chunk.J, chunk.r, chunk.at
+        self._next = (self._next + 1) % _WINDOW
+        self._count = min(self._count + 1, _WINDOW)
+        self._since += 1
+        if self._count >= _FEWEST and self._since >= _EVERY:
+            self._since = 0
+            self._adapt(before.active, noise)
+
+    def restart(self) -> None:
+        """Forget the window: a jump in it would pass for drift."""
+        self._count = self._next = self._since = 0
+        self._parts = []
+
+    def copy(self) -> DriftRates:
+        """Return an independent copy in the same state.
+
+        Returns
+        -------
+        DriftRates
+        """
+        other = copy.copy(self)
+        other._parts = list(self._parts)
+        for name in ("variance", "_J", "_r", "_at", "_q", "_P"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    def _adapt(self, active: NDArray[np.bool_], noise: float) -> None:
+        ratio = np.ones(self.variance.size)
+        if self._looks % (_SELDOM // _EVERY) == 0:
+            ratio = self._ratio(self._count, active, noise)
+        self._looks += 1
+        for length in _RECENT:
+            if length < self._count:
+                recent = self._ratio(length, active, noise)
+                ratio = np.where(recent > _SURE, np.maximum(recent, ratio), ratio)
+        factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
+        self.variance = np.clip(self.variance * factor, self._floor, self._ceiling)
+
+    def _ratio(self, count: int, active: NDArray[np.bool_], noise: float) -> Array:
+        """Sum of lambda_j^2 over sum of N_jj in the last `count` chunks: above 1 where number j walks faster."""
+        step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
+        first = (self._next - count) % _WINDOW
+        squares, powers = self._score(
+            self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise
+        )
+        told = active & (powers > 0.0)
+        return np.where(told, squares / np.where(told, powers, 1.0), 1.0)

@@ -1,0 +1,189 @@
+"""From samples to evidence: the predictor runs along the stream and every block of samples leaves a triangle."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.track.evidence import Evidence
+from ambid.track.physical.linearisation import Linearisation
+from ambid.track.physical.numbers import TrackedNumbers
+
+Array = NDArray[np.float64]
+
+SETTLING = 8.0  # memories of the predictor until what it did not know at a restart is below the noise
+_ROOM = 128  # samples whose rows are folded at once: they stay in the first-level cache
+
+
+class EvidenceStream:
+    """The predictor of a bench, running.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    at : Linearisation
+        Where the predictor starts.
+    block : int
+        Samples of one evidence.
+
+    Attributes
+    ----------
+    at : Linearisation
+    sample : int
+        Number of the next sample of the stream.
+    moment : ndarray, shape (n_outputs, n_outputs)
+        Sum over the last complete block of the products of innovations, in scaled output units.
+    """
+
+    def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
+        from ambid.track.physical._kernels import advance
+
+        problem, p = numbers.problem, numbers.start.size
+        n, n_u, n_y = len(problem.model.states), len(problem.model.inputs), len(problem.model.outputs)
+        self.numbers, self.at, self.sample = numbers, at, 0
+        self._advance: Callable[..., int] = advance
+        self._scale = np.stack([numbers.point, np.concatenate([problem.scales.input, problem.scales.output])])
+        self._lags = np.array([problem.delay + lag for lag in problem.lags], dtype=np.int64)
+        self._history = np.zeros((int(self._lags.max()) + 1, n_u))
+        self._x, self._s = np.zeros(n), np.zeros((n, p))
+        self._rows = np.zeros((p + 1, min(block, _ROOM) * n_y))
+        self._triangle, self._moment = np.zeros((p + 1, p + 1)), np.zeros((n_y, n_y))
+        self.moment = np.zeros((n_y, n_y))
+        self._counts = np.zeros(6, dtype=np.int64)
+        self._counts[4] = block
+        self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
+        self.weigh(numbers.innovation_covariance)
+        self._fresh = True
+
+    def weigh(self, covariance: Array) -> None:
+        """Weight innovations anew, from the next block on.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (n_outputs, n_outputs)
+            Of the innovations, in scaled output units.
+        """
+        self.covariance = covariance.copy()
+        self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def relinearise(self, at: Linearisation) -> None:
+        """Go on with the predictor of another point; the state moves along to first order.
+
+        Parameters
+        ----------
+        at : Linearisation
+        """
+        self._x += self._s @ (at.at - self.at.at)
+        self.at = at
+
+    def restart(self, sample: int) -> None:
+        """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is dropped.
+
+        Parameters
+        ----------
+        sample : int
+            Number of the next sample.
+        """
+        self.sample, self._fresh = sample, True
+        self._triangle[:], self._moment[:] = 0.0, 0.0
+        self._counts[1:3] = 0
+
+    @property
+    def settling(self) -> int:
+        """Samples that are still needed to settle."""
+        return int(self._counts[3])
+
+    def feed(self, u: Array, y: Array, forcing: Array | None = None) -> tuple[int, Array, Evidence | None]:
+        """Take samples until a block is complete, they are used up, or one is not finite.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+        forcing : ndarray, shape (n_samples, 2), optional
+            (speed/top speed)^2 times cosine and sine of the rotor's angle, in the middle of each sample.
+
+        Returns
+        -------
+        used : int
+            Samples taken; fewer than given, without evidence, where the next one is not finite.
+        errors : ndarray, shape (used, n_outputs)
+            Innovations in scaled output units.
+        evidence : Evidence or None
+            Of the block that these samples complete.
+        """
+        if self._fresh and y.shape[0]:
+            self._begin(u, y)
+        errors = np.empty_like(y)
+        extra = self._nothing_like(y.shape[0]) if forcing is None else forcing
+        used = self._advance(
+            u, y, extra, self.at.M, self.at.D, self.at.C, self._W, self._scale, self._lags, self._history,
+            self._x, self._s, self._rows, self._triangle, self._moment, self._counts, errors,
+        )  # fmt: skip
+        self.sample += used
+        complete = self._counts[2] == self._counts[4]
+        return used, errors[:used], self._evidence() if complete else None
+
+    def _nothing_like(self, n: int) -> Array:
+        if self._nothing.shape[0] != n:
+            self._nothing = np.zeros((n, self._nothing.shape[1]))
+        return self._nothing
+
+    def _begin(self, u: Array, y: Array) -> None:
+        """Start from what is measured; what is not settles."""
+        model, outputs = self.numbers.problem.model, self.numbers.problem.model.outputs
+        if not (np.all(np.isfinite(u[0])) and np.all(np.isfinite(y[0]))):
+            return
+        n_u = u.shape[1]
+        self._history[:] = (u[0] - self._scale[0, :n_u]) / self._scale[1, :n_u]
+        measured = (y[0] - self._scale[0, n_u:]) / self._scale[1, n_u:]
+        # outputs are states in scaled units of their own: C picks and scales them
+        for j, state in enumerate(model.states):
+            row = outputs.index(state) if state in outputs else -1
+            self._x[j] = measured[row] / self.at.C[row, j] if row >= 0 else 0.0
+        self._s[:] = 0.0
+        self._counts[3] = self._lags.max() + int(np.ceil(SETTLING * self.at.memory))
+        self._fresh = False
+
+    def _evidence(self) -> Evidence:
+        p, n_y = self._s.shape[1], self._W.shape[0]
+        found = Evidence(
+            names=self.numbers.names,
+            at=self.at.at,
+            J=self._triangle[:p, :p].copy(),
+            r=self._triangle[:p, p].copy(),
+            rest=float(self._triangle[p, p] ** 2),
+            n_samples=int(self._counts[2]),
+            n_outputs=n_y,
+            first=self.sample - int(self._counts[2]),
+            last=self.sample,
+        )
+        self.moment = self._moment.copy()
+        self._triangle[:], self._moment[:] = 0.0, 0.0
+        self._counts[2] = 0
+        return found
+
+    def copy(self) -> EvidenceStream:
+        """Return an independent stream in the same state.
+
+        Returns
+        -------
+        EvidenceStream
+        """
+        other = copy.copy(self)
+        for name in ("_history", "_x", "_s", "_rows", "_triangle", "_moment", "_counts", "_scale"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k != "_advance"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from ambid.track.physical._kernels import advance
+
+        self.__dict__.update(state)
+        self._advance = advance

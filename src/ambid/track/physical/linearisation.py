@@ -1,0 +1,80 @@
+"""The predictor at one point of the tracked numbers, with its exact derivatives, in the layout of the compiled loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.predictor import assemble
+from ambid.track.physical.numbers import TrackedNumbers
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearisation:
+    """x+ = M [x; inputs at their lags; y; 1; unbalance forcing], and dM/dq.
+
+    Attributes
+    ----------
+    at : ndarray, shape (p,)
+        The point.
+    M : ndarray, shape (n, n_l)
+    D : ndarray, shape (n_l, n, p)
+        Derivative of M by the tracked numbers, first by column.
+    C : ndarray, shape (n_outputs, n)
+    gain : ndarray, shape (n, n_outputs)
+        Starts the next solution of the Riccati equation.
+    memory : float
+        Samples after which the predictor has forgotten all but a part 1/e of its state.
+    """
+
+    at: Array
+    M: Array
+    D: Array
+    C: Array
+    gain: Array
+    memory: float
+
+
+def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> Linearisation | None:
+    """Assemble the predictor and its derivatives at a point.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    q : ndarray, shape (p,)
+    near : ndarray, shape (n, n_outputs), optional
+        Predictor gain of a point near this one.
+
+    Returns
+    -------
+    Linearisation or None
+        None where there is no stable predictor or no physical plant.
+    """
+    problem = numbers.problem
+    found = assemble(problem, numbers.vector(q), near=near)
+    if found is None:
+        return None
+    n, count = found.x0.size, problem.slices["initial"].start
+    M, dM = found.M, found.dM[:, :, :count]
+    if numbers.synchronous:
+        force = problem.model.disturbances.index("force")
+        a, b = q[count:]
+        M = np.hstack([M, a * found.E[:, force, None], b * found.E[:, force, None]])
+        wide = np.zeros((n, M.shape[1], count + 2))
+        wide[:, :-2, :count] = dM
+        wide[:, -2, :count], wide[:, -1, :count] = a * found.dE[:, force, :count], b * found.dE[:, force, :count]
+        wide[:, -2, count], wide[:, -1, count + 1] = found.E[:, force], found.E[:, force]
+        dM = wide
+    radius = float(np.abs(np.linalg.eigvals(M[:, :n])).max())
+    return Linearisation(
+        at=q.copy(),
+        M=np.ascontiguousarray(M),
+        D=np.ascontiguousarray(np.moveaxis(dM, 0, 1)),
+        C=found.C,
+        gain=found.gain,
+        memory=1.0 / (1.0 - radius),
+    )

@@ -1,0 +1,351 @@
+"""What is tracked beside the physical parameters, where tracking begins, and how sure one is of that.
+
+The tracked numbers q are, in this order: physical parameters that are not fixed, gains of the sensors (1 unless a fault
+is found), the noise description, constant disturbances (offsets), and unbalance where the angle is known. All are in
+units of their own magnitude.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Estimate
+from ambid.identify.innovations import predictor_gain
+from ambid.identify.predictor import assemble
+from ambid.identify.problem import NoiseForm, PredictorProblem, Scales
+from ambid.identify.scaling import scales_for
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.models import model
+from ambid.physics.sensor_gain import SensorGains
+
+Array = NDArray[np.float64]
+Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
+
+UNBALANCE = ("unbalance_cos", "unbalance_sin")
+MEMORY_S = 0.1  # longest memory of the predictor: what happened before cannot disturb the tracking of changes
+_LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
+_LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that does not say how sure it is
+_GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
+_GAIN_SD = 0.1  # relative, of an entry of the predictor gain
+_OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
+_UNBALANCE_SD = 1e4  # likewise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedNumbers:
+    """The tracked numbers of a bench and their state at the start.
+
+    Attributes
+    ----------
+    names : tuple of str
+    kinds : tuple of {"parameter", "gain", "noise", "offset", "unbalance"}
+    units : tuple of str
+        SI units of parameters and gains; "1" for the others, except ``kg m`` for the unbalance.
+    magnitude : ndarray, shape (p,)
+        SI size of one unit of q.
+    start : ndarray, shape (p,)
+        q at the start.
+    covariance : ndarray, shape (p, p)
+        Of q at the start.
+    problem : PredictorProblem
+        Without data: model, scales, delay and noise form from which predictors are assembled.
+    point : ndarray, shape (n_inputs + n_outputs,), SI
+        Operating point that is taken off the samples: inputs, then outputs.
+    innovation_covariance : ndarray, shape (n_outputs, n_outputs)
+        At the start, in scaled output units.
+    information_s : float
+        Length of the record behind the start, s.
+    overdispersion : float
+        Variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
+        explains its record only in part.
+    speed : float
+        rad/s at which the unbalance force has the size of its magnitude.
+    """
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+    units: tuple[str, ...]
+    magnitude: Array
+    start: Array
+    covariance: Array
+    problem: PredictorProblem
+    point: Array
+    innovation_covariance: Array
+    information_s: float
+    overdispersion: float = 1.0
+    speed: float = 1.0
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate in Hz."""
+        return self.problem.rate_hz
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether the unbalance is among the numbers."""
+        return "unbalance" in self.kinds
+
+    def places(self, *kinds: Kind) -> NDArray[np.int64]:
+        """Return where the numbers of some kinds stand in q.
+
+        Parameters
+        ----------
+        *kinds : str
+
+        Returns
+        -------
+        ndarray of int, shape (n_places,)
+        """
+        return np.array([j for j, k in enumerate(self.kinds) if k in kinds], dtype=np.int64)
+
+    def values(self, q: Array) -> dict[str, float]:
+        """Return numbers in SI units.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        dict of str to float
+        """
+        return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
+
+    def vector(self, q: Array) -> Array:
+        """Return q in the layout of `PredictorProblem`, initial state zero.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        ndarray, shape (problem.size,)
+        """
+        out = np.zeros(self.problem.size)
+        n = self.problem.slices["initial"].start
+        out[:n] = q[:n]
+        return out
+
+
+def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed: float = 1.0) -> TrackedNumbers:
+    """Set up tracking from an off-line estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Parameters, covariance, noise, delay and operating point are taken from it.
+    synchronous : bool
+        Track an unbalance too: the angle of the rotor is known.
+    top_speed : float
+        Speed at which the unbalance is felt most, rad/s.
+
+    Returns
+    -------
+    TrackedNumbers
+
+    Raises
+    ------
+    EstimationError
+        If the estimate has failed, has nothing free, or makes no predictor.
+    """
+    from scipy.linalg import block_diag
+
+    plant = SensorGains(model(estimate.model))
+    if estimate.status == "failed" or not estimate.covariance_names:
+        raise EstimationError("the start estimate has no estimated parameters. Identify with free parameters first")
+    scales = _scales(plant, estimate)
+    noise = _noise(plant, estimate, scales)
+    free = tuple(estimate.covariance_names)
+    sizes = [_size(plant, estimate, k) for k in free] + [1.0] * len(plant.gains)
+    problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
+    groups = _groups(problem, estimate, noise, free, top_speed if synchronous else None)
+    found = TrackedNumbers(
+        names=tuple(name for g in groups for name in g.names),
+        kinds=tuple(g.kind for g in groups for _ in g.names),
+        units=tuple(unit for g in groups for unit in g.units),
+        magnitude=np.concatenate([g.magnitude for g in groups]),
+        start=np.concatenate([g.start for g in groups]),
+        covariance=block_diag(*(g.covariance for g in groups)),
+        problem=problem,
+        point=np.array([estimate.operating_point[role] for role in (*plant.inputs, *plant.outputs)]),
+        innovation_covariance=estimate.noise.innovation_covariance / np.outer(scales.output, scales.output),
+        information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
+        overdispersion=_overdispersion(estimate),
+        speed=top_speed,
+    )
+    if assemble(problem, found.vector(found.start), with_derivatives=False) is None:
+        raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Group:
+    """Numbers of one kind."""
+
+    kind: Kind
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    magnitude: Array
+    start: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _NoiseNumbers:
+    """Form of the noise, the numbers that describe it, their standard deviations, and a gain where it is held."""
+
+    form: NoiseForm
+    numbers: Array
+    sd: Array
+    gain: Array
+
+
+def _problem(
+    plant: SensorGains, estimate: Estimate, scales: Scales, noise: _NoiseNumbers, names: tuple[str, ...], sizes: Array
+) -> PredictorProblem:
+    delay = estimate.delay[plant.inputs[0]]
+    few = delay.samples + 3
+    return PredictorProblem(
+        model=plant,
+        rate_hz=_rate(estimate),
+        u=np.zeros((few, len(plant.inputs))),
+        y=np.zeros((few, len(plant.outputs))),
+        estimated=names,
+        known={k: v for k, v in estimate.values.items() if k not in names},
+        magnitude=sizes,
+        prior_mean=np.zeros(len(names)),
+        prior_sd=np.full(len(names), np.inf),
+        scales=scales,
+        delay=delay.samples,
+        lag=delay.fraction,
+        skip=delay.samples + 2,
+        noise=noise.form,
+        gain=noise.gain,
+    )
+
+
+def _groups(
+    problem: PredictorProblem,
+    estimate: Estimate,
+    noise: _NoiseNumbers,
+    free: tuple[str, ...],
+    top_speed: float | None,
+) -> list[_Group]:
+    """The tracked numbers, kind by kind, in the order of the predictor's vector."""
+    plant, scales = problem.model, problem.scales
+    n, count, specs = len(free), noise.numbers.size, {s.name: s.unit for s in plant.parameters}
+    gains = problem.estimated[n:]
+    size, held = problem.magnitude[:n], scales.disturbance
+    groups = [
+        _Group(
+            kind="parameter", names=free, units=tuple(specs[k] for k in free), magnitude=size,
+            start=np.array([estimate.values[k] for k in free]) / size,
+            covariance=estimate.covariance / np.outer(size, size),
+        ),
+        _Group(
+            kind="gain", names=gains, units=("1",) * len(gains), magnitude=np.ones(len(gains)),
+            start=np.ones(len(gains)), covariance=_GAIN_KNOWN**2 * np.eye(len(gains)),
+        ),
+        _Group(
+            kind="noise", names=tuple(f"noise_{k}" for k in range(count)), units=("1",) * count,
+            magnitude=np.ones(count), start=noise.numbers, covariance=np.diag(noise.sd**2),
+        ),
+        _Group(
+            kind="offset", names=tuple(f"offset_{d}" for d in plant.disturbances),
+            units=tuple(plant.units[d] for d in plant.disturbances), magnitude=held, start=np.zeros(held.size),
+            covariance=_OFFSET_SD**2 * np.eye(held.size),
+        ),
+    ]  # fmt: skip
+    if top_speed is not None and "force" in plant.disturbances:
+        size = np.full(2, held[plant.disturbances.index("force")] / top_speed**2)
+        groups.append(
+            _Group(
+                kind="unbalance", names=UNBALANCE, units=("kg m",) * 2, magnitude=size, start=np.zeros(2),
+                covariance=_UNBALANCE_SD**2 * np.eye(2),
+            )
+        )  # fmt: skip
+    return groups
+
+
+def _rate(estimate: Estimate) -> float:
+    return float(str(estimate.record["rate_hz"]))
+
+
+def _overdispersion(estimate: Estimate) -> float:
+    if estimate.covariance_method == "information":
+        return 1.0
+    return max(float(str(estimate.information.get("robust_over_information_sd", 1.0))) ** 2, 1.0)
+
+
+def _size(plant: LinearModel, estimate: Estimate, name: str) -> float:
+    value = estimate.values[name]
+    return max(abs(value), plant.references(estimate.values).get(name, 0.0)) or 1.0
+
+
+def _scales(plant: LinearModel, estimate: Estimate) -> Scales:
+    """Scales from the innovations; an input is measured by what moves an output by about its innovation in a sample."""
+    outputs = np.sqrt(np.diag(estimate.noise.innovation_covariance))
+    rate = _rate(estimate)
+    scales = scales_for(plant, estimate.values, np.ones(len(plant.inputs)), outputs, rate)
+    discrete, _ = discretise(plant.matrices(estimate.values), 1.0 / rate)
+    reach = np.abs(discrete.C @ discrete.B) + np.abs(discrete.C @ discrete.A @ discrete.B)
+    return replace(scales, input=1.0 / np.max(reach / outputs[:, None], axis=0))
+
+
+def _noise(plant: SensorGains, estimate: Estimate, scales: Scales) -> _NoiseNumbers:
+    found = estimate.noise
+    gain = found.gain * scales.output / scales.state[:, None]
+    if found.form == "gain":
+        entries = gain.ravel()
+        return _NoiseNumbers(form="gain", numbers=entries, sd=_GAIN_SD * (np.abs(entries) + 0.1), gain=gain)
+    A, C, E = _discrete(plant, estimate, scales)
+    longest = max(MEMORY_S * _rate(estimate), _LEAST_MEMORY)
+    if found.form == "levels":
+        sensor = np.array([found.sensor_sd[o] for o in plant.outputs]) / scales.output
+        held = np.array([found.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
+        with np.errstate(divide="ignore"):
+            numbers = np.log(np.concatenate([held, sensor[1:]]) / sensor[0])
+        if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
+            return _NoiseNumbers(form="levels", numbers=numbers, sd=np.full(numbers.size, _LOG_LEVEL_SD), gain=gain)
+    nothing = np.zeros(0)
+    return _NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest))
+
+
+def _discrete(plant: SensorGains, estimate: Estimate, scales: Scales) -> tuple[Array, Array, Array]:
+    """A, C and E of the sampled plant in scaled units."""
+    at, _ = discretise(plant.matrices(estimate.values), 1.0 / _rate(estimate))
+    state = scales.state
+    return (
+        at.A * state / state[:, None],
+        at.C * state / scales.output[:, None],
+        at.E * scales.disturbance / state[:, None],
+    )
+
+
+def _memory(F: Array) -> float:
+    """Memory of a predictor in samples."""
+    radius = float(np.abs(np.linalg.eigvals(F)).max())
+    return np.inf if radius >= 1.0 else 1.0 / (1.0 - radius)
+
+
+def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
+    """Gain of a predictor that forgets soon enough: disturbances are taken a little larger than they are.
+
+    An estimate without disturbances remembers its initial state for ever. The larger variance of the innovations that
+    this costs is about the number of states over the memory in samples.
+    """
+    for level in 10.0 ** np.arange(-4.0, 2.1, 0.25):
+        try:
+            gain = predictor_gain(A, C, level**2 * E @ E.T, np.eye(C.shape[0])).K
+        except np.linalg.LinAlgError:
+            continue
+        if _memory(A - gain @ C) <= longest:
+            return gain
+    raise EstimationError("no predictor of this estimate forgets its start. Give a model whose states the outputs show")

@@ -1,0 +1,237 @@
+"""Recursive prediction error estimation of physical parameters (Ljung and Söderström 1983, ch. 3; Ljung 1999, ch. 11).
+
+The innovations-form predictor of the off-line estimator runs along the stream with exact sensitivities. Every block
+leaves its evidence, which a Kalman filter of the tracked numbers takes in; the predictor is assembled anew where the
+estimate has moved so far that second-order terms matter. Under feedback it is as consistent as the off-line estimator,
+and with unlimited memory it ends where that does.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Estimate
+from ambid.track.evidence import Evidence
+from ambid.track.physical.drift import DriftRates
+from ambid.track.physical.evidence_stream import EvidenceStream
+from ambid.track.physical.linearisation import linearise
+from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.physical.parameter_filter import ParameterFilter
+
+Array = NDArray[np.float64]
+Memory = float | Literal["auto", "all"]
+
+BLOCK_S = 0.005  # of one evidence
+_FEWEST = 4  # samples of one evidence
+_START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
+# square of a move, over the standard deviation, at which second-order terms matter
+_CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
+_NOISE_S = 2.0  # time constant with which the covariance of the innovations is followed
+_NOISE_MOVED = 0.05  # relative change of it at which innovations are weighted anew
+_OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of which nothing is known before
+
+
+class PhysicalRpem:
+    """Recursive estimator of a bench's physical parameters, started from an off-line estimate.
+
+    Parameters
+    ----------
+    start : Estimate or TrackedNumbers
+        Where tracking begins.
+    memory : float, "auto" or "all"
+        Time constant with which old data are forgotten, s; found for each number by maximum likelihood; or all data
+        count alike.
+    block : int, optional
+        Samples of one evidence; by default 5 ms.
+
+    Attributes
+    ----------
+    numbers : TrackedNumbers
+    filter : ParameterFilter
+    stream : EvidenceStream
+    drift : DriftRates
+    noise : float
+        Variance of the evidence's residual: above 1 where the start estimate explains its record only in part.
+    n_used, n_rejected : int
+    n_linearised : int
+        Times that the predictor was assembled anew.
+
+    Raises
+    ------
+    EstimationError
+        If the start cannot be tracked from, or the memory is not positive.
+    """
+
+    def __init__(self, start: Estimate | TrackedNumbers, *, memory: Memory = "auto", block: int | None = None) -> None:
+        numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
+        at = linearise(numbers, numbers.start)
+        if at is None:
+            raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+        size = max(round(BLOCK_S * numbers.rate_hz), _FEWEST) if block is None else block
+        if size < 1:
+            raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
+        self.numbers, self.block_s = numbers, size / numbers.rate_hz
+        self.filter = ParameterFilter(numbers.start, numbers.covariance)
+        self.filter.active[numbers.places("gain")] = False
+        self.stream = EvidenceStream(numbers, at, size)
+        self.drift = _rates(numbers, memory, self.block_s)
+        self.noise = numbers.overdispersion
+        self.n_used = self.n_rejected = self.n_linearised = 0
+        self._spread_of_errors = numbers.innovation_covariance.copy()
+        self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
+        self._part = -float(np.expm1(-self.block_s / _NOISE_S))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the physical parameters."""
+        return tuple(self.numbers.names[j] for j in self._own)
+
+    @property
+    def estimate(self) -> Array:
+        """Physical parameters, SI, shape (n_parameters,)."""
+        own = self._own
+        return np.asarray(self.filter.q[own] * self.numbers.magnitude[own])
+
+    @property
+    def covariance(self) -> Array:
+        """Their covariance, SI, shape (n_parameters, n_parameters)."""
+        own = self._own
+        size = self.numbers.magnitude[own]
+        return np.asarray(self.filter.covariance[np.ix_(own, own)] * np.outer(size, size))
+
+    @property
+    def _own(self) -> NDArray[np.int64]:
+        return self.numbers.places("parameter")
+
+    def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), SI
+        outputs : array_like, shape (n_outputs,) or (n_samples, n_outputs), SI
+        forcing : array_like, shape (2,) or (n_samples, 2), optional
+            Where the unbalance is tracked: (speed/top speed)^2 times cosine and sine of the angle.
+
+        Returns
+        -------
+        ndarray, shape of `outputs`, SI
+            Innovations; NaN for a rejected sample.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        u, y, extra, one = self._checked(inputs, outputs, forcing)
+        errors = np.full(y.shape, np.nan)
+        k, n = 0, y.shape[0]
+        while k < n:
+            used, found, evidence = self.stream.feed(u[k:], y[k:], extra if extra is None else extra[k:])
+            errors[k : k + used] = found
+            k += used
+            self.n_used += used
+            if evidence is not None:
+                self.take(evidence)
+            elif k < n:
+                self.n_rejected += 1
+                k += 1
+                self.stream.restart(self.stream.sample + 1)
+        errors *= self.numbers.problem.scales.output
+        return np.asarray(errors[0] if one else errors)
+
+    def take(self, evidence: Evidence) -> None:
+        """Take in the evidence of a block.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        self.predict()
+        self.drift.add(evidence, self.filter, self.noise)
+        self.filter.absorb(evidence, self.noise)
+        self._spread_of_errors += self._part * (self.stream.moment / evidence.n_samples - self._spread_of_errors)
+        self.refresh()
+
+    def predict(self) -> None:
+        """Let the numbers walk over one block."""
+        if self.drift.adapts or np.any(self.drift.variance):
+            self.filter.walk(np.sqrt(self.drift.variance * self.block_s))
+
+    def refresh(self) -> None:
+        """Assemble the predictor anew where the estimate has moved too far from it, or the noise has changed."""
+        moved = self.filter.q - self.stream.at.at
+        if np.any(moved * moved > self._curved * self.filter.sd):
+            self.move_to(self.filter.q)
+        ratio = np.diag(self._spread_of_errors) / np.diag(self.stream.covariance)
+        if np.any(np.abs(ratio - 1.0) > _NOISE_MOVED):
+            self.stream.weigh(self._spread_of_errors)
+
+    def move_to(self, q: Array) -> bool:
+        """Linearise at other numbers.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        bool
+            False where there is no predictor: it stays where it is.
+        """
+        at = linearise(self.numbers, q, self.stream.at.gain)
+        if at is None:
+            return False
+        self.stream.relinearise(at)
+        self.n_linearised += 1
+        return True
+
+    def _checked(
+        self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None
+    ) -> tuple[Array, Array, Array | None, bool]:
+        model = self.numbers.problem.model
+        n_u, n_y = len(model.inputs), len(model.outputs)
+        u, y = np.asarray(inputs, dtype=np.float64), np.asarray(outputs, dtype=np.float64)
+        one = y.ndim == (1 if n_y > 1 else 0)
+        u, y = u.reshape(-1, n_u) if u.size % n_u == 0 else u, y.reshape(-1, n_y) if y.size % n_y == 0 else y
+        extra = None if forcing is None else np.asarray(forcing, dtype=np.float64).reshape(-1, 2)
+        fits = u.ndim == 2 and y.ndim == 2 and u.shape[0] == y.shape[0]
+        if not fits or (self.numbers.synchronous and (extra is None or extra.shape[0] != y.shape[0])):
+            raise EstimationError(
+                f"inputs have shape {np.shape(inputs)}, outputs {np.shape(outputs)}; the model wants {n_u} and {n_y}"
+                f" columns of one length{' and the unbalance its forcing' if self.numbers.synchronous else ''}. Check"
+                " the block"
+            )
+        return np.ascontiguousarray(u), np.ascontiguousarray(y), extra, one
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        PhysicalRpem
+        """
+        other = copy.copy(self)
+        other.filter, other.stream, other.drift = self.filter.copy(), self.stream.copy(), self.drift.copy()
+        other._spread_of_errors = self._spread_of_errors.copy()
+        return other
+
+
+def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRates:
+    """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory."""
+    own = np.diag(numbers.covariance) * numbers.information_s
+    one_second = np.where(np.isin(numbers.kinds, ("offset", "unbalance")), _OFFSET_RATE, own)
+    one_second[numbers.places("gain")] = 0.0
+    if memory == "all":
+        return DriftRates(np.zeros_like(one_second), np.zeros_like(one_second), np.zeros_like(one_second), block_s)
+    if memory != "auto":
+        if not memory > 0.0:
+            raise EstimationError(f"the memory is {memory} s; it must be positive. Give seconds, 'auto' or 'all'")
+        held = one_second / memory**2
+        return DriftRates(held, held, held, block_s)
+    return DriftRates(one_second / _START_MEMORY_S**2, one_second / _LONGEST_S**2, one_second / _SHORTEST_S**2, block_s)
