@@ -1,0 +1,145 @@
+"""What a guard gives: clean stretches of a stream, rejections, and the ledger that counts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+RowKind = Literal["nan", "range", "saturated", "stuck"]
+RejectionKind = (
+    Literal["gap", "repeated", "overlap", "contradiction", "clock", "number", "shape", "type", "empty"] | RowKind
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stretch:
+    """Clean consecutive samples.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_samples, n_channels), SI
+        Finite, within the limits.
+    first : int
+        Number of the first sample.
+    restart : bool
+        Whether it does not follow on the last stretch: a memory of the signals must start anew.
+    """
+
+    values: Array
+    first: int
+    restart: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejection:
+    """What was not given out, or what happened to the stream.
+
+    Attributes
+    ----------
+    kind : str
+        ``gap`` (numbers that never came), ``repeated`` and ``overlap`` (numbers that had been given or passed over),
+        ``contradiction`` (an overlap that differs from what was given), ``clock`` and ``number`` (the block does not
+        fit the stream; without samples: the clock or the counter jumped and the stream goes on), ``shape``, ``type``
+        and ``empty`` (of the block), ``nan``, ``range``, ``saturated`` and ``stuck`` (of rows).
+    samples : int
+        How many.
+    t : float
+        Number of the first of them divided by the rate, s.
+    why : str
+        One line for people.
+    """
+
+    kind: RejectionKind
+    samples: int
+    t: float
+    why: str
+
+
+Passed = Stretch | Rejection
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """A block under its number in the stream.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first sample, with wrap-arounds and new counts taken out.
+    time_s : float
+        Its stamp, s; NaN if it has none.
+    values : ndarray, shape (n_samples, n_channels)
+    """
+
+    first: int
+    time_s: float
+    values: Array
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return int(self.values.shape[0])
+
+    @property
+    def end(self) -> int:
+        """Number of the sample after the last."""
+        return self.first + int(self.values.shape[0])
+
+
+class Ledger:
+    """Collects what is given in the order of the stream, and counts.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Turns sample numbers into times.
+
+    Attributes
+    ----------
+    events, samples : dict of str to int
+        Rejections of each kind, and samples in them.
+    n_given : int
+        Samples in stretches.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate = rate_hz
+        self._entries: list[Passed] = []
+        self.events: dict[RejectionKind, int] = {}
+        self.samples: dict[RejectionKind, int] = {}
+        self.n_given = 0
+
+    def reject(self, kind: RejectionKind, samples: int, first: int, why: str) -> None:
+        """Enter a rejection.
+
+        Parameters
+        ----------
+        kind : str
+        samples : int
+        first : int
+            Number of the first of them.
+        why : str
+            One line for people.
+        """
+        self.events[kind] = self.events.get(kind, 0) + 1
+        self.samples[kind] = self.samples.get(kind, 0) + samples
+        self._entries.append(Rejection(kind=kind, samples=samples, t=first / self._rate, why=why))
+
+    def give(self, stretch: Stretch) -> None:
+        """Enter a stretch.
+
+        Parameters
+        ----------
+        stretch : Stretch
+        """
+        self.n_given += stretch.values.shape[0]
+        self._entries.append(stretch)
+
+    def taken(self) -> list[Passed]:
+        """Return the entries since the last call."""
+        entries, self._entries = self._entries, []
+        return entries
