@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.polynomial.orders import Layout
+from ambid.track.polynomial.plan import plan_of
 
 Array = NDArray[np.float64]
 Table = NDArray[np.int64]
@@ -58,27 +59,28 @@ class State:
 
     Attributes
     ----------
-    orders, count : ndarray of int
-        See `_kernels`.
+    plan, meta, count : ndarray of int
+        See `plan` and `_kernels`.
     real : ndarray, shape (6 + n_inputs,)
         Forgetting factors, squared errors and their weight, levels that are taken off.
     theta : ndarray, shape (n,)
         Estimate: free coefficients, then the constant.
-    at : ndarray, shape (n,)
-        The same, C and F kept stable: what the filters use.
+    coef : ndarray, shape (2 + n,)
+        1, -1, then the same, C and F kept stable: what the filters use.
     UD, S : ndarray, shape (n, n)
         S is empty where nothing is forgotten.
     limit : ndarray, shape (n,)
         Variances beyond which forgetting rests.
     signals : ndarray, shape (n_rows, n_columns)
-    work : ndarray, shape (4, n)
+    work : ndarray, shape (4, 2 + n)
     """
 
-    orders: Table
+    plan: Table
+    meta: Table
     count: Table
     real: Array
     theta: Array
-    at: Array
+    coef: Array
     UD: Array
     S: Array
     limit: Array
@@ -93,6 +95,11 @@ class State:
         tuple of ndarray
         """
         return tuple(getattr(self, f.name) for f in fields(self))
+
+    @property
+    def at(self) -> Array:
+        """Estimate with C and F kept stable, shape (n,)."""
+        return self.coef[2:]
 
     @property
     def levels(self) -> Array:
@@ -117,25 +124,6 @@ class State:
         State
         """
         return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
-
-
-def table_of(layout: Layout) -> Table:
-    """Return the orders as the recursion takes them.
-
-    Parameters
-    ----------
-    layout : Layout
-
-    Returns
-    -------
-    ndarray of int
-    """
-    n = layout.free.size + 1
-    reach = max([1, layout.na, *(b + k for b, k in zip(layout.nb, layout.nk, strict=True))])
-    longest = reach + max([layout.nc, layout.nd, *layout.nf])
-    each = [x for i in range(layout.n_inputs) for x in (layout.nb[i], layout.nk[i], layout.nf[i])]
-    head = [layout.na, layout.nc, layout.nd, layout.n_inputs, 1, n, longest]
-    return np.array([*head, *each], dtype=np.int64)
 
 
 def new_state(
@@ -170,8 +158,8 @@ def new_state(
     -------
     State
     """
-    orders = table_of(layout)
-    n, longest = int(orders[5]), int(orders[6])
+    plan = plan_of(layout)
+    longest = int(plan.meta[2])
     first = forgetting.final if forgetting.first is None else forgetting.first
     factor = upper_root(P)
     root = np.diag(factor).copy()
@@ -181,18 +169,19 @@ def new_state(
     count[0] = longest
     inverse = np.linalg.inv(factor / np.sqrt(np.diag(P))[:, None]) / np.sqrt(np.diag(P))
     return State(
-        orders=orders,
+        plan=plan.rows,
+        meta=plan.meta,
         count=count,
         real=np.concatenate(
             [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight], np.asarray(centre)]
         ),
         theta=theta.copy(),
-        at=theta.copy(),
+        coef=np.concatenate([[1.0, -1.0], theta]),
         UD=UD,
         S=np.asarray(inverse.T @ inverse) if forgetting.forgets else np.empty((0, 0)),
         limit=limit.copy(),
-        signals=np.zeros((8 + 6 * layout.n_inputs, longest + _COLUMNS)),
-        work=np.zeros((4, n)),
+        signals=np.zeros((plan.n_signals, longest + _COLUMNS)),
+        work=np.zeros((4, 2 + theta.size)),
     )
 
 
