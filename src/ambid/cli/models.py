@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 
 import typer
 
 
 def command() -> None:
-    """List models with their parameters and units, black-box structures, excitations and preset benches."""
+    """List models with their parameters and units, black-box structures, excitations, scenarios and preset benches."""
     from ambid.cli.terminal import painter
     from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
     from ambid.signals import EXCITATIONS
+    from ambid.simulate import scenario, scenario_names
 
     paint = painter()
     for name in model_names():
@@ -40,8 +42,17 @@ def command() -> None:
         typer.echo(textwrap.fill(x.summary, 80, initial_indent=start, subsequent_indent=" " * len(start)))
     typer.echo()
     typer.echo(f"{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
-    typer.echo(f"{paint('presets', 'strong')}  benches for 'ambid simulate'")
-    wide = max(len(name) for name in preset_names())
-    for name in preset_names():
-        typer.echo(textwrap.fill(preset(name).summary, 80, initial_indent=f"  {name.ljust(wide)}  ",
-                                 subsequent_indent=" " * (wide + 4)))  # fmt: skip
+    _listing("scenarios", "courses of known truth for 'ambid simulate --scenario'",
+             {name: scenario(name).summary for name in scenario_names()})  # fmt: skip
+    typer.echo()
+    _listing("presets", "benches for 'ambid simulate'", {name: preset(name).summary for name in preset_names()})
+
+
+def _listing(title: str, use: str, summaries: Mapping[str, str]) -> None:
+    from ambid.cli.terminal import painter
+
+    typer.echo(f"{painter()(title, 'strong')}  {use}")
+    wide = max(map(len, summaries))
+    for name, summary in summaries.items():
+        start = f"  {name.ljust(wide)}  "
+        typer.echo(textwrap.fill(summary, 80, initial_indent=start, subsequent_indent=" " * len(start)))

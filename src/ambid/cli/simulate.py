@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ambid.cli.output import Outputs
+from ambid.cli.scenario import Course, simulate_course, truth_words, warn
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
@@ -38,14 +39,39 @@ def command(
             "--output", "-o", metavar="FILE", help="Record to write: .csv, .csv.gz or .h5.", show_default=False
         ),
     ],
-    duration: Annotated[float, typer.Option("--duration", metavar="S", help="Length in s.")] = 1.0,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", metavar="S", help="Length in s.", show_default="1, or the scenario's"),
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option("--rate", metavar="HZ", help="Sampling rate in Hz.", show_default="the preset's, or the rig's"),
     ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            metavar="NAME",
+            help="A course of known truth, as 'ambid models' lists them: the record has columns true_... beside it.",
+            show_default="nothing changes",
+        ),
+    ] = None,
+    at: Annotated[
+        float | None,
+        typer.Option("--at", metavar="S", help="When the scenario begins, in s.", show_default="the scenario's"),
+    ] = None,
+    size: Annotated[
+        float | None,
+        typer.Option(
+            "--size", metavar="X", help="How much the scenario changes, e.g. -0.15.", show_default="the scenario's"
+        ),
+    ] = None,
     excitation: Annotated[
-        str, typer.Option("--excitation", metavar="NAME", help="Excitation, as 'ambid models' lists them.")
-    ] = "multisine",
+        str | None,
+        typer.Option(
+            "--excitation", metavar="NAME", help="Excitation, as 'ambid models' lists them.", show_default="multisine"
+        ),
+    ] = None,
     amplitude: Annotated[
         float | None,
         typer.Option(
@@ -80,14 +106,24 @@ def command(
         bool, typer.Option("--nonlinear", help="The nonlinear magnet instead of its linearisation (presets only).")
     ] = False,
 ) -> None:
-    """Simulate a bench and write the record that it would log; equal seeds give equal records."""
+    """Simulate a bench and write the record that it would log; equal seeds give equal records.
+
+    With --scenario something changes on the way, and the record holds the truth of it in columns true_...
+    """
     from ambid.record import Channel, write_record
     from ambid.signals import excitation as make_excitation
 
-    preset = _preset(rig)
+    preset, closed = _preset(rig), None if loop is None else loop == "closed"
+    if scenario is not None:
+        _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
+                               "--periods": None if periods == 1 else periods})  # fmt: skip
+        course = Course(scenario, duration, rate, amplitude, at, size, seed, closed, log_excitation)
+        simulate_course(course, preset, rig, record)
+        return
+    _refuse("a simulation without --scenario", {"--at": at, "--size": size})
+    kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
         outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"))
-        closed = None if loop is None else loop == "closed"
         respond, rate_hz, limits, point = (
             _of_preset(preset, rate, seed, closed, nonlinear)
             if preset
@@ -95,21 +131,24 @@ def command(
         )
         n = _samples(duration, rate_hz)
         shape = _repeated(
-            lambda part: make_excitation(excitation, part, rate_hz, amplitude=1.0, band=_band(band), seed=seed),
-            n,
-            periods,
+            lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=_band(band), seed=seed), n, periods
         )
-        size = _largest(respond, shape, limits, point) if amplitude is None else amplitude
-        done = respond(size * shape)
+        peak = _largest(respond, shape, limits, point) if amplitude is None else amplitude
+        done = respond(peak * shape)
         if log_excitation:
-            logged = Channel(name="excitation", unit="V", values=size * shape)
+            logged = Channel(name="excitation", unit="V", values=peak * shape)
             done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
-        comments = () if record.suffix in (".h5", ".hdf5") else _comments(rig, excitation, size, band, seed, done)
+        comments = () if record.suffix in (".h5", ".hdf5") else _comments(rig, kind, peak, band, seed, done)
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
-    for warning in done.warnings:
-        typer.echo(f"ambid: warning: {warning}", err=True)
-    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {excitation} of {size:.4g} V, seed {seed}")
-    typer.echo("truth: " + _truth(done))
+    warn(done)
+    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {kind} of {peak:.4g} V, seed {seed}")
+    typer.echo("truth: " + truth_words(done))
+
+
+def _refuse(of: str, given: Mapping[str, object]) -> None:
+    for option, value in given.items():
+        if value is not None:
+            raise AmbidError(f"{of} has no {option}. Leave {option} out")
 
 
 def _preset(name: str) -> Preset | None:
@@ -187,10 +226,6 @@ def _band(text: str | None) -> tuple[float, float] | None:
     raise AmbidError(f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000")
 
 
-def _truth(done: Simulation) -> str:
-    return ", ".join(f"{name} {value:.6g}" for name, value in done.truth.items()) + " (SI; delay in samples)"
-
-
 def _comments(rig: str, excitation: str, size: float, band: str | None, seed: int, done: Simulation) -> tuple[str, ...]:
     from importlib.metadata import version
 
@@ -198,4 +233,4 @@ def _comments(rig: str, excitation: str, size: float, band: str | None, seed: in
     made = (
         f"simulated by ambid {version('ambid')}: {Path(rig).name}, {excitation} of {size:.6g} V{between}, seed {seed}"
     )
-    return made, f"truth: {_truth(done)}"
+    return made, f"truth: {truth_words(done)}"

@@ -10,7 +10,7 @@ import numpy as np
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.record.record import Channel, Record
-from ambid.rig.load import role_units
+from ambid.rig.load import OPTIONAL_ROLES, role_units
 from ambid.rig.write import toml_text
 from ambid.units import UNKNOWN, parse_unit
 
@@ -18,6 +18,8 @@ _NAMES = {
     "voltage": r"volt|^u|^v\b|^v_|duty|pwm|command|input|drive",
     "current": r"curr|^i\b|^i_|amp",
     "position": r"pos|disp|gap|^x|^y|^z|eddy|hall|sensor|output",
+    "speed": r"speed|omega|rpm|rotat|spin",
+    "angle": r"angle|phi|theta|encoder",
 }
 _SET_POINT = r"ref|set|target|desired|goal"
 
@@ -51,6 +53,8 @@ def draft_rig(record: Record) -> str:
     units = role_units(plant)
     for role in (*plant.inputs, *plant.outputs):
         lines += [*_channel_lines(role, guesses[role], units[role], record, is_input=role in plant.inputs), ""]
+    for role, column in _turning(record).items():
+        lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
     lines += [
         '# Each parameter: role = "free" (to be found), "fixed" (value is known) or "prior" (value known to ± sd).',
         "[parameters]",
@@ -66,6 +70,21 @@ def draft_rig(record: Record) -> str:
         '# gaps = "error"      # or "interpolate", "cut"',
     ]
     return "\n".join(lines) + "\n"
+
+
+def _turning(record: Record) -> dict[str, Channel]:
+    """Return speed and angle of the rotor where a column has both the name and the unit: nothing needs them."""
+    found: dict[str, Channel] = {}
+    for role in ("speed", "angle"):
+        fits = [
+            c
+            for c in record.channels
+            if c.unit == OPTIONAL_ROLES[role]
+            and re.search(_NAMES[role], c.name.lower())
+            and not re.search(_SET_POINT, c.name.lower())
+        ]
+        found |= {role: fits[0]} if fits else {}
+    return found
 
 
 def _best(record: Record, role: str, unit: str) -> Channel | None:

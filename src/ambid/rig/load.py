@@ -20,8 +20,8 @@ from ambid.units import Unit, parse_unit
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
 
-REFERENCE = "reference"
-"""A role that every model may have beside its own: the set point of the controller, in the unit of the position."""
+OPTIONAL_ROLES: Mapping[str, str] = MappingProxyType({"reference": "m", "speed": "rad/s", "angle": "rad"})
+"""Roles that every model may have beside its own, with their units: set point, speed and angle of a turning rotor."""
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -112,9 +112,9 @@ def role_units(plant: LinearModel) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        Its inputs, its outputs, and ``reference``.
+        Its inputs, its outputs, and `OPTIONAL_ROLES`.
     """
-    return {role: plant.units[role] for role in (*plant.inputs, *plant.outputs)} | {REFERENCE: "m"}
+    return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **OPTIONAL_ROLES}
 
 
 def _build(file: RigFile, path: Path) -> Rig:
@@ -165,7 +165,7 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     for role in units:
         if role in entries:
             channels.append(_channel(role, entries[role], units[role], plant, path))
-        elif role != REFERENCE:
+        elif role not in OPTIONAL_ROLES:
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
             )

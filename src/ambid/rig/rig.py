@@ -24,7 +24,8 @@ class RigChannel:
     Attributes
     ----------
     role : str
-        Input or output of the model (``voltage``, ``current``, ``position``), or ``reference``.
+        Input or output of the model (``voltage``, ``current``, ``position``), or one that every model may have:
+        ``reference``, ``speed`` (rad/s) and ``angle`` (rad) of a turning rotor.
     column : str
         Column of the record.
     unit : str or None
@@ -79,7 +80,7 @@ class Rig:
     model : str
         Name of the model, one of :func:`ambid.physics.models.model_names`.
     channels : tuple of RigChannel
-        One per role: the model's inputs, then its outputs, then ``reference`` if it is given.
+        One per role: the model's inputs, then its outputs, then ``reference``, ``speed`` and ``angle`` where given.
     parameters : tuple of Parameter
         One per parameter of the model, in its order. Those that the file does not name are free, or fixed at the
         model's default where it has one.
