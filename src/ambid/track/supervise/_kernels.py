@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 _QUANTILE = 0.1  # share of quiet statistics above the point by which overdispersion is learned
+_LARGEST_GAIN = 0.02  # of learning overdispersion
+_RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -99,6 +101,80 @@ def _level_of(rest: float, freedom: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _copy(A: Array, B: Array) -> None:
+    """Copy `A` to `B`, both (p, w)."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            B[i, j] = A[i, j]
+
+
+@njit(cache=True, nogil=True)
+def _take(inlet: Array, base: Array, note: Array, before: Array, reference: Array, block: int) -> None:
+    """Store the triangle of a block, and estimate and covariance before it, at the reference point."""
+    p = base.shape[0]
+    for i in range(p):
+        r = inlet[i, p]
+        for j in range(p):
+            base[i, j] = inlet[i, j] if j >= i else 0.0
+            before[i, j] = inlet[p + i, j]
+            r += base[i, j] * (reference[j] - inlet[2 * p, j])
+        base[i, p] = r
+        before[i, p] = inlet[p + i, p] - reference[i]
+    note[0], note[1], note[2] = inlet[2 * p + 1, 0], inlet[2 * p + 1, 1], inlet[2 * p + 1, 2]
+    note[3] = float(block)
+
+
+@njit(cache=True, nogil=True)
+def _test(
+    X: Array, rest: float, freedom: float, row: Array, marks: Array, tested: Counts, gain: float, noise: float,
+    now: Array, found: Array,
+) -> None:  # fmt: skip
+    """Test one whitened window, and learn from it if `gain` is positive.
+
+    `found` (10,): kind, 0 (length), 0 (first), hypothesis, its statistic, size, sd, joint, rest, noise; `now` (tests,):
+    statistics of all hypotheses.
+    """
+    p, hypotheses = X.shape[0], tested.size
+    joint, level = hypotheses, hypotheses + 1
+    spread = rest / freedom if freedom >= 1.0 else 0.0
+    for i in range(10):
+        found[i] = 0.0
+    found[3] = -1.0
+    for h in range(hypotheses):
+        j = tested[h]
+        b, v = 0.0, 0.0
+        for i in range(p):
+            b += X[i, j] * X[i, p]
+            v += X[i, j] * X[i, j]
+        raw = b * b / v if v > 1e-30 else 0.0
+        scale = max(math.exp(row[h]), spread)
+        now[h] = raw / scale
+        if now[h] > found[4]:
+            found[3], found[4], found[5], found[6] = float(h), now[h], -b / v, math.sqrt(scale / v)
+        if gain > 0.0:
+            _learn(row, h, raw, marks[1, h], gain)
+    whole = 0.0
+    for i in range(p):
+        whole += X[i, p] * X[i, p]
+    z = _level_of(rest / noise, freedom)
+    found[7] = whole / max(math.exp(row[joint]), spread)
+    found[8] = z * z * math.exp(-row[level])
+    found[9] = spread / noise
+    if gain > 0.0:
+        _learn(row, joint, whole, marks[1, joint], gain)
+        _learn(row, level, z * z, marks[1, level], gain)
+    if found[4] > marks[0, 0]:
+        # the one number stands for the change if what it leaves is chance or less than what it explains; where the
+        # unexplained part rose as well, this is the transient of a change, or none that it could name
+        clean = found[8] <= marks[0, level] or found[9] < _RAISED
+        found[0] = 1.0 if clean and found[7] - found[4] < max(marks[0, joint], found[4]) else 2.0
+    elif found[7] > marks[0, joint]:
+        found[0] = 2.0
+    elif found[8] > marks[0, level]:
+        found[0] = 3.0
+
+
+@njit(cache=True, nogil=True)
 def watch(
     inlet: Array, bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array,
     tested: Counts, rows: Array, state: Array, scratch: Array, result: Array,
@@ -108,16 +184,15 @@ def watch(
     `inlet` (2 p + 2, at least p + 1): [J r], [P q], [at .], [rest, freedom, first, ...]. `bases` (levels, 4, p, p + 1):
     the last triangles of 2^level blocks; `notes` (levels, 4, 4): their rest, freedom, first sample, first block.
     `counts` (levels + 1,): bases so far, blocks so far last. `history` (ring, p, p + 1): [P q] before each block.
-    `learned` (windows, tests): log of overdispersion. `marks` (2, tests): threshold of each test, and the point that one quiet
-    statistic in ten passes. `tested` (hypotheses,): column of each. `rows` (4, wide): growth of variance per block,
-    the reference point, two of scratch. Triangles are held at the reference point, estimates are kept relative to it.
+    `learned` (windows, tests): log of overdispersion. `marks` (2, tests): threshold of each test, and the point that
+    one quiet statistic in ten passes. `tested` (hypotheses,): column of each. `rows` (5, wide): growth of variance per
+    block, the reference point, scratch. Triangles are held at the reference point, estimates relative to it.
     `state` (6,): log of the noise level, blocks to wait until statistics are quiet again, gain of learning, gain of the
     noise level, longest window, whether to alarm. `scratch` (4, p, p + 1). `result` (10 + hypotheses,): kind (-1: not
     finite), blocks, first sample, hypothesis, its statistic, size, sd, joint, rest, noise; statistics of all.
     """
     levels, _, p, _ = bases.shape
-    hypotheses, ring, longest = tested.size, history.shape[0], int(state[4])
-    joint, rest_test = hypotheses, hypotheses + 1
+    tests, ring, longest = tested.size + 2, history.shape[0], int(state[4])
     total = 0.0
     for i in range(2 * p + 2):
         for j in range(p + 1):
@@ -127,113 +202,66 @@ def watch(
         result[0] = -1.0
         return
     acc, other, M, X = scratch[0], scratch[1], scratch[2], scratch[3]
-    reference, growth, s = rows[1], rows[2], rows[3]
+    reference, growth, now, found = rows[1], rows[2], rows[3], rows[4]
     block = counts[levels]
     if block == 0:
         for j in range(p):
             reference[j] = inlet[2 * p, j]
-    now = history[block % ring]
-    new = bases[0, counts[0] % 4]
-    for i in range(p):
-        moved = inlet[i, p]
-        for j in range(i, p):
-            moved += inlet[i, j] * (reference[j] - inlet[2 * p, j])
-        for j in range(p):
-            new[i, j] = inlet[i, j] if j >= i else 0.0
-            now[i, j] = inlet[p + i, j]
-        new[i, p] = moved
-        now[i, p] = inlet[p + i, p] - reference[i]
-    rest, freedom, first = inlet[2 * p + 1, 0], inlet[2 * p + 1, 1], inlet[2 * p + 1, 2]
-    note = notes[0, counts[0] % 4]
-    note[0], note[1], note[2], note[3] = rest, freedom, first, float(block)
+    slot = counts[0] % 4
+    _take(inlet, bases[0, slot], notes[0, slot], history[block % ring], reference, block)
+    newest, freedom_now = notes[0, slot, 0], notes[0, slot, 1]
     counts[levels] += 1
     counts[0] += 1
-    noise = math.exp(state[0])
-    calm = state[1] <= 0.0
-    if state[1] > 0.0:
-        state[1] -= 1.0
-    best = 0.0
+    noise, calm, best = math.exp(state[0]), state[1] <= 0.0, 0.0
+    state[1] -= 0.0 if calm else 1.0
     for level in range(levels):
-        n_bases = counts[level]
-        rest, freedom = 0.0, 0.0
+        n_bases, rest, freedom = counts[level], 0.0, 0.0
+        gain = 0.0
+        if calm:  # long windows are looked at less often; while settling the gain is large as it is
+            gain = min(state[2] * (1 << level), _LARGEST_GAIN) if state[5] > 0.0 else state[2]
         for m in range(1, min(n_bases, 4) + 1):
             length = m << level
             if length > longest:
                 break
             slot = (n_bases - m) % 4
-            if m == 1:
-                acc[:] = bases[level, slot]
-            else:
-                other[:] = bases[level, slot]
-                fold(acc, other, s)
+            _copy(bases[level, slot], acc if m == 1 else other)
+            if m > 1:
+                fold(acc, other, now)
             rest += notes[level, slot, 0]
             freedom += notes[level, slot, 1]
             if m == 2 and n_bases % 2 == 0 and level + 1 < levels:
                 up = counts[level + 1] % 4
-                bases[level + 1, up] = acc
-                note = notes[level + 1, up]
-                note[0], note[1] = rest, freedom
-                note[2], note[3] = notes[level, slot, 2], notes[level, slot, 3]
+                _copy(acc, bases[level + 1, up])
+                notes[level + 1, up, 0], notes[level + 1, up, 1] = rest, freedom
+                notes[level + 1, up, 2], notes[level + 1, up, 3] = notes[level, slot, 2], notes[level, slot, 3]
             if level > 0 and m < 3:
                 continue
-            window = m - 1 if level == 0 else 1 + 2 * level + m - 2
-            for k in range(p):
-                growth[k] = rows[0, k] * length
-            whiten(acc, history[int(notes[level, slot, 3]) % ring], growth, M, X)
-            whole = 0.0
             for i in range(p):
-                whole += X[i, p] * X[i, p]
-            spread = rest / freedom if freedom >= 1.0 else 0.0
-            gain = min(state[2] * (1 << level), 0.02) if state[5] > 0.0 else state[2]
-            row = learned[window]
-            top, winner, size, sd = 0.0, -1, 0.0, 0.0
-            for h in range(hypotheses):
-                j = tested[h]
-                b, v = 0.0, 0.0
-                for i in range(p):
-                    b += X[i, j] * X[i, p]
-                    v += X[i, j] * X[i, j]
-                raw = b * b / v if v > 1e-30 else 0.0
-                scale = max(math.exp(row[h]), spread)
-                s[h] = raw / scale
-                if calm:
-                    _learn(row, h, raw, marks[1, h], gain)
-                if s[h] > top:
-                    top, winner, size, sd = s[h], h, -b / v, math.sqrt(scale / v)
-            scaled = whole / max(math.exp(row[joint]), spread)
-            z = _level_of(rest / noise, freedom)
-            odd = z * z * math.exp(-row[rest_test])
-            if calm:
-                _learn(row, joint, whole, marks[1, joint], gain)
-                _learn(row, rest_test, z * z, marks[1, rest_test], gain)
-            strength = max(top / marks[0, 0], scaled / marks[0, joint], odd / marks[0, rest_test])
-            code = 0.0
-            if winner >= 0 and top > marks[0, 0]:
-                # the one number stands for the change if what it leaves is chance, or less than what it explains
-                code = 1.0 if scaled - top < max(marks[0, joint], top) else 2.0
-            elif scaled > marks[0, joint]:
-                code = 2.0
-            elif odd > marks[0, rest_test]:
-                code = 3.0
-            # a window that names a number is preferred to one that cannot, unless that one is much the stronger
-            order = strength if code == 1.0 else 0.5 * strength
-            if code > 0.0 and order > best and state[5] > 0.0:
+                growth[i] = rows[0, i] * length
+            whiten(acc, history[int(notes[level, slot, 3]) % ring], growth, M, X)
+            window = m - 1 if level == 0 else 2 * level + m - 1
+            _test(X, rest, freedom, learned[window], marks, tested, gain, noise, now, found)
+            if found[0] == 0.0 or state[5] == 0.0:
+                continue
+            # a window that names a number comes before one that cannot, then the one that shows most
+            order = found[4] / marks[0, 0] + 1e9
+            if found[0] > 1.0:
+                order = max(found[7] / marks[0, tests - 2], found[8] / marks[0, tests - 1])
+            if order > best:
                 best = order
-                result[0], result[1], result[2] = code, float(length), notes[level, slot, 2]
-                result[3], result[4], result[5], result[6] = float(winner), top, size, sd
-                result[7], result[8], result[9] = scaled, odd, spread / noise
-                for h in range(hypotheses):
-                    result[10 + h] = s[h]
+                for i in range(10):
+                    result[i] = found[i]
+                result[1], result[2] = float(length), notes[level, slot, 2]
+                for i in range(tests - 2):
+                    result[10 + i] = now[i]
         if n_bases % 2 == 1 or level + 1 == levels:
             break
         counts[level + 1] += 1
     if result[0] > 0.0:
         state[1] = state[4]
-        return
-    last = notes[0, (counts[0] - 1) % 4]
-    if calm and last[1] >= 1.0:
-        middle = noise * (1.0 - 2.0 / (9.0 * last[1])) ** 3
-        state[0] += state[3] if last[0] / last[1] > middle else -state[3]
+    elif calm and freedom_now >= 1.0:
+        middle = noise * (1.0 - 2.0 / (9.0 * freedom_now)) ** 3
+        state[0] += state[3] if newest / freedom_now > middle else -state[3]
 
 
 @njit(cache=True, nogil=True)

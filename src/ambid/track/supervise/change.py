@@ -179,7 +179,7 @@ class ChangeDetector:
         self._counts = np.zeros(levels + 1, dtype=np.int64)
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
-        self._rows = np.zeros((4, max(p + 1, tests)))
+        self._rows = np.zeros((5, max(p + 1, tests, 10)))
         if drift is not None:
             self._rows[0, :p] = np.broadcast_to(np.asarray(drift, dtype=float), (p,))
         self._state = np.array([math.log(overdispersion), 0.0, _GAIN, _NOISE_GAIN, float(longest), 1.0])
