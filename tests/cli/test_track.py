@@ -191,15 +191,21 @@ def test_a_record_shorter_than_an_interval_is_refused(bench, ambid, job, whole):
     assert "shorter --every" in found.err
 
 
-def test_of_rejections_only_the_last_is_told_and_all_are_counted(bench, ambid, job, whole):
-    def gap(k):
-        return Event(kind="rejected", t=0.05 * k, why=f"gap number {k}.", samples=3)
+def test_routine_decisions_do_not_bury_a_change(bench, ambid, job, whole):
+    def more(k):
+        why = f"gap number {k}."
+        routine = Event(kind="accepted", t=0.05 * k, why=f"routine {k}.")
+        return (routine, Event(kind="rejected", t=0.05 * k, why=why, samples=3))
 
-    lines = [replace(x, events=(*x.events, gap(k))) for k, x in enumerate(whole.lines)]
+    lines = [replace(x, events=(*x.events, *more(k))) for k, x in enumerate(whole.lines)]
     job["track"] = replace(whole, lines=tuple(lines))
-    found = ambid("track", "record.csv")
+    found = ambid("track", "record.csv", "--json", "track.jsonl")
     assert found.out.count("gap number") == 1
     assert "gap number 239." in found.out
+    assert "routine 239." in found.out
+    assert found.out.index("change k_i: ") < found.out.index("routine ")
+    assert found.out.count("routine ") == 2  # the first after the change, and the last
+    assert len(read_track("track.jsonl").lines[100].events) == 2  # nothing is left out there
 
 
 def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
@@ -212,7 +218,7 @@ def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
     assert list(found) == ["R"]
     assert found["R"][0][3] == pytest.approx(0.03)
     assert found["R"][1][3] == pytest.approx(1603.0)
-    assert "'true_m' is in [V], the parameter in [kg]" in capsys.readouterr().err
+    assert "'true_m' is in [V], the tracked number in [kg]" in capsys.readouterr().err
     assert truth_columns(bench / "record.csv", None, {"R": "ohm"}) == {}
     given = {}
     drawn = track_figure.track_figure

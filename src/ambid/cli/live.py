@@ -35,7 +35,8 @@ _FRAME_S = 0.1  # between two pictures at the least
 _SHARE = 0.02  # of the time may go into drawing
 _SLICE_S = 0.05  # after which the drawing thread looks whether the run has ended
 _RECENT = 600  # lines whose error is shown
-_TOLD = 200  # decisions that are kept for the table
+_TOLD = 200  # events that are kept for the table
+_NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; of the others the last of its kind
 
 
 class Stopped(KeyboardInterrupt):
@@ -73,11 +74,12 @@ class Follower:
         self.header: TrackHeader | None = None
         self.last: TrackLine | None = None
         self.history: TrackHistory | None = None
-        self.decisions: deque[Event] = deque(maxlen=_TOLD)
         self.code = 0
         self._writer, self._keep, self._live, self._real_time = writer, keep, live, real_time
         self._tally: Tally | None = None
-        self._rejected: Event | None = None
+        self._notable: deque[Event] = deque(maxlen=_TOLD)
+        self._latest: dict[str, Event] = {}
+        self._unanswered = False
         self._errors: deque[float] = deque(maxlen=_RECENT)
         self._ranges: dict[str, tuple[float, float]] = {}
         self._flags: deque[Flag] = deque()
@@ -150,9 +152,20 @@ class Follower:
 
     @property
     def told(self) -> tuple[Event, ...]:
-        """Decisions in their order, and of the rejections the last."""
-        last = [] if self._rejected is None else [self._rejected]
-        return tuple(sorted([*self.decisions, *last], key=lambda e: e.t))
+        """Events in their order: changes with what was decided on each, and of routine decisions the last."""
+        notable = _copied(self._notable)
+        routine = [e for e in self._latest.copy().values() if e not in notable]
+        return tuple(sorted([*notable, *routine], key=lambda e: e.t))
+
+    def _take(self, event: Event) -> None:
+        if event.kind in _NOTABLE:
+            self._unanswered = self._unanswered or event.kind == "change"
+            self._notable.append(event)
+        elif self._unanswered and event.kind in ("accepted", "refused"):
+            self._unanswered = event.kind == "refused"
+            self._notable.append(event)
+        else:
+            self._latest[event.kind] = event
 
     def tick(self, stage: str) -> None:
         """Take a sign of life from the job.
@@ -221,12 +234,8 @@ class Follower:
             self.history.add(line)
         self._errors.append(line.error)
         self.last = line
-        if line.events:
-            for event in line.events:
-                if event.kind == "rejected":
-                    self._rejected = event
-                else:
-                    self.decisions.append(event)
+        for event in line.events:
+            self._take(event)
         if self._stop is not None:
             raise Stopped(self._stop)
         if not self._flags:
@@ -262,7 +271,7 @@ class Follower:
             header=header,
             line=line,
             errors=_copied(self._errors),
-            decisions=tuple(sorted([*_copied(self.decisions), *([self._rejected] if self._rejected else [])], key=_t)),
+            decisions=self.told,
             ranges=dict(self._ranges),
             begin_s=self._begin_s,
             length_s=samples / header.rate_hz if isinstance(samples, (int, float)) else None,
@@ -287,10 +296,6 @@ class Follower:
             else:
                 before = self._ranges[name]
                 self._ranges[name] = (min(before[0], low), max(before[1], high))
-
-
-def _t(event: Event) -> float:
-    return event.t
 
 
 def _copied(things: deque[T]) -> tuple[T, ...]:

@@ -226,7 +226,8 @@ def _draw(follower: Follower, record: Path, rate: float | None, plot: Path, outp
 
     assert follower.header is not None
     assert follower.history is not None
-    truth = truth_columns(record, rate, follower.header.units)
+    units = follower.header.units
+    truth = truth_columns(record, rate, {name: units.get(name, "") for name in follower.history.names})
     page = track_figure(follower.history, truth=truth)
     outputs.stage(plot, lambda path: save(page, path))
 
@@ -240,7 +241,7 @@ def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) ->
     rate : float or None
         Sampling rate in Hz, for a record without time.
     units : Mapping[str, str]
-        SI unit of each parameter.
+        SI unit of each tracked number; empty where it is not known.
 
     Returns
     -------
@@ -262,9 +263,9 @@ def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) ->
         name = channel.name.removeprefix("true_")
         if name == channel.name or name not in units:
             continue
-        if channel.unit != units[name]:
-            line = f"column {channel.name!r} is in [{channel.unit}], the parameter in [{units[name]}]: it is not drawn"
-            print(f"ambid: {line}", file=sys.stderr)
+        if units[name] not in ("", channel.unit):
+            inside = f"is in [{channel.unit}], the tracked number in [{units[name]}]"
+            print(f"ambid: column {channel.name!r} {inside}: it is not drawn", file=sys.stderr)
             continue
         found[name] = (raw.time_s, channel.values)
     return found

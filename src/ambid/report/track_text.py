@@ -277,6 +277,8 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
     if places:
         rejected += f" in {_counted(places, 'place')}"
     lines = [f"{_counted(summary.updates, 'update')}, {_counted(len(summary.changes), 'change')}, {rejected}"]
+    if summary.counts:
+        lines.append(f"events: {', '.join(f'{n} {kind}' for kind, n in summary.counts.items())}")
     speed = speed_words(summary.samples, summary.seconds_of_record, summary.computing_s)
     if speed:
         lines.append(paint(f"{summary.computing_s:.2g} s of computing: {speed}", "dim"))
