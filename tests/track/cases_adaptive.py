@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.track.adaptive.gradient import Lms, Nlms
+from ambid.track.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
 from ambid.track.adaptive.least_squares import RecursiveLeastSquares
 from tests.track.cases import Case
 
@@ -26,6 +27,13 @@ def three(n: int, seed: int) -> tuple[Array, Array]:
     return phi[:, :3], y - 0.5
 
 
+def instruments(n: int, seed: int) -> tuple[Array, Array]:
+    """The three regressors and four instruments, noisy mixtures of them."""
+    phi, y = three(n, seed)
+    noise = np.random.default_rng([seed, 5]).normal(size=(n, 4))
+    return np.column_stack([phi, phi @ np.ones((3, 4)) + phi[:, [0, 1, 2, 0]] + noise]), y
+
+
 CASES = [
     Case(name="lms", make=lambda: Lms(4, step=0.01), signals=regression),
     Case(name="nlms", make=lambda: Nlms(("a", "b", "c"), step=0.5, small=1e-3), signals=three),
@@ -40,4 +48,10 @@ CASES = [
     ),
     Case(name="rls-reset", make=lambda: RecursiveLeastSquares(4, memory=500, reset_every=90), signals=regression),
     Case(name="rls-walk", make=lambda: RecursiveLeastSquares(4, walk=[1e-4, 1e-3, 0, 1e-4]), signals=regression),
+    Case(name="iv", make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4), signals=instruments),
+    Case(
+        name="iv-forgetting",
+        make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4, memory=60, correlation=7),
+        signals=instruments,
+    ),
 ]

@@ -272,3 +272,31 @@ def covariance_of(name: str, value: ArrayLike, p: int) -> Array:
     if np.linalg.eigvalsh(matrix / np.outer(sd, sd))[0] < 1e-12:
         raise EstimationError(f"{name} must be positive definite; a combination of its coefficients has no variance")
     return matrix
+
+
+def forgetting_factor(factor: float | None, memory: float | None) -> float:
+    """Return the factor of forgetting, 1 where neither is given.
+
+    Parameters
+    ----------
+    factor : float or None
+        0 < factor < 1.
+    memory : float or None
+        Time constant, samples.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    EstimationError
+        If both are given, or one is out of its range.
+    """
+    if factor is not None and memory is not None:
+        raise EstimationError("factor and memory say the same thing. Give one of them")
+    if factor is not None and not 0 < factor < 1:
+        raise EstimationError(f"factor is {factor!r}; it must lie between 0 and 1. Leave it out to forget nothing")
+    if memory is not None and not memory > 1:
+        raise EstimationError(f"memory is {memory!r}; it must be longer than one sample")
+    return 1.0 - 1.0 / memory if memory is not None else 1.0 if factor is None else float(factor)

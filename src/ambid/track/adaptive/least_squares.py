@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
 from ambid.track.adaptive import _layout as at
-from ambid.track.adaptive._recursion import Recursion, covariance_of, numbers, positive
+from ambid.track.adaptive._recursion import Recursion, covariance_of, forgetting_factor, numbers, positive
 
 Array = NDArray[np.float64]
 Forgetting = Literal["none", "exponential", "directional"]
@@ -118,7 +118,9 @@ class RecursiveLeastSquares(Recursion):
         s[at.LIMIT] = positive("limit", limit)
         s[at.RESET_EVERY] = 0 if reset_every is None else int(positive("reset_every", reset_every))
         s[at.TYPICAL] = 0.1 * p
-        s[at.NOISE_RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else _memory(noise_memory))
+        s[at.NOISE_RATE] = 1.0 / (
+            _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)
+        )
         steps = numbers("walk", 0.0 if walk is None else walk, p)
         if (steps < 0).any():
             raise EstimationError(f"walk is {walk!r}; variances are not negative")
@@ -187,19 +189,9 @@ class RecursiveLeastSquares(Recursion):
 def _factor(forgetting: Forgetting | None, factor: float | None, memory: float | None) -> float:
     if forgetting not in (None, "none", "exponential", "directional"):
         raise EstimationError(f"forgetting is {forgetting!r}; it is none, exponential or directional")
-    given = [x for x in (factor, memory) if x is not None]
-    if len(given) != (1 if forgetting in ("exponential", "directional") else 0) and not (
-        forgetting is None and len(given) == 1
-    ):
-        raise EstimationError("give either factor or memory for forgetting, and neither without forgetting")
-    if factor is not None:
-        if not 0 < factor < 1:
-            raise EstimationError(f"factor is {factor!r}; it must lie between 0 and 1. Give forgetting='none' for 1")
-        return float(factor)
-    return 1.0 if memory is None else 1.0 - 1.0 / _memory(memory)
-
-
-def _memory(value: float) -> float:
-    if not value > 1:
-        raise EstimationError(f"a memory is {value!r}; it must be longer than one sample")
-    return float(value)
+    kept = forgetting_factor(factor, memory)
+    if kept < 1.0 and forgetting == "none":
+        raise EstimationError("forgetting is none; leave factor and memory out")
+    if kept == 1.0 and forgetting in ("exponential", "directional"):
+        raise EstimationError(f"forgetting is {forgetting}; say how fast, by factor or memory")
+    return kept

@@ -1,0 +1,1 @@
+"""Recursive instrumental variables: consistent where noise reaches the regressor, as in a loop."""

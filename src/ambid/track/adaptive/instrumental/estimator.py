@@ -1,0 +1,247 @@
+"""Recursive instrumental variables for y = φᵀθ + v: v may be coloured and in the regressor, not in the instruments ζ.
+
+Solves Σ λ^(t-k) ζ (y - φᵀθ) = 0, with more instruments than coefficients in the least squares sense of two-stage
+least squares. The rows [ζᵀ φᵀ y] are rotated into a triangle, so nothing is squared and no unsymmetric P, which can
+pass through infinity, is carried (Söderström & Stoica 1983, ch. 4 and 8).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.errors import EstimationError
+from ambid.track.adaptive._recursion import coefficient_names, forgetting_factor, numbers, positive, samples
+from ambid.track.adaptive.instrumental import _layout as at
+
+Array = NDArray[np.float64]
+
+_NOISE_MEMORIES = 10
+_LOOKS = 32
+_SMALLEST_VARIANCE = 1e-200
+_ENOUGH = 0.5
+
+
+class RecursiveInstrumentalVariables:
+    """Recursive instrumental variables, a `RecursiveEstimator` whose inputs are [φ, ζ].
+
+    Consistent where ζ is uncorrelated with v and correlated with φ: with an external reference of a loop, past
+    inputs in open loop. Instruments that say little of the regressor give a large covariance.
+
+    The covariance is that of the estimate's error for coefficients that do not move, A N Aᵀ with
+    θ̂ = A Σ λ^(t-k) ζ y and N the covariance of Σ λ^(t-k) ζ v: the long-run covariance of ζ v (Bartlett's weights over
+    `correlation` samples; Newey & West 1987), tracked with ten times the memory of the estimate, times the sum of
+    squared weights. So v may be coloured. The lag behind moving coefficients is not in it. While instruments are
+    silent the information is forgotten until the mean of the variances over their prior is `limit`.
+
+    Parameters
+    ----------
+    names : sequence of str, or int
+        Names of the p coefficients, or p.
+    n_instruments : int, optional
+        m, p or more; p if not given.
+    start : array_like, shape (p,), optional
+        Estimate to begin with; zero if not given.
+    prior : array_like, shape () or (p,)
+        Variances of the start's error over the variance of v.
+    instrument_size : array_like, shape () or (m,)
+        Usual size of the instruments: the prior counts like one sample of that size.
+    factor : float, optional
+        Of forgetting, 0 < factor < 1; nothing is forgotten if neither it nor `memory` is given.
+    memory : float, optional
+        The same as a time constant in samples, 1 / (1 - factor).
+    limit : float
+        Of the wind-up.
+    correlation : int
+        Samples; several times the time over which v is correlated. 1 for white v.
+    noise_start : float
+        Standard deviation of v until the data have shown it.
+
+    Attributes
+    ----------
+    names : tuple of str
+    estimate : ndarray, shape (p,)
+    covariance : ndarray, shape (p, p)
+    n_used, n_rejected : int
+    n_singular : int
+        Samples after which the instruments did not determine the coefficients, and the estimate stayed.
+    noise_variance : float
+        Of v.
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str] | int,
+        *,
+        n_instruments: int | None = None,
+        start: ArrayLike | None = None,
+        prior: ArrayLike = 1e6,
+        instrument_size: ArrayLike = 1.0,
+        factor: float | None = None,
+        memory: float | None = None,
+        limit: float = 100.0,
+        correlation: int = 20,
+        noise_start: float = 1.0,
+    ) -> None:
+        self._names = coefficient_names(names)
+        p = len(self._names)
+        m = p if n_instruments is None else int(n_instruments)
+        if m < p:
+            raise EstimationError(f"{m} instruments do not determine {p} coefficients. Give {p} or more")
+        self._guess = positive("noise_start", noise_start) ** 2
+        self._s = s = at.allocate(p, m, int(positive("correlation", correlation)))
+        s[at.FACTOR] = s[at.FACTOR_NOW] = forgetting_factor(factor, memory)
+        s[at.MEMORY] = 1.0 / (1.0 - s[at.FACTOR]) if s[at.FACTOR] < 1 else np.inf
+        s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
+        s[at.LIMIT] = positive("limit", limit)
+        s[at.RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
+        s[at.PRIOR_LEFT] = 1.0
+        self._begin(numbers("start", 0.0 if start is None else start, p), numbers("prior", prior, p), instrument_size)
+        self._prepare()
+
+    def _begin(self, start: Array, prior: Array, instrument_size: ArrayLike) -> None:
+        """Enter the prior as samples whose instruments are the coefficients' own directions."""
+        p, m = start.size, self._m
+        size = numbers("instrument_size", instrument_size, m)
+        if (prior <= 0).any() or (size <= 0).any():
+            raise EstimationError("prior and instrument_size must be positive")
+        part = self._parts()
+        part["estimate"][...] = start
+        part["prior"][...] = prior
+        part["size"][...] = size
+        T = np.diag(1 / np.sqrt(prior))
+        part["T"][...] = T
+        part["R"][:, :m] = np.diag(size)
+        part["R"][:p, m:-1] = T
+        part["R"][:p, -1] = T @ start
+
+    @property
+    def _m(self) -> int:
+        return int(self._s[at.INSTRUMENTS])
+
+    def _parts(self) -> dict[str, Array]:
+        """Views of the state by name."""
+        p, m, lags = len(self._names), self._m, int(self._s[at.LAGS])
+        shapes: dict[str, tuple[int, ...]] = {
+            "estimate": (p,),
+            "R": (m, m + p + 1),
+            "T": (p, p),
+            "omega": (m, m),
+            "ring": (lags, m),
+            "total": (m,),
+            "prior": (p,),
+            "size": (m,),
+        }
+        found, first = {}, at.HEAD
+        for name, shape in shapes.items():
+            n = int(np.prod(shape))
+            found[name] = self._s[first : first + n].reshape(shape)
+            first += n
+        return found
+
+    def _prepare(self) -> None:
+        from ambid.track.adaptive.instrumental._kernels import instrumental
+
+        self._run = instrumental
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_run"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return self._names
+
+    @property
+    def estimate(self) -> Array:
+        """A copy, shape (p,)."""
+        return self._s[at.HEAD : at.HEAD + len(self._names)].copy()
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used."""
+        return int(self._s[at.USED])
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that were not, for a number that is not finite or beyond 1e100."""
+        return int(self._s[at.REJECTED])
+
+    @property
+    def n_singular(self) -> int:
+        """Samples after which the estimate stayed because the instruments did not determine it."""
+        return int(self._s[at.SINGULAR])
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of v, in squared units of the output."""
+        if self._s[at.NOISE_WEIGHT] < _ENOUGH:
+            return self._guess
+        return max(float(self._s[at.NOISE_SUM] / self._s[at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
+
+    @property
+    def covariance(self) -> Array:
+        """A copy of the covariance of the estimate's error, shape (p, p)."""
+        from scipy.linalg import solve_triangular
+
+        part, s, m = self._parts(), self._s, self._m
+        N = np.diag(s[at.PRIOR_LEFT] * self.noise_variance * part["size"] ** 2)
+        if s[at.NOISE_WEIGHT] >= _ENOUGH:
+            N = N + part["omega"] * (s[at.SUM_OF_SQUARES] / s[at.NOISE_WEIGHT])
+        half = solve_triangular(part["R"][:, :m], _root(N), trans="T")
+        B = np.linalg.lstsq(part["R"][:, m:-1], half, rcond=None)[0]
+        return np.asarray(B @ B.T)
+
+    def update(self, rows: ArrayLike, y: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        rows : array_like, shape (p + m,), or (n_samples, p + m) for a block
+            Regressor, then instruments.
+        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
+
+        Returns
+        -------
+        ndarray, shape of `y`
+            y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        inputs, values, shape = samples(rows, y, len(self._names) + self._m)
+        out = np.empty(values.size)
+        self._run(self._s, inputs, values, out)
+        return out.reshape(shape)
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        RecursiveInstrumentalVariables
+        """
+        return copy.deepcopy(self)
+
+
+def _root(N: Array) -> Array:
+    """Return a square root of N; what rounding made of its smallest eigenvalues does not count."""
+    scale = np.sqrt(np.diag(N))
+    value, vector = np.linalg.eigh(N / np.outer(scale, scale))
+    floor = np.finfo(float).eps * value[-1]
+    return np.asarray(scale[:, None] * vector * np.sqrt(np.maximum(value, floor)))
