@@ -165,6 +165,16 @@ def _ring(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table)
 
 
 @njit(cache=True, nogil=True)
+def _shift(plan: Table, meta: Table, step: float, s: Array, t: int) -> None:
+    """Let the past of v and e know of a new constant: both are linear in it, and its first steps may be large."""
+    ones = plan[meta[_COLUMNS] + meta[_N] - 1, 0]
+    for k in range(1, meta[_LONGEST] + 1):
+        s[meta[_V], t - k] -= step
+        if meta[_E] != meta[_V]:
+            s[meta[_E], t - k] -= step * s[ones, t - k]
+
+
+@njit(cache=True, nogil=True)
 def _learn(
     plan: Table,
     meta: Table,
@@ -203,7 +213,9 @@ def _learn(
     real[_WEIGHT] = forget * real[_WEIGHT] + 1.0
     for j in range(theta.size):
         theta[j] += gain[j] * e
+    level = coef[_FIRST + theta.size - 1]
     count[_PROJECTED] += _follow(plan, meta, theta, coef, work[2], work[3])
+    _shift(plan, meta, coef[_FIRST + theta.size - 1] - level, s, t)
     filter_column(plan, meta, meta[_INPUT], meta[_RESIDUAL], coef, s, t)
     count[_LEARNT] += 1
 

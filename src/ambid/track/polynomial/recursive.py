@@ -30,6 +30,7 @@ from ambid.track.polynomial.window import Window
 Array = NDArray[np.float64]
 
 _USED, _REJECTED, _WAITED, _PROJECTED, _HELD = COUNTED
+_REFITTED = 16  # first windows
 _NUMBERS = (float, np.float64)
 
 
@@ -56,7 +57,8 @@ class RecursivePolynomial:
     forgetting : Forgetting or float, optional
         A number is `Forgetting.final`.
     burn_in : int or None, optional
-        Samples of the first window; None: 100 for each coefficient, at least 500.
+        Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
+        the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
     open_loop : bool, optional
         Say that no feedback is at work.
 
@@ -95,10 +97,12 @@ class RecursivePolynomial:
         who = Identity(structure=structure, layout=layout, dt=dt, inputs=inputs, outputs=("y",), units=units)
         self._prepare(who, forgetting, open_loop=open_loop)
         need = 10 * (layout.n_theta + layout.first_row)
-        size = max(500, 100 * layout.free.size) if burn_in is None else burn_in
-        if size < need:
-            raise EstimationError(f"{structure}: burn_in = {size} samples; at least {need} are needed. Raise it")
-        self._window = Window(size=size, n_inputs=n_u)
+        first = max(500, 100 * layout.free.size) if burn_in is None else burn_in
+        if first < need:
+            raise EstimationError(f"{structure}: burn_in = {first} samples; at least {need} are needed. Raise it")
+        memory = 1.0 / max(1.0 - self._forgetting.final, 1e-12)
+        last = first * int(np.clip(memory / first, 1, _REFITTED))  # equal weights only inside the memory
+        self._window = Window(first=first, last=last, n_inputs=n_u)
 
     @classmethod
     def from_fit(
@@ -191,7 +195,8 @@ class RecursivePolynomial:
     @property
     def n_used(self) -> int:
         """Samples that were taken in, as information or as history."""
-        return self._used_before + self._count(_USED) + (0 if self._window is None else self._window.filled)
+        stored = self._window.filled if self._window is not None and self._state is None else 0
+        return self._used_before + self._count(_USED) + stored
 
     @property
     def n_rejected(self) -> int:
@@ -215,7 +220,7 @@ class RecursivePolynomial:
 
     @property
     def n_failed_starts(self) -> int:
-        """First windows from which no model could be had (no excitation, say); half of each was dropped."""
+        """Windows from which no first estimate could be had (no excitation, say)."""
         return self._failed_starts
 
     @property
@@ -277,35 +282,50 @@ class RecursivePolynomial:
         u, y, shape = columns(self._who, inputs, outputs)
         errors, first = np.full(y.size, np.nan), 0
         if self._window is not None:
-            first = self._first_window(u, y)
+            first = self._with_window(u, y, errors)
         if first < y.size:
             self._run(u[first:], y[first:], errors[first:], learn, *self._arrays)
         return errors.reshape(shape)
 
-    def _first_window(self, u: Array, y: Array) -> int:
-        """Store samples until a model can be had from them; return how many of the block were taken."""
-        first = 0
-        while self._window is not None and first < y.size:
-            taken, rejected, lost = self._window.take(u[first:], y[first:])
-            first += taken
-            self._rejected_before += rejected
-            self._used_before += lost
-            if self._window.full:
-                self._leave_window()
-        return first
+    def _with_window(self, u: Array, y: Array, errors: Array) -> int:
+        """Store samples and fit them at fixed counts; return how many of the block were dealt with."""
+        at = 0
+        while self._window is not None and at < y.size:
+            n, gap = self._window.take(u[at:], y[at:])
+            if self._state is not None and n:
+                self._run(u[at : at + n], y[at : at + n], errors[at : at + n], True, *self._arrays)
+            at += n
+            if gap and self._state is not None:
+                self._window = None  # the recursion goes on alone
+            elif gap:
+                self._used_before += self._window.clear()
+                self._rejected_before += 1
+                at += 1
+            elif self._window.filled == self._window.target:
+                self._fit_window(self._window)
+        return at
 
-    def _leave_window(self) -> None:
-        window = self._window
-        if window is None:
-            return
-        fit = window.fit(self._who, open_loop=self._open_loop)
-        if fit is None:
+    def _fit_window(self, window: Window) -> None:
+        fit = window.fit(self._who, None if self._state is None else self.model.theta)
+        if fit is not None:
+            self._begin_anew(fit, window)
+        elif self._state is None:
             self._failed_starts += 1
-            self._used_before += window.drop_half()
+        if not window.grow():
+            if self._state is None:
+                self._used_before += window.drop_half()
+            else:
+                self._window = None
+
+    def _begin_anew(self, fit: BlackBoxFit, window: Window) -> None:
+        """Go on from an off-line fit of all samples so far."""
+        before, n = self._state, window.filled
+        self._begin(fit, n)
+        now = self._state
+        if now is None:
             return
-        self._begin(fit, window.filled)
-        self._window = None
-        self._take(window.u, window.y, learn=False)
+        self._run(window.u[:n], window.y[:n], np.empty(n), False, *self._arrays)
+        now.go_on_counting(before, n)
 
     def _count(self, k: int) -> int:
         return 0 if self._state is None else int(self._state.count[k])

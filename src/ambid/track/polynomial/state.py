@@ -116,6 +116,20 @@ class State:
         names = ("used", "rejected", "waited", "projected", "held")
         return {name: int(self.count[k]) for name, k in zip(names, COUNTED, strict=True)}
 
+    def go_on_counting(self, before: State | None, samples: int) -> None:
+        """Take over counters and the forgetting of the moment, as if the samples had been taken in one by one.
+
+        Parameters
+        ----------
+        before : State or None
+            None: this is the first estimate.
+        samples : int
+            Taken in so far.
+        """
+        self.count[list(COUNTED)] = [samples, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
+        if before is not None:
+            self.real[0] = before.real[0]
+
     def copy(self) -> State:
         """Return a state that shares nothing with this one.
 

@@ -1,7 +1,9 @@
-"""The first window of a recursion that begins with nothing: stored, fitted off-line, used once.
+"""The first samples of a recursion that begins with nothing: stored, fitted off-line, counted once.
 
-Gradients of a recursion are exact only near the truth; what a one-pass start learns far from it stays in its estimate.
-A search over a stored window starts inside the valley instead, and its cost is paid once.
+Gradients of a recursion are exact only near the truth: what it learns far from it stays in its estimate. So the first
+estimate is an off-line fit of a window; while the window grows, the recursion follows, and at every doubling the
+whole window is fitted anew from where the recursion stands. When the window is dropped, coefficients, covariance and
+filters are those of the off-line fit of all samples so far, and near enough to the truth for one pass to do.
 """
 
 from __future__ import annotations
@@ -18,29 +20,28 @@ from ambid.track.polynomial.start import Identity
 
 Array = NDArray[np.float64]
 
+_MOST = 20  # evaluations of a fit that begins near its end
+
 
 class Window:
-    """Samples without a gap, until there are enough of them.
-
-    Attributes
-    ----------
-    u, y : ndarray, shape (size, n_inputs), (size,)
-    filled : int
+    """Samples without a gap, and the counts at which they are fitted.
 
     Parameters
     ----------
-    size : int
+    first, last : int
+        Samples at the first and at most at the last fit.
     n_inputs : int
+
+    Attributes
+    ----------
+    u, y : ndarray, shape (last, n_inputs), (last,)
+    filled, target : int
+        Samples stored; samples at the next fit.
     """
 
-    def __init__(self, *, size: int, n_inputs: int) -> None:
-        self.u, self.y = np.zeros((size, n_inputs)), np.zeros(size)
-        self.filled = 0
-
-    @property
-    def full(self) -> bool:
-        """Whether it can be fitted."""
-        return self.filled == self.y.size
+    def __init__(self, *, first: int, last: int, n_inputs: int) -> None:
+        self.u, self.y = np.zeros((last, n_inputs)), np.zeros(last)
+        self.first, self.filled, self.target = first, 0, first
 
     def copy(self) -> Window:
         """Return an independent window with the same samples.
@@ -49,12 +50,12 @@ class Window:
         -------
         Window
         """
-        twin = Window(size=self.y.size, n_inputs=self.u.shape[1])
-        twin.u[:], twin.y[:], twin.filled = self.u, self.y, self.filled
+        twin = Window(first=self.first, last=self.y.size, n_inputs=self.u.shape[1])
+        twin.u[:], twin.y[:], twin.filled, twin.target = self.u, self.y, self.filled, self.target
         return twin
 
-    def take(self, u: Array, y: Array) -> tuple[int, int, int]:
-        """Take samples until the window is full; one that is not finite empties it.
+    def take(self, u: Array, y: Array) -> tuple[int, bool]:
+        """Take samples until the next fit, or up to and without one that is not finite.
 
         Parameters
         ----------
@@ -63,22 +64,42 @@ class Window:
 
         Returns
         -------
-        tuple of int
-            Samples taken, of those rejected, and good ones that were stored and are lost with them.
+        tuple of int, bool
+            Samples taken, and whether the next one is not finite.
         """
-        n = min(y.size, self.y.size - self.filled)
+        n = min(y.size, self.target - self.filled)
         bad = np.flatnonzero(~(np.isfinite(y[:n]) & np.all(np.isfinite(u[:n]), axis=1)))
-        if bad.size:
-            lost = self.filled + int(bad[0])
-            self.filled = 0
-            return int(bad[0]) + 1, 1, lost
+        gap = bad.size > 0
+        n = int(bad[0]) if gap else n
         at = slice(self.filled, self.filled + n)
         self.u[at], self.y[at] = u[:n], y[:n]
         self.filled += n
-        return n, 0, 0
+        return n, gap
+
+    def clear(self) -> int:
+        """Begin anew; return how many samples were stored.
+
+        Returns
+        -------
+        int
+        """
+        n, self.filled, self.target = self.filled, 0, self.first
+        return n
+
+    def grow(self) -> bool:
+        """Move the next fit to twice as many samples.
+
+        Returns
+        -------
+        bool
+            False where the window cannot grow: it is at its largest.
+        """
+        at_end = self.target >= self.y.size
+        self.target = min(2 * self.target, self.y.size)
+        return not at_end
 
     def drop_half(self) -> int:
-        """Make room for as many samples as half the window.
+        """Make room for as many samples as half of those stored.
 
         Returns
         -------
@@ -91,13 +112,14 @@ class Window:
         self.filled = keep
         return n
 
-    def fit(self, who: Identity, *, open_loop: bool) -> BlackBoxFit | None:
+    def fit(self, who: Identity, near: Array | None) -> BlackBoxFit | None:
         """Return the off-line fit of the window.
 
         Parameters
         ----------
         who : Identity
-        open_loop : bool
+        near : ndarray, shape (n_theta,), or None
+            Coefficients to begin with; None: the search finds its own start.
 
         Returns
         -------
@@ -112,10 +134,25 @@ class Window:
                 inputs=who.inputs,
                 outputs=who.outputs,
                 units=who.units,
-                open_loop=open_loop,
+                open_loop=True,  # whether it is, is no question of the coefficients
             )
-            found = structure(who.structure).estimator(data, shown_orders(who.structure, who.layout))
+            if near is None:
+                found = structure(who.structure).estimator(data, shown_orders(who.structure, who.layout))
+            else:
+                found = _fit_near(who, data, near)
         except EstimationError:
             return None
         usable = found.status == "converged" and float(found.noise_covariance[0, 0]) > 0.0
         return found if usable else None
+
+
+def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
+    from ambid.identify.polynomial.predictor import predictor
+    from ambid.identify.polynomial.result import result
+    from ambid.identify.polynomial.scaled import scaled_data, unit
+    from ambid.identify.polynomial.search import searched
+
+    scaled = scaled_data(who.structure, data)
+    worth = unit(who.layout, scaled, 0)
+    found = searched(predictor(who.layout), scaled.y[0], scaled.u, near / worth, most=_MOST)
+    return result(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
