@@ -100,7 +100,7 @@ def test_names_of_events_do_not_lie_on_each_other(track):
     axes = panel(track_figure(replace(track, lines=lines)), "R")
     axes.figure.canvas.draw()
     boxes = [t.get_window_extent() for t in axes.texts]
-    assert 3 <= len(boxes) < 12
+    assert 2 <= len(boxes) < 12
     assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
 
 

@@ -146,7 +146,10 @@ DAMAGE = {
     "a word for a number": (lambda x: changed(x, 2, '"sd": ', '"sd": "x", "y": '), "line 3: 'x' stands where a number"),
     "an unknown state": (lambda x: changed(x, 2, '"tracking"', '"asleep"'), "state 'asleep' is unknown"),
     "an unknown event": (lambda x: x.replace('"kind": "change"', '"kind": "miracle"'), "event 'miracle' is unknown"),
-    "another parameter": (lambda x: changed(x, 2, '"k_x"', '"k_y"'), "parameter 'k_x' stands here or in the lines before"),
+    "another parameter": (
+        lambda x: changed(x, 2, '"k_x"', '"k_y"'),
+        "parameter 'k_x' stands here or in the lines before",
+    ),
     "a line twice": (lambda x: x.replace(x.split("\n")[4], "\n".join(2 * [x.split("\n")[4]])), "does not come after"),
     "something behind": (lambda x: x + x.split("\n")[4] + "\n", "behind the summary"),
     "a list": (lambda x: "[1]\n" + x, "line 1: the schema is None"),

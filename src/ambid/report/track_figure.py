@@ -34,7 +34,7 @@ _MARKED: dict[str, Any] = {
 }  # events that get a vertical mark, and its line style
 _BINS = 1200  # a longer track is drawn as the extremes of that many stretches
 _LEAST = 0.004  # part of the width that the shortest state is drawn with, so that none is lost
-_LEVELS = 3  # rows in which names of events stand over each other
+_LEVELS = 2  # rows in which names of events stand over each other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
