@@ -34,16 +34,15 @@ def advance(
     s: Array,
     rows: Array,
     triangle: Array,
-    moment: Array,
     counts: Integers,
     errors: Array,
 ) -> int:
     """Run until a block is complete, samples are used up, or one is not finite; return how many were used.
 
     `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `errors` (n_samples, n_y) gets
-    innovations in scaled units, `W` weights them, `moment` sums their products. `rows` (p + 1, room) holds rows that
-    are not folded yet. `counts`: place of the next input in `history`, rows and samples of the present block, samples
-    still to settle, samples of a block.
+    innovations in scaled units, `W` weights them. `rows` (p + 1, room) holds rows that are not folded yet. `counts`:
+    place of the next input in `history`, rows and samples of the present block, samples still to settle, samples of a
+    block.
     """
     (n_x, n_l), (n_u, n_y), p = M.shape, (u.shape[1], y.shape[1]), s.shape[1]
     depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
@@ -103,8 +102,6 @@ def advance(
                 for j in range(n_y):
                     v += W[i, j] * errors[k, j]
                 rows[p, r + i] = v
-                for j in range(n_y):
-                    moment[i, j] += errors[k, i] * errors[k, j]
             counts[1] = r + n_y
             counts[2] += 1
         # next state and sensitivities

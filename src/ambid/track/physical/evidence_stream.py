@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from ambid.track.evidence import Evidence
 from ambid.track.physical.linearisation import Linearisation
 from ambid.track.physical.numbers import TrackedNumbers
+from ambid.track.physical.signals import Samples
 
 Array = NDArray[np.float64]
 
-SETTLING = 8.0  # memories of the predictor until what it did not know at a restart is below the noise
+SETTLING = 10.0  # memories of the predictor until what it did not know at a restart is below the noise
 _ROOM = 128  # samples whose rows are folded at once: they stay in the first-level cache
 
 
@@ -35,8 +36,6 @@ class EvidenceStream:
     at : Linearisation
     sample : int
         Number of the next sample of the stream.
-    moment : ndarray, shape (n_outputs, n_outputs)
-        Sum over the last complete block of the products of innovations, in scaled output units.
     """
 
     def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
@@ -51,24 +50,12 @@ class EvidenceStream:
         self._history = np.zeros((int(self._lags.max()) + 1, n_u))
         self._x, self._s = np.zeros(n), np.zeros((n, p))
         self._rows = np.zeros((p + 1, min(block, _ROOM) * n_y))
-        self._triangle, self._moment = np.zeros((p + 1, p + 1)), np.zeros((n_y, n_y))
-        self.moment = np.zeros((n_y, n_y))
+        self._triangle = np.zeros((p + 1, p + 1))
         self._counts = np.zeros(6, dtype=np.int64)
         self._counts[4] = block
         self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
-        self.weigh(numbers.innovation_covariance)
+        self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(numbers.innovation_covariance)))
         self._fresh = True
-
-    def weigh(self, covariance: Array) -> None:
-        """Weight innovations anew, from the next block on.
-
-        Parameters
-        ----------
-        covariance : ndarray, shape (n_outputs, n_outputs)
-            Of the innovations, in scaled output units.
-        """
-        self.covariance = covariance.copy()
-        self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def relinearise(self, at: Linearisation) -> None:
         """Go on with the predictor of another point; the state moves along to first order.
@@ -89,7 +76,7 @@ class EvidenceStream:
             Number of the next sample.
         """
         self.sample, self._fresh = sample, True
-        self._triangle[:], self._moment[:] = 0.0, 0.0
+        self._triangle[:] = 0.0
         self._counts[1:3] = 0
 
     @property
@@ -97,15 +84,17 @@ class EvidenceStream:
         """Samples that are still needed to settle."""
         return int(self._counts[3])
 
-    def feed(self, u: Array, y: Array, forcing: Array | None = None) -> tuple[int, Array, Evidence | None]:
+    @property
+    def settling_samples(self) -> int:
+        """Samples that settling takes after a restart."""
+        return int(self._lags.max()) + int(np.ceil(SETTLING * self.at.memory))
+
+    def feed(self, samples: Samples) -> tuple[int, Array, Evidence | None]:
         """Take samples until a block is complete, they are used up, or one is not finite.
 
         Parameters
         ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-        forcing : ndarray, shape (n_samples, 2), optional
-            (speed/top speed)^2 times cosine and sine of the rotor's angle, in the middle of each sample.
+        samples : Samples
 
         Returns
         -------
@@ -116,17 +105,40 @@ class EvidenceStream:
         evidence : Evidence or None
             Of the block that these samples complete.
         """
+        u, y = samples.u, samples.y
         if self._fresh and y.shape[0]:
             self._begin(u, y)
         errors = np.empty_like(y)
-        extra = self._nothing_like(y.shape[0]) if forcing is None else forcing
+        forcing = self._nothing_like(y.shape[0]) if samples.forcing is None else samples.forcing
         used = self._advance(
-            u, y, extra, self.at.M, self.at.D, self.at.C, self._W, self._scale, self._lags, self._history,
-            self._x, self._s, self._rows, self._triangle, self._moment, self._counts, errors,
+            u, y, forcing, self.at.M, self.at.D, self.at.C, self._W, self._scale, self._lags, self._history,
+            self._x, self._s, self._rows, self._triangle, self._counts, errors,
         )  # fmt: skip
         self.sample += used
-        complete = self._counts[2] == self._counts[4]
-        return used, errors[:used], self._evidence() if complete else None
+        return used, errors[:used], self._evidence() if self._counts[2] == self._counts[4] else None
+
+    def close(self, block: int) -> Evidence | None:
+        """Return the evidence of the samples since the last block, and go on with blocks of another length.
+
+        Parameters
+        ----------
+        block : int
+            Samples of the blocks to come.
+
+        Returns
+        -------
+        Evidence or None
+            None where nothing but settling has happened.
+        """
+        from ambid.track.physical._kernels import fold
+
+        found = None
+        if self._counts[2]:
+            fold(self._triangle, self._rows, int(self._counts[1]))
+            self._counts[1] = 0
+            found = self._evidence()
+        self._counts[4] = block
+        return found
 
     def _nothing_like(self, n: int) -> Array:
         if self._nothing.shape[0] != n:
@@ -146,7 +158,7 @@ class EvidenceStream:
             row = outputs.index(state) if state in outputs else -1
             self._x[j] = measured[row] / self.at.C[row, j] if row >= 0 else 0.0
         self._s[:] = 0.0
-        self._counts[3] = self._lags.max() + int(np.ceil(SETTLING * self.at.memory))
+        self._counts[3] = self.settling_samples
         self._fresh = False
 
     def _evidence(self) -> Evidence:
@@ -162,8 +174,7 @@ class EvidenceStream:
             first=self.sample - int(self._counts[2]),
             last=self.sample,
         )
-        self.moment = self._moment.copy()
-        self._triangle[:], self._moment[:] = 0.0, 0.0
+        self._triangle[:] = 0.0
         self._counts[2] = 0
         return found
 
@@ -175,7 +186,7 @@ class EvidenceStream:
         EvidenceStream
         """
         other = copy.copy(self)
-        for name in ("_history", "_x", "_s", "_rows", "_triangle", "_moment", "_counts", "_scale"):
+        for name in ("_history", "_x", "_s", "_rows", "_triangle", "_counts", "_scale"):
             setattr(other, name, getattr(self, name).copy())
         return other
 

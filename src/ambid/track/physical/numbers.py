@@ -117,6 +117,35 @@ class TrackedNumbers:
         """
         return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
 
+    def physical(self, q: Array) -> Array:
+        """Return the physical parameters in SI units.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        ndarray, shape (n_parameters,)
+        """
+        own = self.places("parameter")
+        return np.asarray(q[own] * self.magnitude[own])
+
+    def physical_covariance(self, covariance: Array) -> Array:
+        """Return the covariance of the physical parameters in SI units.
+
+        Parameters
+        ----------
+        covariance : ndarray, shape (p, p)
+            Of q.
+
+        Returns
+        -------
+        ndarray, shape (n_parameters, n_parameters)
+        """
+        own = self.places("parameter")
+        return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
+
     def vector(self, q: Array) -> Array:
         """Return q in the layout of `PredictorProblem`, initial state zero.
 

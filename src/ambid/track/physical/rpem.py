@@ -22,6 +22,7 @@ from ambid.track.physical.evidence_stream import EvidenceStream
 from ambid.track.physical.linearisation import linearise
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
+from ambid.track.physical.signals import checked
 
 Array = NDArray[np.float64]
 Memory = float | Literal["auto", "all"]
@@ -31,8 +32,8 @@ _FEWEST = 4  # samples of one evidence
 _START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
-_NOISE_S = 2.0  # time constant with which the covariance of the innovations is followed
-_NOISE_MOVED = 0.05  # relative change of it at which innovations are weighted anew
+_NOISE_S = 2.0  # time constant with which the noise level is followed
+_LOWEST_NOISE = 0.25  # of the level at identification: less is not believed
 _OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of which nothing is known before
 
 
@@ -55,8 +56,11 @@ class PhysicalRpem:
     filter : ParameterFilter
     stream : EvidenceStream
     drift : DriftRates
-    noise : float
-        Variance of the evidence's residual: above 1 where the start estimate explains its record only in part.
+    block_samples : int
+    block_s : float
+        Length of one evidence.
+    noise_level : float
+        Variance of the innovations over that at identification, followed through what no number explains.
     n_used, n_rejected : int
     n_linearised : int
         Times that the predictor was assembled anew.
@@ -75,38 +79,30 @@ class PhysicalRpem:
         size = max(round(BLOCK_S * numbers.rate_hz), _FEWEST) if block is None else block
         if size < 1:
             raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
-        self.numbers, self.block_s = numbers, size / numbers.rate_hz
+        self.numbers, self.block_samples, self.block_s = numbers, size, size / numbers.rate_hz
         self.filter = ParameterFilter(numbers.start, numbers.covariance)
         self.filter.active[numbers.places("gain")] = False
         self.stream = EvidenceStream(numbers, at, size)
         self.drift = _rates(numbers, memory, self.block_s)
-        self.noise = numbers.overdispersion
         self.n_used = self.n_rejected = self.n_linearised = 0
-        self._spread_of_errors = numbers.innovation_covariance.copy()
+        self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the physical parameters."""
-        return tuple(self.numbers.names[j] for j in self._own)
+        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
 
     @property
     def estimate(self) -> Array:
         """Physical parameters, SI, shape (n_parameters,)."""
-        own = self._own
-        return np.asarray(self.filter.q[own] * self.numbers.magnitude[own])
+        return self.numbers.physical(self.filter.q)
 
     @property
     def covariance(self) -> Array:
         """Their covariance, SI, shape (n_parameters, n_parameters)."""
-        own = self._own
-        size = self.numbers.magnitude[own]
-        return np.asarray(self.filter.covariance[np.ix_(own, own)] * np.outer(size, size))
-
-    @property
-    def _own(self) -> NDArray[np.int64]:
-        return self.numbers.places("parameter")
+        return self.numbers.physical_covariance(self.filter.covariance)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
         """Take in one sample or a block.
@@ -128,11 +124,11 @@ class PhysicalRpem:
         EstimationError
             If the shapes do not fit.
         """
-        u, y, extra, one = self._checked(inputs, outputs, forcing)
-        errors = np.full(y.shape, np.nan)
-        k, n = 0, y.shape[0]
+        samples = checked(self.numbers, inputs, outputs, forcing)
+        errors = np.full(samples.y.shape, np.nan)
+        k, n = 0, samples.y.shape[0]
         while k < n:
-            used, found, evidence = self.stream.feed(u[k:], y[k:], extra if extra is None else extra[k:])
+            used, found, evidence = self.stream.feed(samples.part(k))
             errors[k : k + used] = found
             k += used
             self.n_used += used
@@ -143,7 +139,7 @@ class PhysicalRpem:
                 k += 1
                 self.stream.restart(self.stream.sample + 1)
         errors *= self.numbers.problem.scales.output
-        return np.asarray(errors[0] if one else errors)
+        return errors.reshape(np.shape(outputs))
 
     def take(self, evidence: Evidence) -> None:
         """Take in the evidence of a block.
@@ -155,7 +151,7 @@ class PhysicalRpem:
         self.predict()
         self.drift.add(evidence, self.filter, self.noise)
         self.filter.absorb(evidence, self.noise)
-        self._spread_of_errors += self._part * (self.stream.moment / evidence.n_samples - self._spread_of_errors)
+        self.follow_noise(evidence)
         self.refresh()
 
     def predict(self) -> None:
@@ -164,13 +160,25 @@ class PhysicalRpem:
             self.filter.walk(np.sqrt(self.drift.variance * self.block_s))
 
     def refresh(self) -> None:
-        """Assemble the predictor anew where the estimate has moved too far from it, or the noise has changed."""
+        """Assemble the predictor anew where the estimate has moved too far from it."""
         moved = self.filter.q - self.stream.at.at
         if np.any(moved * moved > self._curved * self.filter.sd):
             self.move_to(self.filter.q)
-        ratio = np.diag(self._spread_of_errors) / np.diag(self.stream.covariance)
-        if np.any(np.abs(ratio - 1.0) > _NOISE_MOVED):
-            self.stream.weigh(self._spread_of_errors)
+
+    def follow_noise(self, evidence: Evidence) -> None:
+        """Follow the noise level by the part of a block's innovations that no number explains.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        if evidence.freedom:
+            self.noise_level += self._part * (evidence.rest / evidence.freedom - self.noise_level)
+
+    @property
+    def noise(self) -> float:
+        """Variance of the evidence's residual: above 1 where the model explains the record only in part."""
+        return self.numbers.overdispersion * max(self.noise_level, _LOWEST_NOISE)
 
     def move_to(self, q: Array) -> bool:
         """Linearise at other numbers.
@@ -191,24 +199,6 @@ class PhysicalRpem:
         self.n_linearised += 1
         return True
 
-    def _checked(
-        self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None
-    ) -> tuple[Array, Array, Array | None, bool]:
-        model = self.numbers.problem.model
-        n_u, n_y = len(model.inputs), len(model.outputs)
-        u, y = np.asarray(inputs, dtype=np.float64), np.asarray(outputs, dtype=np.float64)
-        one = y.ndim == (1 if n_y > 1 else 0)
-        u, y = u.reshape(-1, n_u) if u.size % n_u == 0 else u, y.reshape(-1, n_y) if y.size % n_y == 0 else y
-        extra = None if forcing is None else np.asarray(forcing, dtype=np.float64).reshape(-1, 2)
-        fits = u.ndim == 2 and y.ndim == 2 and u.shape[0] == y.shape[0]
-        if not fits or (self.numbers.synchronous and (extra is None or extra.shape[0] != y.shape[0])):
-            raise EstimationError(
-                f"inputs have shape {np.shape(inputs)}, outputs {np.shape(outputs)}; the model wants {n_u} and {n_y}"
-                f" columns of one length{' and the unbalance its forcing' if self.numbers.synchronous else ''}. Check"
-                " the block"
-            )
-        return np.ascontiguousarray(u), np.ascontiguousarray(y), extra, one
-
     def copy(self) -> Self:
         """Return an independent estimator in the same state.
 
@@ -218,7 +208,6 @@ class PhysicalRpem:
         """
         other = copy.copy(self)
         other.filter, other.stream, other.drift = self.filter.copy(), self.stream.copy(), self.drift.copy()
-        other._spread_of_errors = self._spread_of_errors.copy()
         return other
 
 

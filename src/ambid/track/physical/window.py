@@ -1,0 +1,258 @@
+"""Moving-window Gauss-Newton estimation of the physical parameters, warm-started from the last estimate.
+
+The tracked numbers that explain a stretch of raw samples best are found by iterating: linearise, run the predictor
+over the stretch, take its evidence in beside what is known from before. Used alone it forgets sharply; the supervisor
+uses it to find a parameter anew after a jump, where the recursion's first-order step would be too long.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Estimate
+from ambid.track.evidence import Evidence
+from ambid.track.physical.evidence_stream import EvidenceStream
+from ambid.track.physical.linearisation import linearise
+from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.physical.parameter_filter import ParameterFilter
+from ambid.track.physical.signals import Samples, checked
+
+Array = NDArray[np.float64]
+
+_ITERATIONS = 6
+_SETTLED = 0.05  # step, in standard deviations, below which the search has converged
+_HALVINGS = 4
+_WIDER = 30.0  # how much wider than the start's the standard deviations are that a window begins with
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Refined:
+    """Numbers found from a stretch.
+
+    Attributes
+    ----------
+    filter : ParameterFilter
+        Estimate and covariance, what was known before included.
+    stream : EvidenceStream
+        The predictor at the estimate, at the end of the stretch.
+    evidence : Evidence
+        Of the stretch, linearised at the estimate or within a few hundredths of a standard deviation of it.
+    misfit : float
+        Squared distance of the estimate from what was known before and from the stretch: chi-squared with p degrees of
+        freedom if both are right.
+    converged : bool
+    iterations : int
+    """
+
+    filter: ParameterFilter
+    stream: EvidenceStream
+    evidence: Evidence
+    misfit: float
+    converged: bool
+    iterations: int
+
+
+def refine(
+    numbers: TrackedNumbers,
+    before: ParameterFilter,
+    samples: Samples,
+    *,
+    first: int = 0,
+    block: int = 1,
+    noise: float = 1.0,
+    gain: Array | None = None,
+) -> Refined | None:
+    """Find the numbers that explain a stretch, given what is known from before it.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    before : ParameterFilter
+        What is known without the stretch; the search starts there.
+    samples : Samples
+        The stretch; its first part settles the predictor.
+    first : int
+        Number of its first sample in the stream.
+    block : int
+        Samples of one evidence of the stream that is given back.
+    noise : float
+        Variance of the evidence's residual.
+    gain : ndarray, shape (n_states, n_outputs), optional
+        A predictor gain near the one looked for.
+
+    Returns
+    -------
+    Refined or None
+        None where the stretch is too short to settle, or no step leads to a predictor.
+    """
+    q, near = before.q.copy(), gain
+    for iteration in range(1, _ITERATIONS + 1):
+        at = linearise(numbers, q, near)
+        for _ in range(_HALVINGS):
+            if at is not None:
+                break
+            q = 0.5 * (q + before.q)
+            at = linearise(numbers, q, near)
+        if at is None:
+            return None
+        near = at.gain
+        stream = EvidenceStream(numbers, at, 1 << 40)
+        stream.restart(first)
+        stream.feed(samples)
+        evidence = stream.close(block)
+        if evidence is None:
+            return None
+        found = before.copy()
+        misfit = found.absorb(evidence, noise)
+        step = np.max(np.abs(found.q - q) / found.sd)
+        if step < _SETTLED or iteration == _ITERATIONS:
+            return Refined(
+                filter=found,
+                stream=stream,
+                evidence=evidence,
+                misfit=misfit,
+                converged=bool(step < _SETTLED),
+                iterations=iteration,
+            )
+        q = found.q.copy()
+    return None
+
+
+class MovingWindow:
+    """Estimator of the physical parameters from the last samples alone.
+
+    Parameters
+    ----------
+    start : Estimate or TrackedNumbers
+    window : int
+        Samples of the window.
+    every : int, optional
+        Samples between estimates; by default a tenth of the window.
+
+    Attributes
+    ----------
+    numbers : TrackedNumbers
+    n_used, n_rejected : int
+    n_failed : int
+        Windows from which nothing was found: the estimate before is kept.
+
+    Raises
+    ------
+    EstimationError
+        If the window is too short for the numbers and for the predictor to settle.
+    """
+
+    def __init__(self, start: Estimate | TrackedNumbers, *, window: int, every: int | None = None) -> None:
+        numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
+        at = linearise(numbers, numbers.start)
+        if at is None:
+            raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+        stream = EvidenceStream(numbers, at, 1)
+        fewest = stream.settling_samples + 10 * numbers.start.size
+        if window < fewest:
+            raise EstimationError(f"the window has {window} samples; it needs at least {fewest}. Give a longer window")
+        self.numbers, self.window = numbers, window
+        self.every = max(1, window // 10) if every is None else every
+        wide = numbers.covariance.copy()
+        own = numbers.places("parameter", "noise")
+        wide[np.ix_(own, own)] *= _WIDER**2
+        self._begin = ParameterFilter(numbers.start, wide)
+        self._begin.active[numbers.places("gain")] = False
+        self._now, self._gain = ParameterFilter(numbers.start, numbers.covariance), at.gain
+        n_u, n_y = len(numbers.problem.model.inputs), len(numbers.problem.model.outputs)
+        self._u, self._y = np.zeros((window, n_u)), np.zeros((window, n_y))
+        self._held = self._since = 0
+        self.n_used = self.n_rejected = self.n_failed = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the physical parameters."""
+        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
+
+    @property
+    def estimate(self) -> Array:
+        """Physical parameters, SI, shape (n_parameters,)."""
+        return self.numbers.physical(self._now.q)
+
+    @property
+    def covariance(self) -> Array:
+        """Their covariance, SI, shape (n_parameters, n_parameters)."""
+        return self.numbers.physical_covariance(self._now.covariance)
+
+    def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), SI
+        outputs : array_like, shape (n_outputs,) or (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape of `outputs`, SI
+            NaN: a window predicts nothing sample by sample.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        samples = checked(self.numbers, inputs, outputs, None)
+        n, k = samples.y.shape[0], 0
+        finite = np.asarray(np.isfinite(np.hstack([samples.u, samples.y])).all(axis=1))
+        while k < n:
+            if not finite[k]:
+                self.n_rejected += 1
+                self._held, k = 0, k + 1
+                continue
+            stop = min(n, k + self.every - self._since)
+            bad = np.flatnonzero(~finite[k:stop])
+            stop = k + int(bad[0]) if bad.size else stop
+            self._push(samples.u[k:stop], samples.y[k:stop])
+            k = stop
+            if self._since >= self.every:
+                self._since = 0
+                self._solve()
+        return np.full(np.shape(outputs), np.nan)
+
+    def _push(self, u: Array, y: Array) -> None:
+        n = u.shape[0]
+        for ring, new in ((self._u, u), (self._y, y)):
+            if n >= self.window:
+                ring[:] = new[-self.window :]
+            else:
+                ring[:-n] = ring[n:]
+                ring[-n:] = new
+        self._held = min(self._held + n, self.window)
+        self._since += n
+        self.n_used += n
+
+    def _solve(self) -> None:
+        if self._held < self.window:
+            return
+        begin = self._begin.copy()
+        begin.q = self._now.q.copy()  # a warm start; what is known of it is as wide as at the beginning
+        samples = Samples(u=self._u, y=self._y, forcing=None)
+        found = refine(self.numbers, begin, samples, noise=self.numbers.overdispersion, gain=self._gain)
+        if found is None or not found.converged:
+            self.n_failed += 1
+            return
+        self._now, self._gain = found.filter, found.stream.at.gain
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        MovingWindow
+        """
+        other = copy.copy(self)
+        other._begin, other._now = self._begin.copy(), self._now.copy()
+        other._u, other._y = self._u.copy(), self._y.copy()
+        return other
