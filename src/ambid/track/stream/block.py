@@ -27,3 +27,18 @@ class Block:
     first: int
     time_s: float
     values: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """A block with the time at which it was there.
+
+    Attributes
+    ----------
+    block : Block
+    arrived_s : float
+        When its last sample was there, by `time.perf_counter`, which all processes of a machine share, s.
+    """
+
+    block: Block
+    arrived_s: float

@@ -16,7 +16,7 @@ from ambid.track.stream.clock import SampleClock
 from ambid.track.stream.outcome import Ledger, Part, RejectionKind
 
 _REMEMBERED = 8  # blocks that came but were refused: their numbers are not waited for
-_LEAP_S = 1.0  # without a clock, a number that leads by more is doubted
+_LEAP_S = 1.0  # a number that leads by more is doubted where no clock says that so much time went by
 
 
 class BlockOrder:
@@ -211,8 +211,8 @@ class BlockOrder:
             return
         self._doubtful = None
         low, high = sorted((held, part), key=lambda each: each.first)
-        if low.first > self.next and self._runs_on(low):
-            self._count_anew([low, high])
+        if low.first - self.next > self._leap and self._runs_on(low):
+            self._count_anew([low, high])  # nobody lost so much in no time
             return
         self._release_all()  # what waits came before the jump
         if self._clock is not None:
