@@ -104,11 +104,11 @@ def bearing(what: str, factor: float, *, at: int, n: int, seed: int) -> list[Evi
     state = np.array(
         [sensor[of.outputs.index(x)] if x in of.outputs else sensor[0] * s.rate_hz / 30 for x in of.states]
     )
-    disturbance = np.array([s.noise[d] for d in of.disturbances])
+    disturbance, u_rms = np.array([s.noise[d] for d in of.disturbances]), np.std(u, axis=0)
     problem = PredictorProblem(
         model=of, rate_hz=s.rate_hz, u=u, y=y, estimated=names, known={"c": truth["c"]},
         magnitude=np.array([abs(truth[k]) for k in names]),
-        scales=Scales(state=3 * np.array(state), input=np.std(u, axis=0), output=1.5 * sensor, disturbance=0.7 * disturbance),
+        scales=Scales(state=3 * np.array(state), input=u_rms, output=1.5 * sensor, disturbance=0.7 * disturbance),
         noise_center=np.zeros(disturbance.size + sensor.size - 1), delay=delay, lag=s.loop.delay - delay,
         skip=BLOCK, prior_mean=np.zeros(len(names)), prior_sd=np.full(len(names), np.inf),
     )  # fmt: skip
@@ -123,7 +123,7 @@ def bearing(what: str, factor: float, *, at: int, n: int, seed: int) -> list[Evi
     rows = np.concatenate([b.copy() for b in residual_blocks(problem, vector, weight, work)])
     columns = [*range(*sl["physical"].indices(problem.size)), *range(*sl["offset"].indices(problem.size)), problem.size]
     rows, p = rows[:, :, columns], len(columns) - 1
-    q = np.r_[np.ones(len(names)), np.zeros(p - len(names))]
+    q = np.r_[np.sign([truth[k] for k in names]), np.zeros(p - len(names))]
     found = []
     for k in range(10, len(rows) // BLOCK):  # the first blocks depend on the initial state
         R = np.linalg.qr(rows[k * BLOCK : (k + 1) * BLOCK].reshape(-1, p + 1), mode="r")

@@ -16,6 +16,7 @@ Counts = NDArray[np.int64]
 
 _QUANTILE = 0.1  # share of quiet statistics above the point by which overdispersion is learned
 _LARGEST_GAIN = 0.02  # of learning overdispersion
+_SETTLE_GAIN = 6.0  # over the number of tests, while settling: one over the density of log chi-squared at that point
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 
 
@@ -203,7 +204,7 @@ def watch(
         return
     acc, other, M, X = scratch[0], scratch[1], scratch[2], scratch[3]
     reference, growth, now, found = rows[1], rows[2], rows[3], rows[4]
-    block = counts[levels]
+    block = int(counts[levels])
     if block == 0:
         for j in range(p):
             reference[j] = inlet[2 * p, j]
@@ -217,8 +218,10 @@ def watch(
     for level in range(levels):
         n_bases, rest, freedom = counts[level], 0.0, 0.0
         gain = 0.0
-        if calm:  # long windows are looked at less often; while settling the gain is large as it is
-            gain = min(state[2] * (1 << level), _LARGEST_GAIN) if state[5] > 0.0 else state[2]
+        if calm and state[5] > 0.0:  # long windows are looked at less often
+            gain = min(state[2] * (1 << level), _LARGEST_GAIN)
+        elif calm:  # as fast as a tenth quantile can be learned
+            gain = _SETTLE_GAIN / (n_bases + 2.0 * _SETTLE_GAIN)
         for m in range(1, min(n_bases, 4) + 1):
             length = m << level
             if length > longest:

@@ -25,8 +25,7 @@ _FEWEST = 4  # blocks of the longest window, at least
 # threshold and is taken larger than what was found.
 _INDEPENDENT = 0.7
 _GAIN, _NOISE_GAIN = 0.002, 2e-4  # per test, per block: of learning overdispersion and noise level
-_SETTLE_GAIN = 6.0  # over the number of blocks, while settling: the fastest that a tenth quantile can be learned
-_LARGEST_FIRST = 100.0
+_SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,12 +253,10 @@ class ChangeDetector:
         self._from = from_sample
 
     def _learn_fast(self) -> None:
-        """Set the gains of learning while settling, and the final ones at its end."""
+        """Learn fast while settling, and slowly from its end on."""
         self._seen += 1
         settling = self._seen <= self._settle
-        n = self._seen + _LARGEST_FIRST / 4
-        self._state[2] = max(_SETTLE_GAIN / n, _GAIN) if settling else _GAIN
-        self._state[3] = max(1.0 / n, _NOISE_GAIN) if settling else _NOISE_GAIN
+        self._state[3] = max(1.0 / (self._seen + _SETTLE_NOISE), _NOISE_GAIN) if settling else _NOISE_GAIN
         self._state[5] = 0.0 if settling else 1.0
 
     def _alarm(self, end: int) -> Alarm:

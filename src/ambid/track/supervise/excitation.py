@@ -39,6 +39,8 @@ class ExcitationMonitor:
     reference_rate : Mapping[str, float]
         Information rate of each parameter at identification, 1/(sd² T), 1/s: `rate_of`. Numbers that are not in it are
         nuisance: they take their share of information and are not judged.
+    held : sequence of str
+        Numbers that are held fixed: taken as known, they take no information from the others.
     block_s : float
         Duration of a block, s.
     window_s : float
@@ -67,6 +69,7 @@ class ExcitationMonitor:
         names: Sequence[str],
         *,
         reference_rate: Mapping[str, float],
+        held: Sequence[str] = (),
         block_s: float,
         window_s: float = 1.0,
         freeze: float = 0.02,
@@ -76,9 +79,10 @@ class ExcitationMonitor:
         from ambid.track.supervise._kernels import inform
 
         self.names, p = tuple(names), len(names)
-        for name, value in reference_rate.items():
+        for name in (*reference_rate, *held):
             if name not in self.names:
-                raise EstimationError(f"reference_rate names {name!r}, not tracked.{nearest(name, self.names)}")
+                raise EstimationError(f"excitation: {name!r} is not tracked.{nearest(name, self.names)}")
+        for name, value in reference_rate.items():
             if not (value >= 0 and math.isfinite(value)):
                 raise EstimationError(
                     f"reference_rate of {name} is {value:g}; it is an information rate. Give 0 or more"
@@ -86,6 +90,7 @@ class ExcitationMonitor:
         if not (0 < block_s < window_s and 0 < freeze <= thaw and enough >= 0):
             raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Mend them")
         self._inform, self._judged = inform, tuple(name for name in self.names if name in reference_rate)
+        self._held = np.array([self.names.index(name) for name in held], dtype=np.int64)
         self._at = tuple(self.names.index(name) for name in self._judged)
         self._reference = np.array([reference_rate.get(name, -1.0) for name in self.names])
         self._limits = np.array([freeze, thaw, enough, _WORSE, _RIDGE])
@@ -133,6 +138,8 @@ class ExcitationMonitor:
                 f"the block at sample {evidence.first} is not finite or of other numbers. Leave it out"
             )
         self._J[:] = J
+        if self._held.size:
+            self._J[:, self._held] = 0.0
         self._duration = self._duration * self._decay + self._block
         enough = self._duration >= _FILLED * self._window
         changed = self._inform(

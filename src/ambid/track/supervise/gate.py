@@ -189,7 +189,7 @@ class Gate:
         return Event(kind="refused", t=t, why=f"a newer candidate takes its place after {n} blocks: {earlier.why}")
 
     def restart(self) -> None:
-        """Drop the candidate and end the probation: after a change, data from before it say nothing of what holds now."""
+        """Drop the candidate and end the probation: data from before a change say nothing of what holds now."""
         self._candidate = self._before = None
 
     def judge(self, evidence: Evidence, t: float) -> Event | None:

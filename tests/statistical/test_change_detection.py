@@ -1,0 +1,47 @@
+"""False alarms of the change detector on quiet Gaussian evidence, tracked by an exact filter."""
+
+import numpy as np
+import pytest
+
+from ambid.track.supervise.change import ChangeDetector
+from tests.track.supervise.evidences import BLOCK_S, Filter, evidence, triangle
+
+N = 12_000  # blocks: a minute of record
+P7 = tuple(f"q{i}" for i in range(7))
+
+
+def alarms(detector, J, seed, n=N):
+    """Times at which an alarm began after at least a longest window without one, and the kinds."""
+    rng, walk, truth = np.random.default_rng(seed), 1e-9, np.zeros(7)
+    P = np.linalg.inv(200 * J.T @ J)
+    f = Filter(np.linalg.cholesky(P) @ rng.normal(size=7), P, walk=walk)
+    begun, last, kinds = 0, -1000, []
+    for k in range(n):
+        e = evidence(J, truth, k, rng)
+        alarm = detector.update(e, f.q, f.P)
+        if alarm is not None:
+            begun += k - last > 100
+            last = k
+            kinds.append(alarm.kind)
+        f.update(e)
+        truth = truth + np.sqrt(walk) * rng.normal(size=7)
+    return begun, kinds
+
+
+@pytest.mark.parametrize(("condition", "scale"), [(1.0, 1.0), (1e6, 1.0), (1e2, 1e-3)])
+def test_false_alarms_come_no_oftener_than_allowed(condition, scale):
+    """Allowed one a second: 60 in a minute; they may be fewer, as the allowance holds for the worst case."""
+    J = triangle(7, 1, condition=condition) * scale
+    detector = ChangeDetector(P7, block_s=BLOCK_S, false_alarms_per_hour=3600.0, drift=1e-9)
+    begun, kinds = alarms(detector, J, 2)
+    assert 5 <= begun <= 60 + 3 * np.sqrt(60)
+    assert set(kinds) == {"moved", "unexplained"}
+
+
+def test_quiet_running_gives_no_alarm():
+    """At the default of one in twenty hours a minute of quiet running gives one in a thousand cases."""
+    for seed, condition in ((3, 1.0), (4, 1e6)):
+        detector = ChangeDetector(P7, block_s=BLOCK_S, drift=1e-9)
+        assert alarms(detector, triangle(7, seed, condition=condition), seed)[0] == 0
+        assert detector.noise == pytest.approx(1.0, abs=0.02)
+        assert np.median(detector.overdispersion) < 1.1
