@@ -17,7 +17,8 @@ Ints = NDArray[np.int64]
 
 # places in `counts`
 K, USED, REJECTED, PARTIAL, FILLED, FRESH, DUE, REFUSED, MISSED = range(9)
-_ABSURD = 1e6  # standard deviations of an innovation beyond which it is no measurement
+_ABSURD, _HUGE = 1e3, 1e200  # standard deviations of an innovation beyond which it is no measurement
+_FORGET = 1.0 / 1024.0  # weight of a sample in the running level of the innovations
 _BLIND = 32  # samples without any output after which the state is taken for lost
 
 
@@ -74,10 +75,10 @@ def _shrink(T: Array, f: Array, beta: float, b: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _measure(z: Array, T: Array, C: Array, e: Array, f: Array, b: Array) -> int:
-    """Take in the outputs one after the other, `e` being their innovations (NaN: missing); return how many."""
-    n, (n_y, n_x) = z.size, C.shape
-    s, taken = n - n_x, 0
+def _measure(z: Array, T: Array, C: Array, e: Array, level: Array, f: Array, b: Array) -> int:
+    """Take in outputs one by one, `e` their innovations (NaN: missing), `level` a running mean; return how many."""
+    n, taken, (n_y, n_x) = z.size, 0, C.shape
+    s = n - n_x
     for o in range(n_y):
         if not np.isfinite(e[o]):
             continue
@@ -91,9 +92,10 @@ def _measure(z: Array, T: Array, C: Array, e: Array, f: Array, b: Array) -> int:
                 acc += T[j, s + i] * C[o, i]
             f[j] = acc
             alpha += acc * acc
-        if not left * left <= _ABSURD * _ABSURD * alpha:
+        if not left * left <= _ABSURD * _ABSURD * alpha < _HUGE:
             e[o] = np.nan
             continue
+        level[o] += (left * left / alpha - level[o]) * _FORGET
         _shrink(T, f[:n], 1.0, b)
         gain = left / alpha
         for i in range(n):
@@ -193,7 +195,7 @@ def _take(
         for i in range(n_x):
             e[o] -= C[o, i] * z[s + i]
     f[n:] = 0.0
-    taken = _measure(z, T, C, e, f, b)
+    taken = _measure(z, T, C, e, io[2, n_u:], f, b)
     counts[USED if taken else REJECTED] += 1
     counts[PARTIAL] += 0 < taken < n_y
     if taken == 0:  # an innovation that no noise can make: the state is lost
@@ -238,9 +240,8 @@ def ekf_block(
     """
     n, p, (n_x, wide_m) = z.size, dM.shape[0], M.shape
     s, n_u, n_y, n_d = n - n_x, u.shape[1], y.shape[1], dist.size
-    f, b, v = work[0, : n + n_x], work[1, :n], work[2, :wide_m]
-    now, J = work[3 : 3 + n_x, :wide_m], work[3 + n_x : 3 + 2 * n_x, :s]
-    W = work[3 + 2 * n_x : 3 + 3 * n_x, : n_x + n_d]
+    f, b, v, now = work[0, : n + n_x], work[1, :n], work[2, :wide_m], work[3 : 3 + n_x, :wide_m]
+    J, W = work[3 + n_x : 3 + 2 * n_x, :s], work[3 + 2 * n_x : 3 + 3 * n_x, : n_x + n_d]
     for k in range(first, u.shape[0]):
         counts[K] += 1
         if _take(u[k], y[k], e[k], z, T, C, io, wide, past, counts, f, b):
@@ -344,11 +345,8 @@ def ukf_block(
     f, b, t, zero, point = work[0, : n + n_x], work[1, :n], work[2, : 2 * n_x + p], work[3, :n_u], work[4, :n]
     up, still, q, o, x = work[5, :n_x], work[6, :n_x], point[:p], point[p:s], point[s:]
     D, ends = work[7 : 7 + n_x, : n_x + n_u + n_d], work[7 + n_x : 7 + 3 * n_x, :p]
-    A, J, W = (
-        work[7 + 3 * n_x : 7 + 4 * n_x, :n_x],
-        work[7 + 4 * n_x : 7 + 5 * n_x, :s],
-        work[7 + 5 * n_x : 7 + 6 * n_x, :wide_w],
-    )
+    A, J = work[7 + 3 * n_x : 7 + 4 * n_x, :n_x], work[7 + 4 * n_x : 7 + 5 * n_x, :s]
+    W = work[7 + 5 * n_x : 7 + 6 * n_x, :wide_w]
     zero[:] = 0.0
     # points of the linear columns lie about the moved centre: all share its distance from the mean
     centre = cov_0 + 2.0 * other * (n - p)

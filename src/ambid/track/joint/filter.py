@@ -30,7 +30,8 @@ class JointFilter:
 
     A sample of which one output is missing is used with the other. One without any output moves only the state. One
     without input is rejected, and the state begins anew from the next outputs, as it does after 32 samples without
-    outputs and after an innovation that no noise can make (a million standard deviations).
+    outputs and after an innovation of both outputs that no noise makes (a thousand standard deviations). Smaller
+    errors of sensors are taken for noise: screen the samples before.
 
     Parameters
     ----------
@@ -58,7 +59,11 @@ class JointFilter:
         unit = np.r_[self._size, scales.disturbance]
         roles = (*model.inputs, *model.outputs)
         self._io = np.array(
-            [[start.operating_point.get(r, 0.0) for r in roles], np.r_[np.ones(len(model.inputs)), sensor]]
+            [
+                [start.operating_point.get(r, 0.0) for r in roles],
+                np.r_[np.ones(len(model.inputs)), sensor],
+                np.ones(len(roles)),
+            ]
         )
         self._C = np.ascontiguousarray(model.matrices(start.values).C * scales.state / sensor[:, None])
         self._dist = disturbance / scales.disturbance
@@ -122,6 +127,15 @@ class JointFilter:
     def n_partial(self) -> int:
         """Used samples of which an output was missing."""
         return int(self._counts[3])
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the innovations over what the filter expects of them, over about 1000 samples.
+
+        One where model, noise levels and covariance are right. Well above it (1.2) the covariance is too small to be
+        believed: the estimate has left the range in which the filter is linear, or the plant has changed.
+        """
+        return float(np.sqrt(np.mean(self._io[2, self._past.shape[1] :])))
 
     def _unit(self) -> Array:
         """Derivative of `estimate` by the scaled numbers."""

@@ -29,11 +29,19 @@ _REST = 1e-15  # of the Taylor series, relative
 class JointUkf(JointFilter):
     """Joint unscented Kalman filter.
 
+    Of the augmented state only the parameters enter nonlinearly, so that points are needed along their columns alone;
+    along the others (states, offsets) the points of the full transform are known in closed form, and the result is that
+    of all 2 n + 1 points. Measurements are linear and are taken in exactly. It converges from farther than `JointEkf`
+    (5 % on a lightly damped resonance) at about a third of its speed; near the truth they agree to a hundredth of a
+    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.track.physical`.
+
     Parameters
     ----------
     start : JointStart
     alpha : float
-        Spread of the points: sqrt(n) alpha standard deviations, n the length of the augmented state.
+        Spread of the points: sqrt(n) alpha standard deviations, n the length of the augmented state. At 1 all weights
+        are positive; well below, the covariance is downdated, and a downdate that leaves nothing positive is left out
+        and counted.
     beta : float
         What is known of the distribution's kurtosis; 2 for a Gaussian one.
 
