@@ -1,7 +1,11 @@
-"""Compiled recursions in U-D factors: P = V^T diag(D) V, V the transposed unit triangle (layout in `_layout`).
+"""Compiled recursions in U-D factors, P = V^T diag(D) V with V the transposed unit triangle.
 
 Two rank-one steps make them all: Bierman's measurement update (Bierman 1977, ch. V.3) and the positive update of Agee
 and Turner. Both keep D positive whatever is rounded. With four coefficients all state stays in registers.
+
+A recursion is one array, since a call from Python costs by the number of arrays: head | estimate p | factors | factors
+at the start | walk p | prior variance p | work 3 p. The factors are those of P, D p and V p p, and of its companion,
+E p and W p p: the information of squared weights for least squares, else the covariance of the error.
 """
 
 from __future__ import annotations
@@ -10,30 +14,31 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ambid.track.adaptive._layout import (
-    DIRECTIONAL,
-    EVERY,
-    FACTOR,
-    FACTOR_NOW,
-    HEAD,
+Array = NDArray[np.float64]
+
+# Places in the head of the one array of a recursion. They stand in this file because compiled code is cached by it.
+(
+    SIZE,  # p
+    USED,
+    REJECTED,
     KIND,
-    LIMIT,
-    LIMITED,
-    LMS,
-    MEMORY,
-    NOISE_RATE,
+    FACTOR,  # of forgetting, as asked for
+    FACTOR_NOW,  # the same, nearer to 1 where P is about to pass its limit
+    EVERY,  # samples between two looks at the limit
+    LIMIT,  # of the mean of P_ii over prior variance
+    RESET_EVERY,  # samples; 0 for never
+    MEMORY,  # of the estimate, samples
+    NOISE_RATE,  # of forgetting of the noise variance
     NOISE_SUM,
     NOISE_WEIGHT,
-    REJECTED,
-    RESET_EVERY,
-    SIZE,
-    SMALL,
+    TYPICAL,  # a tenth of the usual φᵀPφ
     STEP,
-    TYPICAL,
-    USED,
-)
+    SMALL,
+    LIMITED,  # samples whose step was limited
+) = range(17)
+HEAD = 24
 
-Array = NDArray[np.float64]
+LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
 
 _HUGE = 1e200  # a sample that leads there is rejected as one that is not finite
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive import _layout as at
 
 Array = NDArray[np.float64]
 Kernel = Callable[[Array, Array, Array, Array], None]
 
 _SMALLEST_VARIANCE = 1e-200  # exact data; a variance of 0 would not be positive definite
-_ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
+ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
 _FLOAT = np.dtype(np.float64)
 
 
@@ -34,28 +34,40 @@ class Recursion:
 
     _kernel = "least_squares"
 
-    def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None, guess: float):
-        self._names = coefficient_names(names)
-        p = len(self._names)
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        width: int,
+        size: int,
+        start: ArrayLike | None,
+        noise_sd: float | None,
+        guess: float,
+    ) -> None:
+        p = len(names)
+        self._names, self._shape = names, (width,)
+        self._prepare()
+        self._s = np.zeros(self._at.HEAD + size)
+        self._s[self._at.SIZE] = p
         self._known_noise = None if noise_sd is None else positive("noise_sd", noise_sd) ** 2
         self._guess = positive("noise_start", guess) ** 2
-        self._s = at.allocate(p)
-        self._s[at.HEAD : at.HEAD + p] = numbers("start", 0.0 if start is None else start, p)
-        self._prepare()
+        self._s[self._at.HEAD :][:p] = numbers("start", 0.0 if start is None else start, p)
+
+    def _kernels(self) -> ModuleType:
+        """Return the module of compiled loops, which also knows where the numbers lie."""
+        from ambid.track.adaptive import _kernels
+
+        return _kernels
 
     def _prepare(self) -> None:
         """Make what is not state: work space and the compiled kernel."""
-        from ambid.track.adaptive import _kernels
-
-        p = len(self._names)
-        self._run: Kernel = getattr(_kernels, self._kernel)
-        self._shape = (p,)
-        self._row, self._y, self._e = np.zeros((1, p)), np.zeros(1), np.zeros(1)
+        self._at: Any = self._kernels()
+        self._run: Kernel = getattr(self._at, self._kernel)
+        self._row, self._y, self._e = np.zeros((1, *self._shape)), np.zeros(1), np.zeros(1)
         self._error = self._e.reshape(())
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what `_prepare` makes."""
-        made = {"_run", "_row", "_y", "_e", "_error", "_shape"}
+        made = {"_at", "_run", "_row", "_y", "_e", "_error"}
         return {key: value for key, value in self.__dict__.items() if key not in made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -70,26 +82,26 @@ class Recursion:
     @property
     def estimate(self) -> Array:
         """A copy, shape (p,)."""
-        return self._s[at.HEAD : at.HEAD + len(self._names)].copy()
+        return self._s[self._at.HEAD :][: len(self._names)].copy()
 
     @property
     def n_used(self) -> int:
         """Samples that were used."""
-        return int(self._s[at.USED])
+        return int(self._s[self._at.USED])
 
     @property
     def n_rejected(self) -> int:
         """Samples that were not, for a number that is not finite or leads beyond 1e200."""
-        return int(self._s[at.REJECTED])
+        return int(self._s[self._at.REJECTED])
 
     @property
     def noise_variance(self) -> float:
         """Variance of e, in squared units of the output."""
         if self._known_noise is not None:
             return self._known_noise
-        if self._s[at.NOISE_WEIGHT] < _ENOUGH:
+        if self._s[self._at.NOISE_WEIGHT] < ENOUGH:
             return self._guess
-        return max(float(self._s[at.NOISE_SUM] / self._s[at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
+        return max(float(self._s[self._at.NOISE_SUM] / self._s[self._at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
 
     def update(self, phi: ArrayLike, y: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -129,14 +141,25 @@ class Recursion:
         """
         return copy.deepcopy(self)
 
+
+class Factored(Recursion):
+    """A recursion with P in U-D factors, and a companion of it."""
+
+    def __init__(
+        self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None, guess: float
+    ) -> None:
+        found = coefficient_names(names)
+        p = len(found)
+        super().__init__(found, p, 10 * p + 4 * p * p, start, noise_sd, guess)
+
     def _factors(self, which: int) -> tuple[Array, Array]:
         """Return D (p,) and V (p, p) of P (0), of its companion (1), or of both at the start (2, 3)."""
         p = len(self._names)
-        first = at.HEAD + p + which * (p + p * p)
+        first = self._at.HEAD + p + which * (p + p * p)
         return self._s[first : first + p], self._s[first + p : first + p + p * p].reshape(p, p)
 
     def _set_factors(self, which: int, matrix: Array) -> None:
-        for place, value in zip(self._factors(which), at.factors(matrix), strict=True):
+        for place, value in zip(self._factors(which), factors(matrix), strict=True):
             place[...] = value
 
 
@@ -300,3 +323,40 @@ def forgetting_factor(factor: float | None, memory: float | None) -> float:
     if memory is not None and not memory > 1:
         raise EstimationError(f"memory is {memory!r}; it must be longer than one sample")
     return 1.0 - 1.0 / memory if memory is not None else 1.0 if factor is None else float(factor)
+
+
+def factors(covariance: Array) -> tuple[Array, Array]:
+    """Factor a positive definite matrix.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (p, p)
+
+    Returns
+    -------
+    D : ndarray, shape (p,)
+    V : ndarray, shape (p, p)
+        Unit lower triangle: the matrix is V^T diag(D) V.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    L = np.linalg.cholesky((covariance / np.outer(scale, scale))[::-1, ::-1])[::-1, ::-1]  # upper: P = L L^T
+    L = L * scale[:, None]
+    d = np.diag(L)
+    return d**2, np.ascontiguousarray((L / d).T)
+
+
+def product(D: Array, V: Array) -> Array:
+    """Return V^T diag(D) V.
+
+    Parameters
+    ----------
+    D : ndarray, shape (p,)
+    V : ndarray, shape (p, p)
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        Symmetric to the last bit.
+    """
+    half = np.sqrt(D)[:, None] * V
+    return np.asarray(half.T @ half)

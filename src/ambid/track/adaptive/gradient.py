@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive import _layout as at
-from ambid.track.adaptive._recursion import Recursion, covariance_of, positive
+from ambid.track.adaptive._recursion import Factored, covariance_of, positive, product
 
 Array = NDArray[np.float64]
 
 
-class _Gradient(Recursion):
+class _Gradient(Factored):
     """A recursion along the regressor, with the covariance of its error."""
 
     _kernel = "gradient"
@@ -33,13 +32,13 @@ class _Gradient(Recursion):
         noise_memory: float,
     ) -> None:
         super().__init__(names, start, noise_sd, noise_start)
-        self._s[at.NOISE_RATE] = 1.0 / positive("noise_memory", noise_memory)
+        self._s[self._at.NOISE_RATE] = 1.0 / positive("noise_memory", noise_memory)
         self._set_factors(1, covariance_of("prior", prior, len(self._names)))
 
     @property
     def covariance(self) -> Array:
         """A copy of the covariance of the estimate's error, shape (p, p)."""
-        return self.noise_variance * at.product(*self._factors(1))
+        return self.noise_variance * product(*self._factors(1))
 
 
 class Lms(_Gradient):
@@ -92,12 +91,12 @@ class Lms(_Gradient):
         noise_memory: float = 10_000.0,
     ) -> None:
         super().__init__(names, start, prior, noise_sd, noise_start, noise_memory)
-        self._s[at.KIND], self._s[at.STEP] = at.LMS, positive("step", step)
+        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.LMS, positive("step", step)
 
     @property
     def n_limited(self) -> int:
         """Samples whose step was limited."""
-        return int(self._s[at.LIMITED])
+        return int(self._s[self._at.LIMITED])
 
 
 class Nlms(_Gradient):
@@ -150,5 +149,5 @@ class Nlms(_Gradient):
         super().__init__(names, start, prior, noise_sd, noise_start, noise_memory)
         if not 0 < step < 2:
             raise EstimationError(f"step is {step!r}; normalised LMS converges for 0 < step < 2")
-        self._s[at.KIND], self._s[at.STEP] = at.NLMS, step
-        self._s[at.SMALL] = positive("small", small)
+        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.NLMS, step
+        self._s[self._at.SMALL] = positive("small", small)

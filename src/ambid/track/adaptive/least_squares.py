@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive import _layout as at
-from ambid.track.adaptive._recursion import Recursion, covariance_of, forgetting_factor, numbers, positive
+from ambid.track.adaptive._recursion import Factored, covariance_of, forgetting_factor, numbers, positive, product
 
 Array = NDArray[np.float64]
 Forgetting = Literal["none", "exponential", "directional"]
@@ -23,7 +22,7 @@ _NOISE_MEMORIES = 10  # memory of the noise variance, in memories of the estimat
 _LOOKS = 32  # most samples between two looks at the limit
 
 
-class RecursiveLeastSquares(Recursion):
+class RecursiveLeastSquares(Factored):
     """Recursive least squares, a `RecursiveEstimator`.
 
     What is forgotten:
@@ -110,7 +109,7 @@ class RecursiveLeastSquares(Recursion):
         directional = kind == "directional"
         self._kernel = "kalman" if directional or walk is not None else "least_squares"
         super().__init__(names, start, noise_sd, noise_start)
-        s, p = self._s, len(self._names)
+        s, p, at = self._s, len(self._names), self._at
         s[at.KIND] = at.DIRECTIONAL if directional else at.LEAST_SQUARES if walk is None else at.WALK
         s[at.FACTOR] = s[at.FACTOR_NOW] = kept
         s[at.MEMORY] = 1.0 / (1.0 - kept) if kept < 1.0 else np.inf
@@ -131,14 +130,14 @@ class RecursiveLeastSquares(Recursion):
     @property
     def P(self) -> Array:
         """A copy of the matrix of the recursion, shape (p, p): covariance over σ² without forgetting."""
-        return at.product(*self._factors(0))
+        return product(*self._factors(0))
 
     @property
     def covariance(self) -> Array:
         """A copy of the covariance of the estimate's error, shape (p, p)."""
-        s = self._s
+        s, at = self._s, self._at
         if s[at.KIND] == at.DIRECTIONAL:
-            return self.noise_variance * at.product(*self._factors(1))
+            return self.noise_variance * product(*self._factors(1))
         if s[at.FACTOR] == 1.0:
             return self.noise_variance * self.P
         E, W = self._factors(1)
@@ -172,18 +171,18 @@ class RecursiveLeastSquares(Recursion):
         scale = np.sqrt(np.diag(prior))
         inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
         self._set_factors(2, prior)
-        self._set_factors(3, prior if self._s[at.KIND] == at.DIRECTIONAL else (inverse + inverse.T) / 2)
-        if not self._s[at.USED]:
-            self._s[at.HEAD + 2 * p + 4 * (p + p * p) :][:p] = np.diag(prior)
+        self._set_factors(3, prior if self._s[self._at.KIND] == self._at.DIRECTIONAL else (inverse + inverse.T) / 2)
+        if not self._s[self._at.USED]:
+            self._s[self._at.HEAD + 2 * p + 4 * (p + p * p) :][:p] = np.diag(prior)
 
     def _at_start(self) -> slice:
         p = len(self._names)
-        first = at.HEAD + p + 2 * (p + p * p)
+        first = self._at.HEAD + p + 2 * (p + p * p)
         return slice(first, first + 2 * (p + p * p))
 
     def _begin(self) -> None:
         p, start = len(self._names), self._at_start()
-        self._s[at.HEAD + p : start.start] = self._s[start]
+        self._s[self._at.HEAD + p : start.start] = self._s[start]
 
 
 def _factor(forgetting: Forgetting | None, factor: float | None, memory: float | None) -> float:

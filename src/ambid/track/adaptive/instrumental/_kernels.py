@@ -1,4 +1,9 @@
-"""Compiled recursion of instrumental variables by orthogonal rotations (layout in `_layout`)."""
+"""Compiled recursion of instrumental variables by orthogonal rotations.
+
+One array: head | estimate p | R m (m + p + 1) | T p p | long-run covariance m m | ring lags m | its sum m | prior p |
+size of the instruments m | work. R is the upper part of the triangle of the weighted rows [ζᵀ φᵀ y], T the triangle of
+its columns of φ.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +11,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ambid.track.adaptive.instrumental._layout import (
-    EVERY,
-    FACTOR,
-    FACTOR_NOW,
-    HEAD,
-    INSTRUMENTS,
+Array = NDArray[np.float64]
+
+# Places in the head of the one array of the recursion
+(
+    SIZE,  # p
+    INSTRUMENTS,  # m
     LAGS,
-    LIMIT,
-    MEMORY,
-    NOISE_SUM,
-    NOISE_WEIGHT,
-    PRIOR_LEFT,
-    RATE,
+    USED,
     REJECTED,
     SINGULAR,
-    SIZE,
-    SUM_OF_SQUARES,
-    USED,
-)
-
-Array = NDArray[np.float64]
+    FACTOR,  # of forgetting, as asked for
+    FACTOR_NOW,
+    EVERY,  # samples between two looks at the limit
+    LIMIT,
+    MEMORY,
+    NOISE_RATE,
+    NOISE_SUM,
+    NOISE_WEIGHT,
+    SUM_OF_SQUARES,  # of the weights of the samples
+    PRIOR_LEFT,  # squared weight that the prior still has
+) = range(16)
+HEAD = 20
 
 _HUGE = 1e200
 _SINGULAR = 1e-12
@@ -127,7 +133,7 @@ def _add_noise(s: Array, omega: Array, ring: Array, total: Array, zeta: Array, w
             total[i] = 0.0
             for k in range(lags):
                 total[i] += ring[k, i]
-    keep = 1.0 - s[RATE] * share
+    keep = 1.0 - s[NOISE_RATE] * share
     for i in range(m):
         for j in range(i + 1):
             omega[i, j] = keep * omega[i, j] + share / lags * total[i] * total[j]
@@ -203,7 +209,7 @@ def _account(
     typical = 0.1 * m / min(s[USED] + 1.0, s[MEMORY])
     share = leverage / (leverage + typical)
     _add_noise(s, omega, ring, total, zeta, weighted, share)
-    keep = 1.0 - s[RATE] * share
+    keep = 1.0 - s[NOISE_RATE] * share
     s[NOISE_SUM] = keep * s[NOISE_SUM] + share * weighted * weighted
     s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
     s[SUM_OF_SQUARES] = factor * factor * s[SUM_OF_SQUARES] + share

@@ -7,26 +7,29 @@ pass through infinity, is carried (Söderström & Stoica 1983, ch. 4 and 8).
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from typing import Any, Self
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive._recursion import coefficient_names, forgetting_factor, numbers, positive, samples
-from ambid.track.adaptive.instrumental import _layout as at
+from ambid.track.adaptive._recursion import (
+    ENOUGH,
+    Recursion,
+    coefficient_names,
+    forgetting_factor,
+    numbers,
+    positive,
+)
 
 Array = NDArray[np.float64]
 
 _NOISE_MEMORIES = 10
 _LOOKS = 32
-_SMALLEST_VARIANCE = 1e-200
-_ENOUGH = 0.5
 
 
-class RecursiveInstrumentalVariables:
+class RecursiveInstrumentalVariables(Recursion):
     """Recursive instrumental variables, a `RecursiveEstimator` whose inputs are [φ, ζ].
 
     Consistent where ζ is uncorrelated with v and correlated with φ: with an external reference of a loop, past
@@ -78,6 +81,8 @@ class RecursiveInstrumentalVariables:
         If a setting is out of its range.
     """
 
+    _kernel = "instrumental"
+
     def __init__(
         self,
         names: Sequence[str] | int,
@@ -92,45 +97,46 @@ class RecursiveInstrumentalVariables:
         correlation: int = 20,
         noise_start: float = 1.0,
     ) -> None:
-        self._names = coefficient_names(names)
-        p = len(self._names)
+        found = coefficient_names(names)
+        p = len(found)
         m = p if n_instruments is None else int(n_instruments)
         if m < p:
             raise EstimationError(f"{m} instruments do not determine {p} coefficients. Give {p} or more")
-        self._guess = positive("noise_start", noise_start) ** 2
-        self._s = s = at.allocate(p, m, int(positive("correlation", correlation)))
+        lags = int(positive("correlation", correlation))
+        size = p + m * (m + p + 1) + p * p + m * m + lags * m + m + p + m + m * (p + 1) + m + 3 * p + 1
+        super().__init__(found, p + m, size, start, None, noise_start)
+        s, at = self._s, self._at
+        s[at.INSTRUMENTS], s[at.LAGS] = m, lags
         s[at.FACTOR] = s[at.FACTOR_NOW] = forgetting_factor(factor, memory)
         s[at.MEMORY] = 1.0 / (1.0 - s[at.FACTOR]) if s[at.FACTOR] < 1 else np.inf
         s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
         s[at.LIMIT] = positive("limit", limit)
-        s[at.RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
+        s[at.NOISE_RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
         s[at.PRIOR_LEFT] = 1.0
-        self._begin(numbers("start", 0.0 if start is None else start, p), numbers("prior", prior, p), instrument_size)
-        self._prepare()
+        self._begin(numbers("prior", prior, p), instrument_size)
 
-    def _begin(self, start: Array, prior: Array, instrument_size: ArrayLike) -> None:
+    def _begin(self, prior: Array, instrument_size: ArrayLike) -> None:
         """Enter the prior as samples whose instruments are the coefficients' own directions."""
-        p, m = start.size, self._m
+        p, m = prior.size, self._m
         size = numbers("instrument_size", instrument_size, m)
         if (prior <= 0).any() or (size <= 0).any():
             raise EstimationError("prior and instrument_size must be positive")
         part = self._parts()
-        part["estimate"][...] = start
         part["prior"][...] = prior
         part["size"][...] = size
         T = np.diag(1 / np.sqrt(prior))
         part["T"][...] = T
         part["R"][:, :m] = np.diag(size)
         part["R"][:p, m:-1] = T
-        part["R"][:p, -1] = T @ start
+        part["R"][:p, -1] = T @ part["estimate"]
 
     @property
     def _m(self) -> int:
-        return int(self._s[at.INSTRUMENTS])
+        return int(self._s[self._at.INSTRUMENTS])
 
     def _parts(self) -> dict[str, Array]:
         """Views of the state by name."""
-        p, m, lags = len(self._names), self._m, int(self._s[at.LAGS])
+        p, m, lags = len(self._names), self._m, int(self._s[self._at.LAGS])
         shapes: dict[str, tuple[int, ...]] = {
             "estimate": (p,),
             "R": (m, m + p + 1),
@@ -141,102 +147,35 @@ class RecursiveInstrumentalVariables:
             "prior": (p,),
             "size": (m,),
         }
-        found, first = {}, at.HEAD
+        found, first = {}, self._at.HEAD
         for name, shape in shapes.items():
             n = int(np.prod(shape))
             found[name] = self._s[first : first + n].reshape(shape)
             first += n
         return found
 
-    def _prepare(self) -> None:
-        from ambid.track.adaptive.instrumental._kernels import instrumental
+    def _kernels(self) -> ModuleType:
+        from ambid.track.adaptive.instrumental import _kernels
 
-        self._run = instrumental
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_run"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._prepare()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The coefficients."""
-        return self._names
-
-    @property
-    def estimate(self) -> Array:
-        """A copy, shape (p,)."""
-        return self._s[at.HEAD : at.HEAD + len(self._names)].copy()
-
-    @property
-    def n_used(self) -> int:
-        """Samples that were used."""
-        return int(self._s[at.USED])
-
-    @property
-    def n_rejected(self) -> int:
-        """Samples that were not, for a number that is not finite or beyond 1e100."""
-        return int(self._s[at.REJECTED])
+        return _kernels
 
     @property
     def n_singular(self) -> int:
         """Samples after which the estimate stayed because the instruments did not determine it."""
-        return int(self._s[at.SINGULAR])
-
-    @property
-    def noise_variance(self) -> float:
-        """Variance of v, in squared units of the output."""
-        if self._s[at.NOISE_WEIGHT] < _ENOUGH:
-            return self._guess
-        return max(float(self._s[at.NOISE_SUM] / self._s[at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
+        return int(self._s[self._at.SINGULAR])
 
     @property
     def covariance(self) -> Array:
         """A copy of the covariance of the estimate's error, shape (p, p)."""
         from scipy.linalg import solve_triangular
 
-        part, s, m = self._parts(), self._s, self._m
+        part, s, m, at = self._parts(), self._s, self._m, self._at
         N = np.diag(s[at.PRIOR_LEFT] * self.noise_variance * part["size"] ** 2)
-        if s[at.NOISE_WEIGHT] >= _ENOUGH:
+        if s[at.NOISE_WEIGHT] >= ENOUGH:
             N = N + part["omega"] * (s[at.SUM_OF_SQUARES] / s[at.NOISE_WEIGHT])
         half = solve_triangular(part["R"][:, :m], _root(N), trans="T")
         B = np.linalg.lstsq(part["R"][:, m:-1], half, rcond=None)[0]
         return np.asarray(B @ B.T)
-
-    def update(self, rows: ArrayLike, y: ArrayLike) -> Array:
-        """Take in one sample or a block.
-
-        Parameters
-        ----------
-        rows : array_like, shape (p + m,), or (n_samples, p + m) for a block
-            Regressor, then instruments.
-        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
-
-        Returns
-        -------
-        ndarray, shape of `y`
-            y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
-
-        Raises
-        ------
-        EstimationError
-            If the shapes do not fit.
-        """
-        inputs, values, shape = samples(rows, y, len(self._names) + self._m)
-        out = np.empty(values.size)
-        self._run(self._s, inputs, values, out)
-        return out.reshape(shape)
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state.
-
-        Returns
-        -------
-        RecursiveInstrumentalVariables
-        """
-        return copy.deepcopy(self)
 
 
 def _root(N: Array) -> Array:
