@@ -158,6 +158,7 @@ def test_noise_that_rises_or_falls_is_not_taken_for_a_parameter():
         alarms = quiet_run(detector, J, 120, 9, noise=lambda k, a=low, b=high: a if k < 100 else b)
         assert 100 <= alarms[0][0] <= 102
         assert {alarm.kind for _, alarm in alarms} == {"unexplained"}
+        assert {alarm.by for _, alarm in alarms} == {"noise"}
         assert all(alarm.parameter is None and alarm.size == 0.0 for _, alarm in alarms)
         assert alarms[0][1].noise == pytest.approx(high**2, rel=0.3)
         assert "no one number" in alarms[0][1].why
@@ -169,7 +170,7 @@ def test_several_numbers_at_once_are_not_taken_for_one():
     move = np.linalg.solve(J, 12 * np.random.default_rng(1).choice([-1, 1], size=7))
     alarms = quiet_run(detector, J, 43, 11, jump=(40, move))
     assert alarms[0][0] == 40
-    assert alarms[0][1].kind == "unexplained"
+    assert (alarms[0][1].kind, alarms[0][1].by) == ("unexplained", "all")
     assert alarms[0][1].statistic > alarms[0][1].threshold
 
 
@@ -244,6 +245,25 @@ def test_what_is_not_finite_is_refused_and_changes_nothing():
 def test_evidence_of_nothing_says_nothing():
     J, rng, detector = np.zeros((7, 7)), np.random.default_rng(22), ChangeDetector(P7, block_s=BLOCK_S)
     assert all(detector.update(evidence(J, np.ones(7), k, rng), np.zeros(7), np.eye(7)) is None for k in range(300))
+
+
+def test_drift_widens_what_a_window_may_show():
+    J = triangle(7, 30)
+    detector = ChangeDetector(P7, block_s=BLOCK_S)
+    assert detector.drift.tolist() == [0.0] * 7
+
+    def walked(detector, walk, n=400):
+        """Alarms where the numbers walk, and the filter stands still as of before."""
+        rng, truth, q, P = np.random.default_rng(31), np.zeros(7), np.zeros(7), np.zeros((7, 7))
+        found = []
+        for k in range(n):
+            truth = truth + np.sqrt(walk) * rng.normal(size=7)
+            found.append(detector.update(evidence(J, truth, k, rng), q, P + k * walk * np.eye(7)))
+        return sum(alarm is not None for alarm in found)
+
+    assert walked(ChangeDetector(P7, block_s=BLOCK_S), 2e-5) > 3
+    detector.drift = np.full(7, 2e-5)
+    assert walked(detector, 2e-5) == 0
 
 
 def test_memory_does_not_grow():

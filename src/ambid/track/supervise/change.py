@@ -25,6 +25,7 @@ _FEWEST = 4  # blocks of the longest window, at least
 # threshold and is taken larger than what was found.
 _INDEPENDENT = 0.7
 _GAIN, _NOISE_GAIN = 0.002, 2e-4  # per test, per block: of learning overdispersion and noise level
+_TESTS: dict[int, tuple[Literal["number", "all", "noise"], int]] = {1: ("number", 0), 2: ("all", -2), 3: ("noise", -1)}
 _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
 
 
@@ -36,6 +37,9 @@ class Alarm:
     ----------
     kind : {"moved", "unexplained"}
         One number moved; or something that no one of them explains: several at once, noise, a disturbance.
+    by : {"number", "all", "noise"}
+        Which test gave it: that of one number; of all together, or of one where it does not explain the window; of what
+        no number explains alone, so that there is no sign of the numbers having moved.
     parameter : str or None
         Which one moved.
     onset, end : int
@@ -60,6 +64,7 @@ class Alarm:
     """
 
     kind: Literal["moved", "unexplained"]
+    by: Literal["number", "all", "noise"]
     parameter: str | None
     onset: int
     end: int
@@ -112,8 +117,8 @@ class ChangeDetector:
         Allowed rate in quiet running with Gaussian evidence.
     longest_s : float
         Longest window, s.
-    drift : array_like, shape (p,), optional
-        Growth of the variance of each number in one block: random walk within a window.
+    drift : array_like, shape (p,), or float, optional
+        Growth of the variance of each number in one block: random walk within a window. May be set anew at any time.
     overdispersion : float
         Where learning starts.
     settle_s : float
@@ -131,6 +136,7 @@ class ChangeDetector:
     names, hypotheses : tuple of str
     threshold : float
         Of T_j.
+    drift : ndarray, shape (p,)
     windows : tuple of int
         Lengths, blocks.
     overdispersion : ndarray, shape (n_windows, n_hypotheses + 2)
@@ -179,8 +185,7 @@ class ChangeDetector:
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
         self._rows = np.zeros((5, max(p + 1, tests, 10)))
-        if drift is not None:
-            self._rows[0, :p] = np.broadcast_to(np.asarray(drift, dtype=float), (p,))
+        self.drift = np.zeros(p) if drift is None else drift
         self._state = np.array([math.log(overdispersion), 0.0, _GAIN, _NOISE_GAIN, float(longest), 1.0])
         self._scratch, self._result = np.zeros((4, p, p + 1)), np.zeros(10 + tests)
         self._settle, self._seen, self._from = round(settle_s / block_s), 0, -1
@@ -188,6 +193,14 @@ class ChangeDetector:
     @property
     def overdispersion(self) -> Array:  # noqa: D102
         return np.asarray(np.exp(self._learned[: len(self.windows)]))
+
+    @property
+    def drift(self) -> Array:  # noqa: D102
+        return self._rows[0, : len(self.names)].copy()
+
+    @drift.setter
+    def drift(self, value: ArrayLike) -> None:
+        self._rows[0, : len(self.names)] = value
 
     @property
     def noise(self) -> float:  # noqa: D102
@@ -265,17 +278,18 @@ class ChangeDetector:
         ranked = sorted(zip(self.hypotheses, self._result[10:].tolist(), strict=False), key=lambda item: -item[1])
         moved = code == 1.0
         others = tuple((name, value) for name, value in ranked if not moved or name != self.hypotheses[int(best)])
-        at = {1.0: (top, 0), 2.0: (joint, -2), 3.0: (rest, -1)}[code]
+        by, place = _TESTS[int(code)]
         return Alarm(
             kind="moved" if moved else "unexplained",
+            by=by,
             parameter=self.hypotheses[int(best)] if moved else None,
             onset=int(onset),
             end=end,
             blocks=int(n),
             size=size if moved else 0.0,
             sd=sd if moved else 0.0,
-            statistic=at[0],
-            threshold=float(self._marks[0, at[1]]),
+            statistic={"number": top, "all": joint, "noise": rest}[by],
+            threshold=float(self._marks[0, place]),
             rivals=tuple((name, value) for name, value in others if value > top - self._margin and value > 1.0),
             runner_up=others[0] if others else None,
             joint=joint,
