@@ -42,6 +42,7 @@ def command(
     Without --rig: the record is read as the one that the estimate came from.
     """
     from ambid.identify.blackbox.fit import BlackBoxFit
+    from ambid.job.estimates import read_estimate
 
     with Outputs(estimate, record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
@@ -100,44 +101,6 @@ def _judged_fit(
     same_bench(known.units, known.dt, data)
     found = validation(known, data)
     return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
-
-
-def read_estimate(path: Path) -> Estimate | BlackBoxFit:
-    """Read an estimate or a black-box fit from its file.
-
-    Parameters
-    ----------
-    path : Path
-        JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
-
-    Returns
-    -------
-    Estimate or BlackBoxFit
-
-    Raises
-    ------
-    EstimationError
-        If the file cannot be read, is no JSON or no estimate.
-    """
-    from ambid.identify.blackbox.fit_file import SCHEMA, fit_from_json
-    from ambid.identify.estimate_file import estimate_from_json
-    from ambid.record.files import file_bytes, utf8_text
-
-    text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
-    try:
-        document = json_format.loads(text)
-    except json_format.JSONDecodeError as failure:
-        raise EstimationError(
-            f"estimate {path}, row {failure.lineno}: not JSON ({failure.msg}). Give what 'ambid identify --json' wrote"
-        ) from None
-    except (RecursionError, ValueError):
-        raise EstimationError(
-            f"estimate {path} is nested too deep, or holds a number that is too long. "
-            "Give what 'ambid identify --json' wrote"
-        ) from None
-    if isinstance(document, dict) and document.get("schema") == SCHEMA:
-        return fit_from_json(document, f"fit {path}")
-    return estimate_from_json(document, f"estimate {path}")
 
 
 def _rig_of(estimate: Estimate, path: Path, rig: Path | None) -> Rig:

@@ -8,7 +8,7 @@ unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,22 +70,6 @@ class Evidence:
         ndarray, shape (p,)
         """
         return np.asarray(self.r + self.J @ (q - self.at))
-
-    def without(self, places: NDArray[np.int64]) -> Evidence:
-        """Return what the block says if some numbers are known to be as at the linearisation.
-
-        Parameters
-        ----------
-        places : ndarray of int, shape (n_places,)
-
-        Returns
-        -------
-        Evidence
-            With zero columns for these numbers.
-        """
-        J = self.J.copy()
-        J[:, places] = 0.0
-        return replace(self, J=J)
 
     def loss(self, q: Array) -> float:
         """Return the sum of squared weighted innovations at `q`, to second order around `at`.

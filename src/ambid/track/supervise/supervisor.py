@@ -18,6 +18,7 @@ from ambid.track.lines import Event, State, TrackedValue
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples, Samples
+from ambid.track.physical.synchronous import amplitude_and_phase
 from ambid.track.supervise.change import Alarm, ChangeDetector
 from ambid.track.supervise.excitation import ExcitationMonitor
 from ambid.track.supervise.gate import Gate
@@ -85,7 +86,6 @@ class Supervisor:
         self.rpem, self.operator, self._t0 = rpem, operator or Operator(), t0
         self._rate = numbers.rate_hz
         own, kinds = numbers.places("parameter"), np.array(numbers.kinds)
-        self._gains = kinds == "gain"
         sd = np.sqrt(np.diag(numbers.covariance))
         imperfect = numbers.overdispersion
         self._detector = ChangeDetector(
@@ -100,6 +100,7 @@ class Supervisor:
         self._excitation = ExcitationMonitor(
             numbers.names,
             reference_rate={numbers.names[j]: 1.0 / (sd[j] ** 2 * numbers.information_s) for j in own},
+            held=[n for n, kind in zip(numbers.names, kinds, strict=True) if kind == "gain"],
             block_s=block_s,
             window_s=max(1.0, 4 * block_s),
         )
@@ -134,7 +135,21 @@ class Supervisor:
         """Published numbers beside the parameters: gains of sensors once they are found to have changed, unbalance."""
         numbers = self.rpem.numbers
         found = {k: v for k, v in self._published("gain").items() if self.rpem.filter.active[numbers.names.index(k)]}
-        return found | self._published("unbalance")
+        return found | self._unbalance()
+
+    def _unbalance(self) -> dict[str, TrackedValue]:
+        numbers, accepted = self.rpem.numbers, self.gate.accepted
+        if not numbers.synchronous:
+            return {}
+        at = numbers.places("unbalance")
+        size = numbers.magnitude[at]
+        a, b = (accepted.values[at] * size).tolist()
+        covariance = accepted.covariance[np.ix_(at, at)] * np.outer(size, size)
+        amplitude, sd, phase, phase_sd = amplitude_and_phase(a, b, covariance)
+        return {
+            "unbalance": TrackedValue(value=amplitude, sd=sd),
+            "unbalance_phase": TrackedValue(value=phase, sd=phase_sd),
+        }
 
     def _published(self, kind: str) -> dict[str, TrackedValue]:
         numbers, accepted = self.rpem.numbers, self.gate.accepted
@@ -200,8 +215,7 @@ class Supervisor:
     def _take(self, evidence: Evidence) -> None:
         """Judge a block, use it, and judge what came of it."""
         rpem, t = self.rpem, self._t0 + evidence.last / self._rate
-        held = np.flatnonzero(~rpem.filter.active & self._gains)
-        for event in self._excitation.update(evidence.without(held), t):
+        for event in self._excitation.update(evidence, t):
             self.log.add(event)
         self._activate()
         rpem.predict()

@@ -1,0 +1,52 @@
+"""Estimates and fits as they come from files: one reader for every job that goes on from one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Estimate
+
+if TYPE_CHECKING:
+    from ambid.identify.blackbox.fit import BlackBoxFit
+
+
+def read_estimate(path: str | Path) -> Estimate | BlackBoxFit:
+    """Read an estimate or a black-box fit from its file.
+
+    Parameters
+    ----------
+    path : str or Path
+        JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
+
+    Returns
+    -------
+    Estimate or BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        If the file cannot be read, is no JSON or no estimate.
+    """
+    from ambid.identify.blackbox.fit_file import SCHEMA, fit_from_json
+    from ambid.identify.estimate_file import estimate_from_json
+    from ambid.record.files import file_bytes, utf8_text
+
+    path = Path(path)
+    text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as failure:
+        raise EstimationError(
+            f"estimate {path}, row {failure.lineno}: not JSON ({failure.msg}). Give what 'ambid identify --json' wrote"
+        ) from None
+    except (RecursionError, ValueError):
+        raise EstimationError(
+            f"estimate {path} is nested too deep, or holds a number that is too long. "
+            "Give what 'ambid identify --json' wrote"
+        ) from None
+    if isinstance(document, dict) and document.get("schema") == SCHEMA:
+        return fit_from_json(document, f"fit {path}")
+    return estimate_from_json(document, f"estimate {path}")

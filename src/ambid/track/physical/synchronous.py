@@ -1,0 +1,106 @@
+"""The forcing by unbalance, for a rotor whose angle is known: f = m e (speed^2) cos(angle + phase) (theory.md sec. 1).
+
+With a = m e cos(phase) and b = -m e sin(phase) it is a speed^2 cos(angle) + b speed^2 sin(angle): linear in a and b,
+with regressors that need no filter and follow the rotor through a spin-up. The force is held over a sample at its
+middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.record import Record
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Forcing:
+    """Regressors of the unbalance.
+
+    Attributes
+    ----------
+    columns : ndarray, shape (n_samples, 2)
+        (speed/top speed)^2 times cosine and sine of the angle, in the middle of each sample.
+    top_speed : float
+        rad/s.
+    """
+
+    columns: Array
+    top_speed: float
+
+
+def forcing_of(record: Record) -> Forcing | None:
+    """Return the regressors of a record that holds the speed or the angle of its rotor.
+
+    Parameters
+    ----------
+    record : Record
+        With a channel ``angle`` in rad, ``speed`` in rad/s, or both. An angle alone is differentiated, a speed alone
+        integrated: the phase then counts from the first sample.
+
+    Returns
+    -------
+    Forcing or None
+        None where the record holds neither, or the rotor stands still.
+
+    Raises
+    ------
+    EstimationError
+        If the speed passes half the sampling rate, where an angle says nothing of it.
+    """
+    if "angle" not in record.names and "speed" not in record.names:
+        return None
+    period = 1.0 / record.rate_hz
+    if "speed" in record.names:
+        speed = record["speed"]
+        angle = record["angle"] if "angle" in record.names else _integrated(speed, period)
+    else:
+        angle = record["angle"]
+        speed = np.gradient(np.unwrap(angle), period)
+    top = float(np.nanmax(np.abs(speed), initial=0.0))
+    if top == 0.0:
+        return None
+    if top * period > np.pi:
+        raise EstimationError(
+            f"the speed reaches {top:.4g} rad/s, more than half a turn a sample at {record.rate_hz:g} Hz."
+            " Check its unit"
+        )
+    middle = angle + 0.5 * period * speed
+    size = (speed / top) ** 2
+    return Forcing(columns=np.column_stack([size * np.cos(middle), size * np.sin(middle)]), top_speed=top)
+
+
+def _integrated(speed: Array, period: float) -> Array:
+    """Angle from the speed by the trapezium rule, 0 at the first sample."""
+    known = np.nan_to_num(speed)  # after a gap the phase is lost; the recursion finds it anew
+    return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * period)])
+
+
+def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, float, float, float]:
+    """Return the unbalance as amplitude and phase.
+
+    Parameters
+    ----------
+    a, b : float
+        m e cos(phase) and -m e sin(phase), kg m.
+    covariance : ndarray, shape (2, 2)
+        Of a and b.
+
+    Returns
+    -------
+    amplitude, amplitude_sd : float
+        kg m.
+    phase, phase_sd : float
+        rad; the standard deviation is pi where the amplitude is within its own of zero.
+    """
+    size = float(np.hypot(a, b))
+    if size == 0.0:
+        return 0.0, float(np.sqrt(covariance.trace() / 2)), 0.0, float(np.pi)
+    along, across = np.array([a, b]) / size, np.array([b, -a]) / size
+    sd, turned = float(np.sqrt(along @ covariance @ along)), float(np.sqrt(across @ covariance @ across)) / size
+    return size, sd, float(np.arctan2(-b, a)), min(turned, float(np.pi))

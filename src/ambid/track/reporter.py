@@ -1,0 +1,202 @@
+"""From samples to lines: feeds the supervisor, and reports once in every reporting interval.
+
+Intervals are counted from the beginning of the stream, so that lines come at the same times whatever the blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.track.physical.signals import Samples
+from ambid.track.supervise.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ambid.track.lines import Latency
+    from ambid.track.stream.outcome import Rejection
+
+
+_EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
+
+
+class Reporter:
+    """Feeds a supervisor and makes lines of what it says.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+        Its `log` calls `Reporter.note`.
+    every_s : float
+        Reporting interval, s.
+    on_line : callable
+        Called with each line; may return flags that an operator set.
+    flags : sequence of (float, str)
+        What an operator sets and when, s of record.
+    t0 : float
+        Time of sample 0, s of record.
+    first : int
+        Number of the first sample that is tracked.
+
+    Attributes
+    ----------
+    lines, samples, rejected : int
+        Lines made, samples used, samples rejected.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        *,
+        every_s: float,
+        on_line: Callable[[TrackLine], Sequence[str] | None],
+        flags: Sequence[tuple[float, str]] = (),
+        t0: float = 0.0,
+        first: int = 0,
+    ) -> None:
+        self.supervisor, self._on_line, self._t0 = supervisor, on_line, t0
+        self._rate = supervisor.rpem.numbers.rate_hz
+        self._every = max(1, round(every_s * self._rate))
+        self._next = (first // self._every + 1) * self._every
+        self._flags = sorted(flags)
+        self._events: list[Event] = []
+        self.lines = self.samples = self.rejected = 0
+
+    def note(self, event: Event) -> None:
+        """Keep an event for the next line.
+
+        Parameters
+        ----------
+        event : Event
+        """
+        self._events.append(event)
+
+    def consume(self, samples: Samples, first: int, *, restart: bool = False) -> None:
+        """Take in consecutive samples and make the lines that they complete.
+
+        Parameters
+        ----------
+        samples : Samples
+            Finite.
+        first : int
+            Number of the first one.
+        restart : bool
+            Samples are missing before it.
+        """
+        self._skip_to(first)
+        k, n = 0, samples.y.shape[0]
+        while k < n:
+            stop = min(n, self._next - first)
+            self.supervisor.feed(samples.part(k, stop), first + k, restart=restart and k == 0)
+            self.samples += stop - k
+            k = stop
+            if first + k == self._next:
+                self._report()
+
+    def reject(self, rejection: Rejection) -> None:
+        """Count samples that were not used, and say so.
+
+        Parameters
+        ----------
+        rejection : Rejection
+        """
+        self.rejected += rejection.samples
+        self.supervisor.log.add(
+            Event(
+                kind="rejected",
+                t=self._t0 + rejection.t,
+                why=f"{rejection.kind}: {rejection.why}",
+                samples=rejection.samples,
+            )
+        )
+
+    def finish(self) -> None:
+        """Report what has happened since the last line."""
+        if self._events:
+            self._report()
+
+    def _skip_to(self, first: int) -> None:
+        """Pass over intervals in which nothing came: a stream's gap has no lines."""
+        while self._next <= first:
+            self._next += self._every
+
+    def _report(self) -> None:
+        s, t = self.supervisor, self._t0 + self._next / self._rate
+        while self._flags and self._flags[0][0] <= t:
+            s.order(self._flags.pop(0)[1])
+        events, self._events = tuple(self._events), []
+        error = s.level.error
+        line = TrackLine(
+            t=t,
+            parameters=s.parameters,
+            error=error if np.isfinite(error) else 1.0,
+            state=s.state,
+            events=events,
+            extra=s.extra,
+        )
+        self._next += self._every
+        self.lines += 1
+        for flag in self._on_line(line) or ():
+            s.order(flag)
+
+    def summary(self, *, computing_s: float, latency: Latency | None = None, complete: bool = True) -> TrackSummary:
+        """Return the last line.
+
+        Parameters
+        ----------
+        computing_s : float
+        latency : Latency, optional
+        complete : bool
+            Whether the run came to the end of its record.
+
+        Returns
+        -------
+        TrackSummary
+        """
+        s = self.supervisor
+        return TrackSummary(
+            samples=self.samples,
+            seconds_of_record=self.samples / self._rate,
+            computing_s=computing_s,
+            updates=s.updates,
+            rejected_samples=self.rejected,
+            changes=tuple(s.changes),
+            counts=s.log.counts,
+            latency=latency,
+            complete=complete,
+        )
+
+
+def header(
+    supervisor: Supervisor, *, limit: float, every_s: float, method: str, record: Mapping[str, object]
+) -> TrackHeader:
+    """Return the first line of a track.
+
+    Parameters
+    ----------
+    supervisor : Supervisor
+        Before its first sample.
+    limit : float
+    every_s : float
+    method : str
+    record : Mapping[str, object]
+
+    Returns
+    -------
+    TrackHeader
+    """
+    numbers = supervisor.rpem.numbers
+    start: dict[str, TrackedValue] = supervisor.parameters
+    units = dict(zip(numbers.names, numbers.units, strict=True))
+    return TrackHeader(
+        rate_hz=numbers.rate_hz,
+        limit=limit,
+        method=method,
+        model=numbers.problem.model.name,
+        units={**{name: units[name] for name in start}, **_EXTRA_UNITS},
+        every_s=every_s,
+        start=start,
+        record=record,
+    )
