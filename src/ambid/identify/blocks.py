@@ -188,9 +188,15 @@ def three_blocks(
     unit = np.array([i / v, 1.0, i / x, 1.0, x / i, 1.0])
     coefficients = np.concatenate([coil.theta, rotor.theta]) * unit
     covariance *= np.outer(unit, unit)
-    settled = coil_settled and rotor_settled
-    warnings = _warnings(doubt, coefficients, covariance, data.dt, settled, open_loop or reference is not None)
-    return _result(coefficients, covariance, {"current": coil.fit, "position": rotor.fit}, doubt, settled, warnings)
+    return blocks_of(
+        coefficients,
+        covariance,
+        data.dt,
+        fit={"current": coil.fit, "position": rotor.fit},
+        doubt=doubt,
+        settled=coil_settled and rotor_settled,
+        safe=open_loop or reference is not None,
+    )
 
 
 def _data(
@@ -269,14 +275,45 @@ def _warnings(
     return tuple(out)
 
 
-def _result(
+def blocks_of(
     coefficients: Array,
     covariance: Array,
+    dt: float,
+    *,
     fit: Mapping[str, float],
     doubt: Mapping[str, float],
     settled: bool,
-    warnings: tuple[str, ...],
+    safe: bool,
+    remarks: tuple[str, ...] = (),
 ) -> ThreeBlocks:
+    """Say what estimated coefficients mean: parameters with their spread, and what there is to warn of.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (6,)
+        K_a, a, K_b, b, K_c, c.
+    covariance : ndarray, shape (6, 6)
+        Of them.
+    dt : float
+        Sampling period, s.
+    fit, doubt : Mapping[str, float]
+        `ThreeBlocks.fit` and `ThreeBlocks.first_order`.
+    settled : bool
+        Whether the search converged.
+    safe : bool
+        Whether feedback cannot have biased them.
+    remarks : tuple of str, optional
+        Further warnings.
+
+    Returns
+    -------
+    ThreeBlocks
+
+    Raises
+    ------
+    EstimationError
+        If the coefficients are not finite.
+    """
     if not np.all(np.isfinite(coefficients)) or coefficients[0] == 0:
         raise EstimationError("three blocks: no finite coefficients fit this record. Check the columns and their units")
     sd = np.sqrt(np.maximum(np.diag(covariance), 0))
@@ -291,6 +328,7 @@ def _result(
         )
         for k, name in enumerate("abc")
     }
+    warnings = _warnings(doubt, coefficients, covariance, dt, settled, safe) + remarks
     values, slope = block_parameters(coefficients)
     spread = slope @ covariance @ slope.T
     parameters = {

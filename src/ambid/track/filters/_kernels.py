@@ -39,8 +39,8 @@ def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
         begun, x = _begin(y, out, j, state[j, 0], first)
         missing += begun
         for k in range(begun, y.shape[0]):
+            v = y[k, j]  # before out, which may be the same array
             out[k, j] = x
-            v = y[k, j]
             if isfinite(v):
                 x = decay * x + forward * v
             else:
@@ -64,8 +64,8 @@ def riccati_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
         S = state[j, 1]
         missing += begun
         for k in range(begun, y.shape[0]):
+            v = y[k, j]  # before out, which may be the same array
             out[k, j] = x
-            v = y[k, j]
             if isfinite(v):
                 short = 1.0 / (1.0 - a * t + g * S * t)
                 level = v * per_c  # the state that this sample points to, held

@@ -50,6 +50,7 @@ class StreamingFilter:
         self.n_samples = 0
         self.n_missing = 0
         self._state = np.ascontiguousarray(state, dtype=np.float64)
+        self._begun = self._state.copy()
         self._constants = np.ascontiguousarray(constants, dtype=np.float64)
         self._scan: Scan = getattr(_kernels, scan)
         self._one, self._one_out = np.empty((1, channels)), np.empty((1, channels))
@@ -87,6 +88,36 @@ class StreamingFilter:
         self.n_missing += self._scan(block, out, self._state, self._constants)
         self.n_samples += block.shape[0]
         return float(out[0, 0]) if given.ndim == 0 else out.reshape(given.shape)
+
+    def run(self, block: Array, out: Array) -> None:
+        """Filter a block without looking at its shape or allocating anything.
+
+        Parameters
+        ----------
+        block, out : ndarray, shape (n_samples, channels), C order, writeable
+            Measured and, on return, filtered; may be one array.
+        """
+        self.n_missing += self._scan(block, out, self._state, self._constants)
+        self.n_samples += block.shape[0]
+
+    def anew(self, channels: int) -> Self:
+        """Return a filter of the same numbers that has seen nothing yet.
+
+        Parameters
+        ----------
+        channels : int
+            All begin as the first channel of this one did.
+
+        Returns
+        -------
+        StreamingFilter
+        """
+        other = copy(self)
+        other.channels, other.n_samples, other.n_missing = channels, 0, 0
+        other._begun = np.tile(self._begun[:1], (channels, 1))
+        other._state = other._begun.copy()
+        other._one, other._one_out = np.empty((1, channels)), np.empty((1, channels))
+        return other
 
     def copy(self) -> Self:
         """Return an independent filter in the same state.
