@@ -17,7 +17,7 @@ Table = NDArray[np.int64]
 # of `meta`: sizes; where filters of inputs, residual, gradients and unknown states end; where the other tables begin
 _N, _NU, _LONGEST, _INPUT, _RESIDUAL, _GRADIENT, _STATES, _TERMS, _COLUMNS, _STABLE, _N_STABLE, _V, _E, _W = range(14)
 _POS, _FILL, _RINGING, _USED, _REJECTED, _WAITED, _PROJECTED, _HELD, _LEARNT, _HOLD = range(10)  # of `count`
-_FORGET, _FINAL, _GROWTH, _SQUARES, _WEIGHT, _LEVELS = range(6)  # of `real`
+_FORGET, _FINAL, _GROWTH, _SQUARES, _WEIGHT, _NOISE, _LEVELS = range(7)  # of `real`
 _FIRST = 2  # free coefficient
 
 _RADIUS = 0.99999  # roots of C and F stay inside
@@ -199,7 +199,9 @@ def _learn(
     for j in range(theta.size):
         e -= psi[j] * (theta[j] - coef[_FIRST + j])
     if count[_LEARNT] % _EVERY == 0 and real[_FINAL] < 1.0:
-        count[_HOLD] = int(_grown(UD, limit, real[_SQUARES] / real[_WEIGHT]))
+        # not less than at the start: a signal that stands still has no noise, and its P would grow without end
+        variance = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE])
+        count[_HOLD] = int(_grown(UD, limit, variance))
     forget = real[_FORGET]
     if count[_HOLD]:
         forget = 1.0

@@ -100,9 +100,7 @@ class RecursivePolynomial:
         first = max(500, 100 * layout.free.size) if burn_in is None else burn_in
         if first < need:
             raise EstimationError(f"{structure}: burn_in = {first} samples; at least {need} are needed. Raise it")
-        memory = 1.0 / max(1.0 - self._forgetting.final, 1e-12)
-        last = first * int(np.clip(memory / first, 1, _REFITTED))  # equal weights only inside the memory
-        self._window = Window(first=first, last=last, n_inputs=n_u)
+        self._window = Window(first=first, last=first * _REFITTED, n_inputs=n_u)
 
     @classmethod
     def from_fit(
@@ -153,10 +151,11 @@ class RecursivePolynomial:
         self._arrays = ()
         self._one = (np.zeros((1, self._n_u)), np.zeros(1), np.zeros(1))
         self._start: Array = who.layout.start()
+        self._doubtful = False
         self._rejected_before = self._used_before = self._failed_starts = 0
 
     def _begin(self, fit: BlackBoxFit, samples: int | None) -> None:
-        self._start = fit.model.theta
+        self._start, self._doubtful = fit.model.theta, fit.status != "converged"
         state = state_from_fit(fit, self._who.layout, self._forgetting, samples=samples)
         self._state, self._arrays = state, state.arrays()
 
@@ -226,7 +225,7 @@ class RecursivePolynomial:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return warnings_of(self._who, self._state, open_loop=self._open_loop)
+        return warnings_of(self._who, self._state, open_loop=self._open_loop, doubtful=self._doubtful)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -311,11 +310,11 @@ class RecursivePolynomial:
             self._begin_anew(fit, window)
         elif self._state is None:
             self._failed_starts += 1
-        if not window.grow():
-            if self._state is None:
-                self._used_before += window.drop_half()
-            else:
-                self._window = None
+        grown = window.grow()
+        if self._state is None and not grown:
+            self._used_before += window.drop_half()
+        elif self._state is not None and not (grown and window.target <= self._forgetting.memory):
+            self._window = None  # later samples would count more than these
 
     def _begin_anew(self, fit: BlackBoxFit, window: Window) -> None:
         """Go on from an off-line fit of all samples so far."""

@@ -58,7 +58,7 @@ def offsets_of(model: PolynomialModel, state: State) -> Offsets:
     return Offsets(u=centre[1:], y=centre[:1])
 
 
-def warnings_of(who: Identity, state: State | None, *, open_loop: bool) -> tuple[str, ...]:
+def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful: bool) -> tuple[str, ...]:
     """Return what a reader of the estimate has to know.
 
     Parameters
@@ -68,6 +68,8 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool) -> tuple
         None where there is no estimate yet.
     open_loop : bool
         Whether the user says that no feedback is at work.
+    doubtful : bool
+        Whether the fit with which it began did not converge.
 
     Returns
     -------
@@ -76,6 +78,11 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool) -> tuple
     name, found = who.structure, []
     if state is None:
         found.append(f"{name}: the first window is not full: there is no estimate yet")
+    if doubtful:
+        found.append(
+            f"{name}: the search for the first estimate did not converge: standard deviations are not to be trusted. "
+            "Lower the orders, or begin with a fit that did"
+        )
     if structure(name).feedback == "biased" and not open_loop:
         found.append(
             f"{name} is biased where a controller is at work, and nothing says that this loop is open: use bj or "

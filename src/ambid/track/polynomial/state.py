@@ -48,6 +48,11 @@ class Forgetting:
                 raise EstimationError(f"forgetting: {name} = {value}; it must be above 0 and at most 1. Correct it")
 
     @property
+    def memory(self) -> float:
+        """Samples of about the same weight, in the long run."""
+        return float("inf") if self.final == 1.0 else 1.0 / (1.0 - self.final)
+
+    @property
     def forgets(self) -> bool:
         """Whether any sample loses weight."""
         return self.final < 1.0 or (self.first is not None and self.first < 1.0)
@@ -61,8 +66,8 @@ class State:
     ----------
     plan, meta, count : ndarray of int
         See `plan` and `_kernels`.
-    real : ndarray, shape (6 + n_inputs,)
-        Forgetting factors, squared errors and their weight, levels that are taken off.
+    real : ndarray, shape (7 + n_inputs,)
+        Forgetting factors, squared errors and their weight, noise variance of the start, levels that are taken off.
     theta : ndarray, shape (n,)
         Estimate: free coefficients, then the constant.
     coef : ndarray, shape (2 + n,)
@@ -104,7 +109,7 @@ class State:
     @property
     def levels(self) -> Array:
         """What is taken off output and inputs, shape (1 + n_inputs,)."""
-        return self.real[5:]
+        return self.real[6:]
 
     def counts(self) -> dict[str, int]:
         """Return how many samples were used, rejected, waited, projected and held.
@@ -187,7 +192,7 @@ def new_state(
         meta=plan.meta,
         count=count,
         real=np.concatenate(
-            [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight], np.asarray(centre)]
+            [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight, noise_variance], centre]
         ),
         theta=theta.copy(),
         coef=np.concatenate([[1.0, -1.0], theta]),

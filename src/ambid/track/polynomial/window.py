@@ -124,7 +124,7 @@ class Window:
         Returns
         -------
         BlackBoxFit or None
-            None where the search did not converge, or the window does not hold what it needs.
+            None where the window does not hold what it needs, or the search did not converge and more samples may help.
         """
         try:
             data = IOData(
@@ -142,8 +142,9 @@ class Window:
                 found = _fit_near(who, data, near)
         except EstimationError:
             return None
-        usable = found.status == "converged" and float(found.noise_covariance[0, 0]) > 0.0
-        return found if usable else None
+        last_resort = near is None and self.filled == self.y.size
+        usable = found.status == "converged" or last_resort
+        return found if usable and float(found.noise_covariance[0, 0]) > 0.0 else None
 
 
 def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
