@@ -96,11 +96,24 @@ def advance_nonlinear(
 
 @njit(cache=True, nogil=True)
 def advance_linear(
-    x: Array, centre: Array, late: float, now: float, disturbance: Array, a: Array, b: Array, b_late: Array, e: Array
+    x: Array,
+    centre: Array,
+    late: float,
+    now: float,
+    disturbance: Array,
+    a: Array,
+    b: Array,
+    b_late: Array,
+    e: Array,
+    deviation: Array,
 ) -> None:
-    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations."""
+    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations.
+
+    `deviation` (n_states,) is room to work in.
+    """
     n = x.size
-    deviation = x - centre
+    for row in range(n):
+        deviation[row] = x[row] - centre[row]
     for row in range(n):
         s = centre[row] + b[row] * now + b_late[row] * late
         for column in range(n):
@@ -151,7 +164,7 @@ def run(
     n, ny = sensor_noise.shape
     measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))
     contact, saturated, n_saturated = -1, -1, 0
-    x = start.copy()
+    x, room = start.copy(), np.empty(start.size)
     at, current_at = roles
     integral = derivative = last = 0.0
     low, high, step = input_limits
@@ -183,7 +196,7 @@ def run(
         now = command[k - delay] if k >= delay else centre_input
         late = command[k - delay - 1] if k > delay else centre_input
         if linear:
-            advance_linear(x, centre, late - centre_input, now - centre_input, disturbance[k], a, b, b_late, e)
+            advance_linear(x, centre, late - centre_input, now - centre_input, disturbance[k], a, b, b_late, e, room)
             touched = False
             if at >= 0:
                 x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])

@@ -23,13 +23,17 @@ def drawn_noise(
 ) -> tuple[Array, Array]:
     """Return sensor noise (n, n_outputs) and disturbances (n, n_disturbances), in SI units."""
     # All columns are drawn whatever their size, so that one level changed leaves the others' numbers as they were.
-    rng = np.random.default_rng(seed)
+    rng, size = np.random.default_rng(seed), noise_sizes(of, noise, rate_hz)
+    drawn = rng.standard_normal((n, size.size)) * size
+    outputs = len(of.outputs)
+    return np.ascontiguousarray(drawn[:, :outputs]), np.ascontiguousarray(drawn[:, outputs:])
+
+
+def noise_sizes(of: LinearModel, noise: Noise, rate_hz: float) -> Array:
+    """Return the rms of the noise of outputs, then disturbances (held over a sample), in SI units."""
     force, voltage = noise.held_rms(rate_hz)
     size = {"force": force, "voltage": voltage, "position": noise.position, "current": noise.current}
-    drawn = rng.standard_normal((n, len(of.outputs) + len(of.disturbances)))
-    sensor = drawn[:, : len(of.outputs)] * [size[o] for o in of.outputs]
-    disturbance = drawn[:, len(of.outputs) :] * [size[d] for d in of.disturbances]
-    return np.ascontiguousarray(sensor), np.ascontiguousarray(disturbance)
+    return np.array([size[name] for name in (*of.outputs, *of.disturbances)])
 
 
 def logged(

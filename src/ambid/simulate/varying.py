@@ -19,7 +19,7 @@ from ambid.errors import ModelError
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.nonlinear import OperatingPoint
 from ambid.record.record import Channel
-from ambid.simulate._logging import drawn_noise, logged, written
+from ambid.simulate._logging import logged, noise_sizes, written
 from ambid.simulate._varying_tables import Tables
 from ambid.simulate.bench import Simulation
 from ambid.simulate.plant import LinearPlant, Standing
@@ -129,6 +129,8 @@ class VaryingLoop:
         self._x, self._memory, self._counts = at_rest.copy(), np.zeros(3), np.array([0, -1, -1, 0])
         self._line = np.full(whole + 2, self.standing.centre_input)
         self._over = 0
+        self._sizes = noise_sizes(of, self.noise, rate_hz)
+        self._force_column = of.disturbances.index("force") if "force" in of.disturbances else -1
         self._input: str = of.inputs[0]
         goal = self.standing.point.position if setpoint is None else float(setpoint)
         self._settings = np.array([self.standing.centre_input, goal])
@@ -198,14 +200,14 @@ class VaryingLoop:
         """
         of, n, first = self.standing.model, excitation.size, self.n_done
         pieces = self.tables.pieces(first, first + n)
-        sensor, disturbance = drawn_noise(of, self.noise, n, self.rate_hz, self._rng)
-        speed, angle = self._add_loads(disturbance, first)
+        noise = self._rng.standard_normal((n, self._sizes.size))  # in the order in which `simulate` draws
+        force, speed, angle = self._loads(first, n)
         measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, len(of.states)))
         lost = self._run(
-            np.ascontiguousarray(excitation, dtype=np.float64), sensor, disturbance, pieces.edges, pieces.A, pieces.B,
-            pieces.B_late, pieces.E, pieces.gains, self._x, self._memory, self._line, self._counts,
-            self.standing.centre, self._settings, self._outputs, self._roles, self._gains, self._resolution,
-            self._ends, measured, command, states,
+            np.ascontiguousarray(excitation, dtype=np.float64), noise, self._sizes, force, self._force_column,
+            pieces.edges, pieces.A, pieces.B, pieces.B_late, pieces.E, pieces.gains, self._x, self._memory, self._line,
+            self._counts, self.standing.centre, self._settings, self._outputs, self._roles, self._gains,
+            self._resolution, self._ends, measured, command, states,
         )  # fmt: skip
         if lost >= 0:
             raise ModelError(
@@ -219,29 +221,27 @@ class VaryingLoop:
             self._over += int(np.count_nonzero((i < low) | (i > high)))
         lengths = np.diff(pieces.edges)
         truth = {name: np.repeat(values, lengths) for name, values in pieces.theta.items()}
-        truth.update(self._loads(first, n))
+        truth.update(self._true_loads(first, n))
         return Stretch(
             first=first, command=command, measured=measured, states=states, speed=speed, angle=angle,
             truth=MappingProxyType(truth),
         )  # fmt: skip
 
-    def _add_loads(self, disturbance: Array, first: int) -> tuple[Array | None, Array | None]:
-        """Add load and unbalance to the process noise in place; return speed and angle at the sampling instants."""
-        v = self.variation
+    def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None]:
+        """Return load and unbalance over each sample (empty for none), and speed and angle at the sampling instants."""
+        v, rate = self.variation, self.rate_hz
         if v.force is None and v.unbalance is None:
-            return None, None
-        column = disturbance[:, self.standing.model.disturbances.index("force")]
-        instants = first + np.arange(column.size, dtype=np.float64)
-        if v.force is not None:
-            column += v.force.at(instants + 0.5, self.rate_hz)
+            return np.empty(0), None, None
+        instants = first + np.arange(n, dtype=np.float64)
+        force = np.zeros(n) if v.force is None else v.force.at(instants + 0.5, rate)
         if v.unbalance is None:
-            return None, None
-        u, rate = v.unbalance, self.rate_hz
+            return force, None, None
+        u = v.unbalance
         middle = u.speed.at(instants + 0.5, rate)
-        column += u.moment * middle**2 * np.cos(u.speed.integral(instants + 0.5, rate) + u.phase)
-        return u.speed.at(instants, rate), u.speed.integral(instants, rate)
+        force = force + u.moment * middle**2 * np.cos(u.speed.integral(instants + 0.5, rate) + u.phase)
+        return force, u.speed.at(instants, rate), u.speed.integral(instants, rate)
 
-    def _loads(self, first: int, n: int) -> dict[str, Array]:
+    def _true_loads(self, first: int, n: int) -> dict[str, Array]:
         v, found = self.variation, {}
         if v.force is not None:
             found["force"] = v.force.at(first + 0.5 + np.arange(n, dtype=np.float64), self.rate_hz)
