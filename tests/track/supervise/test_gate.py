@@ -202,6 +202,11 @@ def test_the_comparison_is_that_of_the_losses():
     w = stacked @ (c - a)
     assert gate.last.separation == pytest.approx(w @ w)
     assert gate.last.sd == pytest.approx(2 * np.sqrt(w @ M @ w * gate.last.scale))
+    start = gate.history[0].covariance
+    assert gate.last.claim == pytest.approx((c - a) @ np.linalg.solve(P + start, c - a))
+    whole = r @ np.linalg.solve(M, r)  # of all rows: what no change of the numbers explains is in it as well
+    beyond = r @ r - np.linalg.norm(np.linalg.qr(np.column_stack([stacked, r]), mode="r")[:5, 5]) ** 2
+    assert gate.last.misfit == pytest.approx(whole - beyond)
 
 
 def test_numbers_that_are_held_have_no_variance_and_may_stand():
@@ -211,6 +216,10 @@ def test_numbers_that_are_held_have_no_variance_and_may_stand():
     gate = Gate(P5, start=np.zeros(5), covariance=P)
     gate.propose(0.1 * np.sqrt(np.diag(P)), P, 1.0, "refined")
     assert judged(gate, np.zeros(5), rng)[0].kind == "accepted"
+    assert np.isfinite(gate.last.claim)
+    gate.propose(1e-6 * np.eye(5)[4], P, 1.0, "a number that was held")
+    assert judged(gate, np.zeros(5), rng, 20) == (None, 20)
+    assert gate.last.claim == np.inf
 
 
 def test_blocks_that_are_not_finite_are_not_used_and_wrong_shapes_refused():

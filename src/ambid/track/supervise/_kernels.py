@@ -325,3 +325,73 @@ def inform(
             fresh[j] = now
             changed += 1
     return changed
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def gather(inlet: Array, T: Array, point: Array, other: Array, s: Array) -> bool:
+    """Fold a block into `T` (p, p + 1), which is held at `point`; do nothing and return False if it is not finite.
+
+    `inlet` (p + 1, p + 1): [J r], [at .]. `other` (p, p + 1) and `s` (p + 1,) are scratch.
+    """
+    p, total = T.shape[0], 0.0
+    for i in range(p):
+        r = inlet[i, p]
+        for j in range(p):
+            a = inlet[i, j] if j >= i else 0.0
+            other[i, j] = a
+            total += a
+            r += a * (point[j] - inlet[p, j])
+        other[i, p] = r
+        total += r
+    if not math.isfinite(total):
+        return False
+    fold(T, other, s)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def weigh(T: Array, sides: Array, M: Array, X: Array, before: Array, out: Array) -> None:
+    """Compare two sets of numbers on the evidence `T` (p, p + 1) held at the first of them.
+
+    `sides` (2 p + 1, p): covariance of the first and of the second, and their difference d. `M` (p, p), `X` and
+    `before` (p, p + 1) are scratch. `out` (5,): gain in loss, |J d|^2, variance of half the gain, misfit of the first,
+    square of d over both covariances (infinite where d moves a number without variance).
+    """
+    p = T.shape[0]
+    d, growth = sides[2 * p], out[5:]
+    cross, square, claim = 0.0, 0.0, 0.0
+    for i in range(p):
+        before[i, p] = growth[i] = 0.0
+        for j in range(p):
+            before[i, j] = sides[i, j]
+    whiten(T, before, growth, M, X)
+    misfit, variance = 0.0, 0.0
+    for i in range(p):
+        w = 0.0
+        for j in range(i, p):
+            w += T[i, j] * d[j]
+        square += w * w
+        cross += w * T[i, p]
+        misfit += X[i, p] * X[i, p]
+        for j in range(i, p):
+            growth[j] += T[i, j] * w
+    for i in range(p):
+        for j in range(p):
+            variance += growth[i] * sides[i, j] * growth[j]
+    for i in range(p):  # Cholesky of the sum of both covariances, scaled to unit diagonal; d is solved on the way
+        size = sides[i, i] + sides[p + i, i]
+        if size <= 0.0 and d[i] != 0.0:
+            claim = math.inf
+        scale = M[i, i] = 1.0 / math.sqrt(size) if size > 0.0 else 0.0
+        pivot, left = 1.0, d[i] * scale
+        for j in range(i):
+            total = (sides[i, j] + sides[p + i, j]) * scale * M[j, j]
+            for k in range(j):
+                total -= X[i, k] * X[j, k]
+            X[i, j] = total * before[j, p]
+            pivot -= X[i, j] * X[i, j]
+            left -= X[i, j] * X[j, p]
+        before[i, p] = 1.0 / math.sqrt(max(pivot, 1e-10)) if scale > 0.0 else 0.0
+        X[i, p] = left * before[i, p]
+        claim += X[i, p] * X[i, p]
+    out[0], out[1], out[2], out[3], out[4] = square - 2.0 * cross, square, square + max(variance, 0.0), misfit, claim

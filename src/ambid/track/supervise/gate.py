@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,8 +55,10 @@ class Comparison:
         Standard deviation of the gain if the candidate is right up to its covariance.
     misfit : float
         Whitened square of the candidate's own residual: chi-squared with p degrees of freedom if it is right.
+    claim : float
+        Square of q - a over the sum of both covariances: whether the candidate says that something is not as accepted.
     scale : float
-        Overdispersion by which the three are to be judged, 1 or more.
+        Overdispersion by which these are to be judged, 1 or more.
     """
 
     blocks: int
@@ -64,6 +66,7 @@ class Comparison:
     separation: float
     sd: float
     misfit: float
+    claim: float
     scale: float
 
 
@@ -126,15 +129,17 @@ class Gate:
     ) -> None:
         from scipy.special import chdtri, ndtri
 
-        from ambid.track.supervise._kernels import fold, whiten
+        from ambid.track.supervise._kernels import gather, weigh
 
         if not (kept >= 2 and 1 <= blocks <= longest and probation >= 0 and 0 < level < 0.5 and 0 < back < 0.5):
             raise EstimationError("gate: kept >= 2, 1 <= blocks <= longest, levels between 0 and 0.5. Mend them")
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
-        self._fold, self._whiten = fold, whiten
+        self._gather, self._weigh = gather, weigh
         self._blocks, self._longest, self._probation = blocks, longest, probation
         p = len(self.names)
+        self._inlet, self._sides, self._out = np.zeros((p + 1, p + 1)), np.zeros((2 * p + 1, p)), np.zeros(5 + p)
+        self._scratch = (np.zeros((p, p)), np.zeros((p, p + 1)), np.zeros((p, p + 1)))
         self._z, self._z_back, self._misfit = float(-ndtri(level)), float(-ndtri(back)), float(chdtri(p, level))
         values, P = self._checked(start, covariance)
         self._history: deque[Accepted] = deque([Accepted(values=values, covariance=P, t=t, why="at the start")], kept)
@@ -208,20 +213,21 @@ class Gate:
         """
         if self._candidate is None and self._before is None:
             return None
-        if not math.isfinite(evidence.rest + evidence.r.sum() + evidence.J.sum()):
+        if not math.isfinite(evidence.rest):
             return None
+        p = len(self.names)
+        self._inlet[:p, :p], self._inlet[:p, p], self._inlet[p, :p] = evidence.J, evidence.r, evidence.at
         back = self._judge_probation(evidence, t)
         if back is not None:
             return back
         if self._candidate is None:
             return None
-        self._trial.add(evidence, self._fold)
-        if self._trial.blocks < self._blocks:
+        if not self._trial.add(evidence, self._inlet, self._gather) or self._trial.blocks < self._blocks:
             return None
         new, old = self._candidate, self.accepted
         seen = self.last = self._compare(self._trial, new, old)
         z = self._z * math.sqrt(seen.scale)
-        if self._claims(new, old) and seen.separation < (2 * z) ** 2:
+        if seen.claim > self._misfit and seen.separation < (2 * z) ** 2:
             if self._trial.blocks < self._longest:
                 return None
             return self._refuse(t, seen, "the later data cannot tell it from the accepted numbers")
@@ -280,7 +286,7 @@ class Gate:
         """Go back if the earlier numbers predict better than chance allows; looked at each time the blocks double."""
         if self._before is None:
             return None
-        self._watched.add(evidence, self._fold)
+        self._watched.add(evidence, self._inlet, self._gather)
         n = self._watched.blocks
         if n < self._next and n < self._probation:
             return None
@@ -297,35 +303,21 @@ class Gate:
 
     def _compare(self, data: _Sum, new: Accepted, old: Accepted) -> Comparison:
         """Compare two sets of numbers on evidence held at the first of them."""
-        w = data.T[:, :-1] @ (new.values - old.values)
-        r = data.T[:, -1]
-        p = r.size
-        X, before = np.empty((p, p + 1)), np.column_stack([new.covariance, np.zeros(p)])
-        self._whiten(data.T, before, np.zeros(p), np.empty((p, p)), X)
-        spread = data.T[:, :-1].T @ w
+        p, sides, out = len(self.names), self._sides, self._out
+        sides[:p], sides[p : 2 * p] = new.covariance, old.covariance
+        np.subtract(new.values, old.values, out=sides[2 * p])
+        self._weigh(data.T, sides, *self._scratch, out)
+        gain, separation, variance, misfit, claim = out[:5].tolist()
         scale = max(self.overdispersion, data.rest / data.freedom if data.freedom else 1.0)
-        square = float(w @ w)
         return Comparison(
             blocks=data.blocks,
-            gain=square - 2 * float(r @ w),
-            separation=square,
-            sd=math.sqrt(max(square + float(spread @ new.covariance @ spread), 0.0) * scale) * 2,
-            misfit=float(X[:, p] @ X[:, p]),
+            gain=gain,
+            separation=separation,
+            sd=2.0 * math.sqrt(variance * scale),
+            misfit=misfit,
+            claim=claim,
             scale=scale,
         )
-
-    def _claims(self, new: Accepted, old: Accepted) -> bool:
-        """Tell whether the candidate says, by the covariances, that something is not as accepted."""
-        d = new.values - old.values
-        var = np.diag(new.covariance) + np.diag(old.covariance)
-        if np.any(d[var <= 0] != 0):
-            return True
-        live = np.flatnonzero(var > 0)
-        if not live.size:
-            return False
-        total = (new.covariance + old.covariance)[np.ix_(live, live)] / np.sqrt(np.outer(var[live], var[live]))
-        scaled = d[live] / np.sqrt(var[live])
-        return bool(scaled @ np.linalg.lstsq(total, scaled, rcond=1e-12)[0] > self._misfit)
 
     def _accept(self, new: Accepted, t: float, why: str, seen: Comparison | None) -> Event:
         """Put the candidate in force, and the numbers before it on trial."""
@@ -372,13 +364,13 @@ class _Sum:
         self.T[:, -1] += self.T[:, :-1] @ (at - self.at)
         self.at = at
 
-    def add(self, evidence: Evidence, fold: object) -> None:
-        self.other[:, :-1] = evidence.J
-        self.other[:, -1] = evidence.residual(self.at)
-        fold(self.T, self.other, self.scratch)  # type: ignore[operator]
+    def add(self, evidence: Evidence, inlet: Array, gather: Callable[..., bool]) -> bool:
+        if not gather(inlet, self.T, self.at, self.other, self.scratch):
+            return False
         self.rest += evidence.rest
         self.freedom += evidence.freedom
         self.blocks += 1
+        return True
 
 
 def _numbers(seen: Comparison) -> str:
