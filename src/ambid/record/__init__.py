@@ -8,9 +8,10 @@ from pathlib import Path
 from ambid.errors import RecordError
 from ambid.record.csv_format import read_csv, write_csv
 from ambid.record.record import Channel, Record, Step
+from ambid.record.rows import Rows, read_rows
 from ambid.record.sampling import GapPolicy
 
-__all__ = ["Channel", "GapPolicy", "Record", "Step", "read_record", "write_record"]
+__all__ = ["Channel", "GapPolicy", "Record", "Rows", "Step", "read_record", "read_rows", "write_record"]
 
 
 def read_record(

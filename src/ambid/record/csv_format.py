@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,7 +18,7 @@ from ambid.errors import RecordError, UnitError
 from ambid.record._csv_text import Header, data_rows, find_header, read_values
 from ambid.record.files import file_bytes, gunzipped, sha256_of, utf8_text
 from ambid.record.record import Array, Channel, Record, Step
-from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly
+from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly, usual_rate
 from ambid.units import UNKNOWN, Unit, nearest_unit, parse_unit
 
 _TIME_NAMES = ("time", "t")
@@ -46,8 +47,52 @@ def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy 
     RecordError
         If the file or one of its rows breaks a rule of the format.
     """
-    path = Path(path)
     check_gap_policy(gaps)
+    content = _content(Path(path), gaps)
+    sampled = sample_uniformly(content.table, rate_hz, gaps)
+    return _record(content, sampled.values, sampled.rate_hz, sampled.start_s, sampled.steps)
+
+
+def read_csv_rows(path: str | Path, *, rate_hz: float | None = None) -> tuple[Record, Array | None]:
+    """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.rows`).
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in ``.gz`` if it is gzipped.
+    rate_hz : float, optional
+        Sampling rate in Hz, for a file without a column ``time [s]``.
+
+    Returns
+    -------
+    record : Record
+        NaN where a value is missing; the rate is that of the usual interval.
+    time_s : ndarray, shape (n_rows,), or None
+        The time column, s; None if there is none.
+
+    Raises
+    ------
+    RecordError
+        If a row breaks the format otherwise, or the rate is neither given nor found.
+    """
+    content = _content(Path(path), "cut")
+    rate, start_s = usual_rate(content.table, rate_hz)
+    time = content.table.time
+    record = _record(content, content.table.values, rate, start_s, ())
+    return record, None if time is None else content.table.values[:, time].copy()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Content:
+    """A file taken apart: its numbers, its header, and where they come from."""
+
+    table: Table
+    header: Header
+    provenance: dict[str, str]
+
+
+def _content(path: Path, gaps: GapPolicy) -> _Content:
+    """Read the header and the numbers, time in s."""
     data = file_bytes(path)
     provenance = {"file": path.name, "sha256": sha256_of(data)}
     if path.suffix.lower() == ".gz":
@@ -61,29 +106,33 @@ def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy 
     header = find_header(lines, path)
     if header.comments:
         provenance["comment"] = "\n".join(header.comments)
-    body = data_rows(lines, header.row, path, MIN_SAMPLES)
-    values = read_values(body, header, path, gaps)
+    values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     time, time_unit = _time_column(header, path)
     if time is not None and time_unit is not None:
         values[:, time] = time_unit.to_si(values[:, time])
     table = Table(where=str(path), names=header.names, values=values, first_row=header.row + 1, time=time)
-    sampled = sample_uniformly(table, rate_hz, gaps)
-    settings: dict[str, object] = {"format": "csv", "rows": len(body)}
+    return _Content(table=table, header=header, provenance=provenance)
+
+
+def _record(content: _Content, values: Array, rate_hz: float, start_s: float, steps: tuple[Step, ...]) -> Record:
+    """Make the record of all columns but time."""
+    header, table = content.header, content.table
+    settings: dict[str, object] = {"format": "csv", "rows": table.values.shape[0]}
     if header.delimiter != ",":
         settings["delimiter"] = header.delimiter
     channels = tuple(
-        column_channel(name, unit_text, sampled.values[:, j])
+        column_channel(name, unit_text, values[:, j])
         for j, (name, unit_text) in enumerate(zip(header.names, header.unit_texts, strict=True))
-        if j != time
+        if j != table.time
     )
     if not channels:
-        raise RecordError(f"{path} has a time column and nothing else; a record needs a channel. Add a column")
+        raise RecordError(f"{table.where} has a time column and nothing else; a record needs a channel. Add a column")
     return Record(
-        rate_hz=sampled.rate_hz,
-        start_s=sampled.start_s,
+        rate_hz=rate_hz,
+        start_s=start_s,
         channels=channels,
-        history=(Step(name="read", settings=MappingProxyType(settings)), *sampled.steps),
-        provenance=MappingProxyType(provenance),
+        history=(Step(name="read", settings=MappingProxyType(settings)), *steps),
+        provenance=MappingProxyType(content.provenance),
     )
 
 

@@ -91,14 +91,8 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
         irregular sampling, or a gap that the policy cannot treat.
     """
     check_gap_policy(gaps)
-    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise RecordError(f"the sampling rate given is {rate_hz}; it must be a positive number of Hz. Correct --rate")
+    _check_rate(table, rate_hz)
     _enough(table.values.shape[0], table.where, "rows")
-    if table.time is None and rate_hz is None:
-        raise RecordError(
-            f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
-            " Add the column, or give --rate HZ"
-        )
     steps: list[Step] = []
     values, first = table.values, 0
     if gaps == "interpolate":
@@ -111,13 +105,60 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
     time = values[:, table.time]
     first_row = table.first_row if gaps == "error" else None
     _check_uniform(time, table.where, table.names[table.time], first_row)
-    found = float(f"{(time.size - 1) / (time[-1] - time[0]):.10g}")  # stamps carry no more than 10 digits of a rate
+    found = _agreed(table, (time.size - 1) / (time[-1] - time[0]), rate_hz)
+    return Sampled(values=values, rate_hz=found, start_s=float(time[0]), steps=tuple(steps))
+
+
+def usual_rate(table: Table, rate_hz: float | None) -> tuple[float, float]:
+    """Find the rate of rows that need not be uniform: that of their usual interval.
+
+    Parameters
+    ----------
+    table : Table
+        Columns of a file; NaN where a value is missing.
+    rate_hz : float or None
+        Rate in Hz for a table without time; beside a time column it has to agree with it.
+
+    Returns
+    -------
+    rate_hz : float
+        In Hz.
+    start_s : float
+        First stamp, s; 0 without time.
+
+    Raises
+    ------
+    RecordError
+        If there is no rate, two rates that differ, or time that does not increase from row to row.
+    """
+    _check_rate(table, rate_hz)
+    if table.time is None:
+        assert rate_hz is not None
+        return float(rate_hz), 0.0
+    time = table.values[:, table.time]
+    period = _period_of(time, table.where)
+    return _agreed(table, 1.0 / period, rate_hz), float(time[np.isfinite(time)][0])
+
+
+def _check_rate(table: Table, rate_hz: float | None) -> None:
+    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise RecordError(f"the sampling rate given is {rate_hz}; it must be a positive number of Hz. Correct --rate")
+    if table.time is None and rate_hz is None:
+        raise RecordError(
+            f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
+            " Add the column, or give --rate HZ"
+        )
+
+
+def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
+    """Return the rate that the time column says, unless another one was given."""
+    found = float(f"{found_hz:.10g}")  # stamps carry no more than 10 digits of a rate
     if rate_hz is not None and abs(rate_hz / found - 1) > JITTER:
         raise RecordError(
             f"{table.where}: its time column says {found:g} Hz but --rate says {rate_hz:g} Hz; they must agree."
             " Give one of them only"
         )
-    return Sampled(values=values, rate_hz=found, start_s=float(time[0]), steps=tuple(steps))
+    return found
 
 
 def check_gap_policy(gaps: str) -> None:

@@ -62,6 +62,8 @@ class StreamGuard:
 
     Attributes
     ----------
+    rate_hz : float
+    n_channels : int
     n_received : int
         Samples that came.
 
@@ -92,7 +94,7 @@ class StreamGuard:
         self._rows = RowCheck(n_channels, limits=limits, saturation=saturation, stuck=stuck)
         tolerance = _TOLERANCE / max(rate_hz, 1e-300) if clock_tolerance_s is None else clock_tolerance_s
         self._clock = SampleClock(rate_hz, tolerance)
-        self._n_channels = n_channels
+        self.rate_hz, self.n_channels = rate_hz, n_channels
         self._wrap = None if counter_bits is None else 1 << counter_bits
         self._ledger = Ledger(rate_hz)
         self._order = BlockOrder(
@@ -195,8 +197,8 @@ class StreamGuard:
         wrong: tuple[RejectionKind, str]
         if not isinstance(raw, np.ndarray) or raw.dtype != np.float64:
             wrong = "type", f"the block holds {getattr(raw, 'dtype', type(raw).__name__)}, not float64"
-        elif raw.ndim != 2 or raw.shape[1] != self._n_channels:
-            wrong = "shape", f"the block has shape {raw.shape}; the stream has {self._n_channels} channels"
+        elif raw.ndim != 2 or raw.shape[1] != self.n_channels:
+            wrong = "shape", f"the block has shape {raw.shape}; the stream has {self.n_channels} channels"
         elif not size:
             wrong = "empty", "the block holds no sample"
         else:

@@ -1,0 +1,210 @@
+"""Records as streams of blocks: at the pace at which they were taken or as fast as possible, with all their damage.
+
+Sample numbers come from the time column where there is one: a stamp that lies k periods after the one before it has a
+number larger by k. A stamp that runs back means repeated samples if the rows are the same as before, and a clock that
+was set back if they are not.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.errors import RecordError
+from ambid.record import Record
+from ambid.record.sampling import JITTER
+from ambid.track.stream.block import Array, Block, Frame
+
+_LONGEST_GAP_S = 60.0  # or ten times the record: a stamp that leads by more is a clock that was set
+_LONGEST_PAUSE_S = 1.0  # a gap in the numbers takes its time, up to this
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Replay:
+    """Rows of a record that come as blocks of consecutive numbers. Can be iterated again, and sent to another process.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_rows, n_channels), SI
+        May hold NaN.
+    numbers : ndarray, shape (n_rows,), int64
+        Sample number of each row.
+    time_s : ndarray, shape (n_rows,), s
+        Stamp of each row.
+    rate_hz : float
+    block_samples : int
+        A block is shorter where the numbers do not follow on each other, and at the end.
+    irregular : int
+        Stamps that are more than 1 % of a period off the grid of the samples beside them.
+    """
+
+    values: Array
+    numbers: NDArray[np.int64]
+    time_s: Array
+    rate_hz: float
+    block_samples: int
+    irregular: int = 0
+
+    def __iter__(self) -> Iterator[Block]:
+        steps = np.diff(self.numbers)
+        jumps = np.abs(np.diff(self.time_s) * self.rate_hz - steps) > 0.5  # of the clock alone
+        breaks = np.flatnonzero((steps != 1) | jumps) + 1
+        for start, stop in pairwise([0, *breaks.tolist(), self.numbers.size]):
+            for k in range(start, stop, self.block_samples):
+                end = min(k + self.block_samples, stop)
+                yield Block(first=int(self.numbers[k]), time_s=float(self.time_s[k]), values=self.values[k:end])
+
+
+def blocks_of(
+    record: Record,
+    block_samples: int,
+    *,
+    channels: Sequence[str] | None = None,
+    time_s: ArrayLike | None = None,
+) -> Replay:
+    """Return a record as a stream.
+
+    Parameters
+    ----------
+    record : Record
+        Rows in the order in which they were written; may hold NaN.
+    block_samples : int
+        Samples of a block.
+    channels : sequence of str, optional
+        Which, in which order; default all.
+    time_s : array_like, shape (n_samples,), optional
+        Stamp of each row where they are not uniform (`ambid.record.read_rows`); default those of the record's rate.
+
+    Returns
+    -------
+    Replay
+        Samples are numbered from 0 at the first row.
+
+    Raises
+    ------
+    RecordError
+        If a channel is missing, the block has no samples, or the stamps number no samples.
+    """
+    if block_samples < 1:
+        raise RecordError(f"a block of {block_samples} samples holds nothing; it must have at least one. Correct it")
+    names = record.names if channels is None else tuple(channels)
+    values = np.column_stack([record[name] for name in names])
+    if time_s is None:
+        numbers, stamps, irregular = np.arange(record.n_samples, dtype=np.int64), record.time_s, 0
+    else:
+        stamps = np.array(time_s, dtype=np.float64)
+        if stamps.shape != (record.n_samples,):
+            raise RecordError(
+                f"{stamps.size} time stamps do not fit {record.n_samples} samples; each row has one. Correct time_s"
+            )
+        numbers, placed, irregular = numbers_from_time(stamps, values, record.rate_hz)
+        values[~placed] = np.nan
+        stamps = _without_holes(stamps, numbers, record.rate_hz)
+    values.flags.writeable = False
+    return Replay(
+        values=values,
+        numbers=numbers,
+        time_s=stamps,
+        rate_hz=record.rate_hz,
+        block_samples=block_samples,
+        irregular=irregular,
+    )
+
+
+def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
+    """Number the rows of a damaged record by their stamps.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n_rows,)
+        Stamps, s; may have gaps, jumps, repetitions, and NaN for a stamp that is missing.
+    values : ndarray, shape (n_rows, n_channels)
+        Tell repeated rows from a clock that was set back.
+    rate_hz : float
+
+    Returns
+    -------
+    numbers : ndarray, shape (n_rows,), int64
+        Sample numbers, 0 for the first row. A row without a stamp follows on the one before it.
+    placed : ndarray, shape (n_rows,), bool
+        False for rows without a stamp where those beside it leave open which samples they are.
+    irregular : int
+        Number of intervals that are off a whole number of periods by more than 1 % of a period.
+
+    Raises
+    ------
+    RecordError
+        If less than half of the intervals are one period within 5 %: the stamps are too coarse, or the rate is wrong.
+    """
+    known = np.flatnonzero(np.isfinite(time_s))
+    rows = np.diff(known)
+    advance = np.diff(time_s[known]) * rate_hz
+    if known.size < 2 or (np.abs(advance / rows - 1) <= 0.05).sum() * 2 < rows.size:
+        raise RecordError(
+            f"less than half of the time stamps are one period of {rate_hz:g} Hz apart; samples cannot be numbered."
+            " Print time with more digits, or correct the rate"
+        )
+    longest = max(_LONGEST_GAP_S * rate_hz, 10.0 * time_s.size)
+    whole = np.rint(np.clip(advance, -(2.0**53), 2.0**53)).astype(np.int64)
+    irregular = int((np.abs(advance - whole) > JITTER * rows).sum())
+    whole = np.where(whole > longest, rows, whole)  # the clock was set: nobody waits so long within a record
+    placed = np.zeros(time_s.size, dtype=bool)
+    placed[known] = True
+    for k in np.flatnonzero((rows > 1) & (whole == rows)):
+        placed[known[k] : known[k + 1]] = True
+    steps = np.ones(time_s.size - 1, dtype=np.int64)
+    steps[known[1:] - 1] = whole - (rows - 1)
+    for k in np.flatnonzero(steps < 1) + 1:
+        if not _repeats(values, int(k), 1 - int(steps[k - 1])):
+            steps[k - 1] = 1
+    return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64), placed, irregular
+
+
+def _without_holes(time_s: Array, numbers: NDArray[np.int64], rate_hz: float) -> Array:
+    """Return the stamps with each missing one replaced by what its number says."""
+    known = np.flatnonzero(np.isfinite(time_s))
+    last = known[np.maximum(np.searchsorted(known, np.arange(time_s.size), side="right") - 1, 0)]
+    return np.where(np.isfinite(time_s), time_s, time_s[last] + (numbers - numbers[last]) / rate_hz)
+
+
+def _repeats(values: Array, k: int, back: int) -> bool:
+    """Tell whether rows from k on are those from `back` rows before on."""
+    n = min(back, values.shape[0] - k, 8)
+    return k >= back and bool(np.array_equal(values[k : k + n], values[k - back : k - back + n], equal_nan=True))
+
+
+def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool] = lambda: False) -> Iterator[Frame]:
+    """Yield blocks at the time at which an acquisition would have them.
+
+    The pace is that of the sample numbers. A gap takes its time, at most one second; numbers that run back take none
+    but that of their samples.
+
+    Parameters
+    ----------
+    blocks : iterable of Block
+    rate_hz : float
+    stopped : callable, optional
+        Asked while waiting; True ends the stream.
+
+    Yields
+    ------
+    Frame
+        With the time at which it was due, however late it is taken.
+    """
+    due, after = time.perf_counter(), None
+    for block in blocks:
+        n = len(block.values) if np.ndim(block.values) else 0
+        first = block.first if isinstance(block.first, int) else None
+        gap = (first - after) / rate_hz if first is not None and after is not None else 0.0
+        due += n / rate_hz + min(max(gap, 0.0), _LONGEST_PAUSE_S)
+        after = first + n if first is not None else after
+        while (left := due - time.perf_counter()) > 0:
+            if stopped():
+                return
+            time.sleep(min(left, 0.05))
+        yield Frame(block=block, arrived_s=due)
