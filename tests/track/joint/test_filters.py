@@ -61,25 +61,41 @@ def test_square_roots_and_closed_forms_change_nothing(name, delay, alpha):
 @BOTH
 def test_converges_on_an_unstable_bearing_in_its_loop(kind):
     bench = run("bearing", 20_000, 4)
-    filter_ = kind(start_of(bench, 0.05, seed=8))
+    filter_ = kind(start_of(bench, 0.03, seed=8))
     filter_.update(bench.signals.u, bench.signals.y)
     sd = np.sqrt(np.diag(filter_.covariance))
     assert np.all(sd[:5] < 0.006 * np.abs(truth_of(bench, filter_.names)[:5]))
     assert np.all(np.abs(filter_.estimate - truth_of(bench, filter_.names)) < 3.5 * sd)
-    assert filter_.error == pytest.approx(1.0, abs=0.1)
+    assert filter_.error == pytest.approx(1.0, abs=0.05)
+    assert filter_.warnings == ()
+
+
+@BOTH
+@pytest.mark.parametrize(("factor", "word"), [(0.5, "too small"), (2.0, "too large")])
+def test_wrong_noise_levels_are_said(kind, factor, word):
+    bench = run("bearing", 6000, 4)
+    start = start_of(bench, 0.01)
+    filter_ = kind(replace(start, sensor_sd={k: factor * v for k, v in start.sensor_sd.items()}))
+    filter_.update(bench.signals.u[:2000], bench.signals.y[:2000])
+    assert filter_.warnings == ()  # too early to tell
+    filter_.update(bench.signals.u[2000:], bench.signals.y[2000:])
+    assert word in filter_.warnings[0]
 
 
 def test_the_second_order_keeps_the_unscented_filter_true_from_a_far_start():
     """A resonance of 639 Hz without damping: 5 % of mass and k_i are far outside of what is linear."""
     bench = run("thesis", 10_000, 2)
-    apart = {}
+    apart, said = {}, {}
     for kind in (JointEkf, JointUkf):
         filter_ = kind(start_of(bench, 0.05, seed=3))
         filter_.update(bench.signals.u, bench.signals.y)
+        said[kind] = filter_.warnings
         sd = np.sqrt(np.diag(filter_.covariance))
         apart[kind] = np.abs((filter_.estimate - truth_of(bench, filter_.names)) / sd).max()
     assert apart[JointUkf] < 4.0
-    assert apart[JointEkf] > 10.0  # what the docstring warns of
+    assert apart[JointEkf] > 10.0
+    assert "use JointUkf" in said[JointEkf][0]
+    assert said[JointUkf] == ()
 
 
 def test_the_correction_is_for_levels_that_are_known():

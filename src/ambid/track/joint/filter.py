@@ -16,6 +16,7 @@ from ambid.track.joint.start import JointStart, parameter_scales
 Array = NDArray[np.float64]
 
 EVERY = 32  # samples between two steps of the random walk, and two looks at the linearisation point
+_SETTLED, _OFF = 4096, 0.1  # samples before a level of the innovations is judged, and how far off it may be
 _WIDE = 1e4  # units of the states, about their sensor noise: what is known of a state that is lost
 _LARGEST = 0.1  # a number's walk rests while its relative standard deviation is above this, and above its start
 
@@ -132,10 +133,22 @@ class JointFilter:
     def error(self) -> float:
         """Root mean square of the innovations over what the filter expects of them, over about 1000 samples.
 
-        One where model, noise levels and covariance are right. Well above it (1.2) the covariance is too small to be
-        believed: the estimate has left the range in which the filter is linear, or the plant has changed.
+        One where model and noise levels are right. It does not show every wrong estimate: sixty thousand innovations
+        can be ordinary to a per cent and yet speak against an estimate by many standard deviations.
         """
         return float(np.sqrt(np.mean(self._io[2, self._past.shape[1] :])))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader has to know before using the numbers; empty where nothing is known against them."""
+        error = self.error
+        if self.n_used < _SETTLED or abs(error - 1.0) < _OFF:
+            return ()
+        kind = "small" if error > 1.0 else "large"
+        return (
+            f"innovations are {error:.2f} times what the filter expects: its noise levels are too {kind}, and its "
+            "standard deviations with them; where the plant is hardly excited, its parameters are moved too",
+        )
 
     def _unit(self) -> Array:
         """Derivative of `estimate` by the scaled numbers."""
