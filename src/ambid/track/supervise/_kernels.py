@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
-_QUANTILE = 0.1  # share of quiet statistics above the point by which overdispersion is learned
+_QUANTILE = 0.03  # share of quiet statistics above the point by which overdispersion is learned
 _LARGEST_GAIN = 0.02  # of learning overdispersion
-_SETTLE_GAIN = 6.0  # over the number of tests, while settling: one over the density of log chi-squared at that point
+_SETTLE_GAIN = 12.0  # over the number of tests, while settling: one over the density of log chi-squared at that point
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 
 
@@ -186,7 +186,7 @@ def watch(
     the last triangles of 2^level blocks; `notes` (levels, 4, 4): their rest, freedom, first sample, first block.
     `counts` (levels + 1,): bases so far, blocks so far last. `history` (ring, p, p + 1): [P q] before each block.
     `learned` (windows, tests): log of overdispersion. `marks` (2, tests): threshold of each test, and the point that
-    one quiet statistic in ten passes. `tested` (hypotheses,): column of each. `rows` (5, wide): growth of variance per
+    few quiet statistics pass. `tested` (hypotheses,): column of each. `rows` (5, wide): growth of variance per
     block, the reference point, scratch. Triangles are held at the reference point, estimates relative to it.
     `state` (6,): log of the noise level, blocks to wait until statistics are quiet again, gain of learning, gain of the
     noise level, longest window, whether to alarm. `scratch` (4, p, p + 1). `result` (10 + hypotheses,): kind (-1: not
@@ -220,7 +220,7 @@ def watch(
         gain = 0.0
         if calm and state[5] > 0.0:  # long windows are looked at less often
             gain = min(state[2] * (1 << level), _LARGEST_GAIN)
-        elif calm:  # as fast as a tenth quantile can be learned
+        elif calm:  # as fast as a quantile can be learned
             gain = _SETTLE_GAIN / (n_bases + 2.0 * _SETTLE_GAIN)
         for m in range(1, min(n_bases, 4) + 1):
             length = m << level
@@ -269,7 +269,7 @@ def watch(
 
 @njit(cache=True, nogil=True)
 def _learn(row: Array, at: int, statistic: float, point: float, gain: float) -> None:
-    """Move the log of a scale (at least 0) so that one statistic in ten lies above `point` times the scale."""
+    """Move the log of a scale (at least 0) so that a share `_QUANTILE` lies above `point` times the scale."""
     up = 1.0 - _QUANTILE if statistic > point * math.exp(row[at]) else -_QUANTILE
     row[at] = max(row[at] + gain * up, 0.0)
 

@@ -24,6 +24,7 @@ _FEWEST = 4  # blocks of the longest window, at least
 # their data. Counted in simulations of 1e6 blocks for six to eleven numbers; it grows slowly towards one with the
 # threshold and is taken larger than what was found.
 _INDEPENDENT = 0.7
+_PASSED = 0.03  # share of quiet statistics above the point by which overdispersion is learned, as in the kernels
 _GAIN, _NOISE_GAIN = 0.002, 2e-4  # per test, per block: of learning overdispersion and noise level
 _TESTS: dict[int, tuple[Literal["number", "all", "noise"], int]] = {1: ("number", 0), 2: ("all", -2), 3: ("noise", -1)}
 _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
@@ -101,9 +102,11 @@ class ChangeDetector:
     explains: :math:`ρ^T M^{-1} ρ` (chi-squared, p) and the unexplained part of the innovations against its usual level.
 
     Where the model is not perfect quiet statistics are larger than chance makes them. Every statistic is therefore
-    divided by its overdispersion, at least 1: learned for each window and number from quiet times (the point which one
-    in ten passes, in steps of bounded size, so that a change is not learned away), or the unexplained part of the
-    window itself per degree of freedom where that is larger (noise that rises does not look like a parameter).
+    divided by its overdispersion, at least 1: learned for each window and number from quiet times (the point which
+    three in a hundred pass, in steps of bounded size, so that a change is not learned away), or the unexplained part of
+    the window itself per degree of freedom where that is larger (noise that rises does not look like a parameter).
+    Blocks should have several times as many rows (samples times outputs) as there are numbers: without degrees of
+    freedom beside them, the second guard is not there.
 
     Parameters
     ----------
@@ -298,11 +301,11 @@ class ChangeDetector:
 
 
 def _marks(tests: int, p: int, alpha: float) -> Array:
-    """Return thresholds of tail `alpha`, and the points that one quiet statistic in ten passes, shape (2, tests)."""
+    """Return thresholds of tail `alpha`, and the points that few quiet statistics pass, shape (2, tests)."""
     from scipy.special import chdtri
 
     marks = np.empty((2, tests))
-    for row, tail in enumerate((alpha, 0.1)):
+    for row, tail in enumerate((alpha, _PASSED)):
         marks[row] = chdtri(1, tail)
         marks[row, -2] = chdtri(p, tail)
     return marks
