@@ -261,7 +261,13 @@ class Sums:
         self._closed = half
 
     def solve(self) -> tuple[Array, Array] | None:
-        """Coefficients that make the instruments' sums zero, shapes (5,) and (3,); None if the sums are singular."""
+        """Return the coefficients that make the instruments' sums zero.
+
+        Returns
+        -------
+        tuple of ndarray, shapes (5,) and (3,), or None
+            None if the sums are singular.
+        """
         electric, mechanic = self.moments
         try:
             return (
@@ -272,7 +278,12 @@ class Sums:
             return None
 
     def covariance(self) -> Array:
-        """Covariance of the eight coefficients, shape (8, 8)."""
+        """Return the covariance of the eight coefficients.
+
+        Returns
+        -------
+        ndarray, shape (8, 8)
+        """
         whole = np.zeros((8, 14))
         for rows, columns, inverse in zip((slice(0, 5), slice(5, 8)), (0, 8), self._inverses(), strict=True):
             whole[rows, columns : columns + inverse.shape[0]] = inverse
@@ -280,7 +291,13 @@ class Sums:
         return np.asarray((out + out.T) / 2)
 
     def doubt(self) -> dict[str, float]:
-        """Probability of what the spare instruments show, if the blocks were of first order (Sargan, Hotelling)."""
+        """Return how probable first-order blocks are, by what the spare instruments show (Sargan, Hotelling).
+
+        Returns
+        -------
+        dict of str to float
+            ``current``, ``position``.
+        """
         from scipy.stats import f
 
         scatter, out = self._scaled_scatter(), {}
@@ -297,7 +314,13 @@ class Sums:
         return out
 
     def fit(self) -> dict[str, float]:
-        """1 - |error|/|signal| of both equations over the last batches, with coefficients from before each."""
+        """Return 1 - |error|/|signal| over the last batches, with the coefficients from before each.
+
+        Returns
+        -------
+        dict of str to float
+            ``current``, ``position``.
+        """
         out = {}
         for k, name in enumerate(("current", "position")):
             e, y, total, n = self._energy[k]

@@ -346,7 +346,8 @@ def synchronous_scan(y: Array, phase: Array, out: Array, state: Array, constants
     `state` (m, 18): cosine, sine, offset; root of their covariance over that of the noise (row by row, 9); sums of
     cos φ e and sin φ e over a batch, samples in it; noise density at the rotation; batches; samples seen.
     """
-    step, most, batch, longest, start = constants
+    step, most, longest, start = constants[0], constants[1], constants[2], constants[3]
+    taper = constants[4:]  # against leakage of stronger noise at other frequencies
     work = np.zeros((4, 6))
     missing = 0
     for j in range(y.shape[1]):
@@ -374,11 +375,11 @@ def synchronous_scan(y: Array, phase: Array, out: Array, state: Array, constants
             s[0] += work[1, 0] * gain
             s[1] += work[2, 0] * gain
             s[2] += work[3, 0] * gain
-            e /= work[0, 0]
+            e *= taper[int(s[14])] / work[0, 0]
             s[12] += c * e
             s[13] += d * e
             s[14] += 1.0
-            if s[14] >= batch:  # the mean squared sum is the density of the noise around the rotation
+            if s[14] >= taper.size:  # the mean squared sum is the density of the noise around the rotation
                 s[16] = min(s[16] + 1.0, longest)
                 s[15] += ((s[12] * s[12] + s[13] * s[13]) / s[14] - s[15]) / s[16]
                 s[12], s[13], s[14] = 0.0, 0.0, 0.0

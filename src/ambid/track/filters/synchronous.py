@@ -89,7 +89,10 @@ class SynchronousFilter:
         self.n_samples = self.n_missing = 0
         self._state = np.zeros((channels, 18))
         # a walk of variance q a sample is followed with the gain √(q/2) a sample where cos² is 1/2 on average
-        self._constants = np.array([sqrt(2.0) / n, 3 * _START, float(int(n / _BATCHES)), _LONGEST, sqrt(_START)])
+        size = int(n / _BATCHES)
+        taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+        taper /= np.sqrt(np.mean(taper**2))
+        self._constants = np.array([sqrt(2.0) / n, 3 * _START, _LONGEST, sqrt(_START), *taper])
         self._scan = synchronous_scan
         self._one = (np.empty((1, channels)), np.empty(1), np.empty((1, channels)))
 
