@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
+from ambid.physics.discretise import discretise
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
-from ambid.physics.presets import preset
+from ambid.physics.presets import preset, preset_names
 from ambid.simulate import (
     LinearPlant,
     Schedule,
@@ -91,6 +92,29 @@ def test_a_jump_under_feedback_follows_the_two_loop_matrices(delay: float) -> No
     for j in range(n):
         assert done.states[j] == pytest.approx(z[:3], rel=1e-8, abs=1e-13)
         z = (before if j < k else after) @ z
+
+
+@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("delay", [1.0, 0.3])
+def test_drifting_matrices_are_those_of_the_exact_discretisation(name: str, delay: float) -> None:
+    """From sample to sample, so that each stretch is one sample and its middle is known."""
+    p = preset(name)
+    plant = LinearPlant(model=model(p.model), parameters=p.parameters)
+    r, k_i = p.parameters["R"], p.parameters["k_i"]
+    drift = {"R": Schedule.ramp(r, 1.2 * r, 0.0, 1.0), "k_i": Schedule.ramp(k_i, 0.9 * k_i, 0.0, 1.0)}
+    x0, u = np.array([1e-5, 1e-3, 0.02]), excite(400)
+    found = simulate_varying(
+        plant, u, variation=Variation(parameters=drift), rate_hz=p.rate_hz, seed=0, loop=Loop(delay=delay), start=x0,
+        grid_s=1.0 / p.rate_hz,
+    ).states  # fmt: skip
+    x, late = x0, np.concatenate([[0.0, 0.0], u])
+    whole = int(delay)
+    for k in range(400):
+        assert found[k] == pytest.approx(x, rel=1e-9, abs=1e-13)
+        middle = (k + 0.5) / p.rate_hz
+        theta = {**p.parameters, "R": r * (1 + 0.2 * middle), "k_i": k_i * (1 - 0.1 * middle)}
+        d, _ = discretise(plant.model.matrices(theta), 1.0 / p.rate_hz, fraction=delay - whole)
+        x = d.A @ found[k] + d.B[:, 0] * late[2 + k - whole] + d.B_late[:, 0] * late[1 + k - whole]
 
 
 def brute_force(u: np.ndarray, theta: dict[str, Schedule], substeps: int) -> np.ndarray:

@@ -1,6 +1,9 @@
 """Scenarios: named courses of a bench whose truth is known, to try on-line identification on.
 
 Each says what changes, from when, and by how much; the bench is any preset or rig of a linear model with a loop.
+
+A position sensor of gain g hides behind the parameters: z = g x obeys the same equations with m/g^2, k_x/g^2, c/g^2 and
+k_i/g. Who does not know the mass cannot tell the two apart.
 """
 
 from __future__ import annotations

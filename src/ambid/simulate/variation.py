@@ -17,7 +17,7 @@ class Unbalance:
 
     The angle is the exact integral of the speed from the record's beginning. As every disturbance of the simulator the
     force is held over a sample, at its value in the middle of it. The tangential part, moment times the angular
-    acceleration, is left out: at 1 s after a start from rest it is 1/angle of the whole.
+    acceleration, is left out: after a steady start from rest it is 1/(2 angle) of the whole.
 
     Attributes
     ----------
