@@ -5,9 +5,7 @@ Read -> start (an estimate, or one identified from the beginning of the record) 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -17,31 +15,27 @@ from ambid.errors import EstimationError
 from ambid.identify.estimate import Estimate
 from ambid.identify.threads import one_thread
 from ambid.job._progress import Tick, silent
+from ambid.job.bench_rows import BenchRows, rows_of
 from ambid.job.estimates import read_estimate
-from ambid.job.physical import identify, load
-from ambid.physics.linear_model import LinearModel
+from ambid.job.physical import identify
 from ambid.physics.models import model
-from ambid.record import Channel, Record
+from ambid.record import Record
 from ambid.rig import Rig, default_rig, load_rig
-from ambid.signals.samples import cut
 from ambid.track.lines import Track, TrackHeader, TrackLine
 from ambid.track.physical.numbers import tracked_numbers
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
-from ambid.track.physical.synchronous import Forcing, forcing_of
+from ambid.track.physical.synchronous import Forcing
 from ambid.track.reporter import Reporter, header
-from ambid.track.stream.block import Block
+from ambid.track.stream.engine import run
 from ambid.track.stream.guard import StreamGuard
-from ambid.track.stream.outcome import Passed, Rejection
-from ambid.track.stream.replay import blocks_of
+from ambid.track.stream.outcome import Stretch
 from ambid.track.supervise.supervisor import Supervisor
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Pace = Literal["fastest", "real-time"]
 
 _START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
-_BLOCK_S = 0.01  # of the stream
-_FORCING = ("forcing_cos", "forcing_sin")
 
 
 def track(
@@ -53,7 +47,7 @@ def track(
     every_s: float = 0.01,
     limit: float = 1.5,
     memory: float | Literal["auto", "all"] = "auto",
-    pace: Pace = "fastest",  # noqa: ARG001
+    pace: Pace = "fastest",
     flags: Sequence[tuple[float, Flag]] = (),
     from_s: float | None = None,
     to_s: float | None = None,
@@ -109,17 +103,17 @@ def track(
     """
     say = tick or silent
     bench_rig = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
-    bench = load(record, bench_rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=None)
-    plant = model(bench_rig.model)
+    source = rows_of(record, bench_rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz)
     say("start")
-    estimate, first = _start(bench, bench_rig, start, start_s)
+    estimate, first = _start(source, bench_rig, start, start_s)
     say("track")
-    forcing = forcing_of(bench) if "force" in plant.disturbances else None
-    rpem = PhysicalRpem(
-        tracked_numbers(estimate, synchronous=forcing is not None, top_speed=forcing.top_speed if forcing else 1.0),
-        memory=memory,
+    forcing = source.forcing
+    numbers = tracked_numbers(
+        estimate, synchronous=forcing is not None, top_speed=1.0 if forcing is None else forcing.top_speed
     )
-    supervisor = Supervisor(rpem, limit=limit, t0=bench.start_s, listener=lambda event: reporter.note(event))
+    supervisor = Supervisor(
+        PhysicalRpem(numbers, memory=memory), limit=limit, t0=source.t0, listener=lambda event: reporter.note(event)
+    )
     lines: list[TrackLine] = []
 
     def emit(line: TrackLine) -> Sequence[Flag] | None:
@@ -127,42 +121,63 @@ def track(
             lines.append(line)
         return None if on_line is None else on_line(line)
 
-    reporter = Reporter(supervisor, every_s=every_s, on_line=emit, flags=flags, t0=bench.start_s, first=first)
+    reporter = Reporter(supervisor, every_s=every_s, on_line=emit, flags=flags, t0=source.t0, first=first)
     top = header(
         supervisor, limit=limit, every_s=every_s, method=f"rpem, memory {memory}",
-        record={
-            "file": bench.provenance.get("file"),
-            "sha256": bench.provenance.get("sha256"),
-            "samples": bench.n_samples - first,
-        },
+        record={**source.origin, "samples": int(np.count_nonzero(source.replay.numbers >= first))},
     )  # fmt: skip
     if on_header is not None:
         on_header(top)
-    begun = time.perf_counter()
-    stream = _columns(bench, plant, forcing)
-    blocks = blocks_of(stream, max(1, round(_BLOCK_S * bench.rate_hz)))
-    guard = StreamGuard(bench.rate_hz, len(stream.channels))
+    n_u = len(model(bench_rig.model).inputs)
     with one_thread():
-        _run((b for b in blocks if b.first >= first), guard, plant, reporter)
-    reporter.finish()
-    return Track(header=top, lines=tuple(lines), summary=reporter.summary(computing_s=time.perf_counter() - begun))
-
-
-def _start(bench: Record, rig: Rig, start: Estimate | str | Path | None, start_s: float | None) -> tuple[Estimate, int]:
-    """The estimate to begin with, and the number of the first sample that is tracked."""
-    if isinstance(start, Estimate):
-        return start, 0
-    if start is not None:
-        return _read_start(start), 0
-    length = (
-        start_s if start_s is not None else min(max(_START_S, _START_SAMPLES / bench.rate_hz), bench.duration_s / 3)
-    )
-    n = round(length * bench.rate_hz)
-    if not 0 < n < bench.n_samples:
-        raise EstimationError(
-            f"the start of {length:g} s leaves nothing of {bench.duration_s:g} s to track. Give less, or an estimate"
+        report = run(
+            source.replay.since(first),
+            lambda stretch: reporter.consume(_samples(stretch, n_u, forcing), stretch.first, restart=stretch.restart),
+            reporter.reject,
+            guard=StreamGuard(numbers.rate_hz, source.replay.values.shape[1]),
+            pace=pace,
+            producer="process" if pace == "real-time" else "none",
+            block_samples=source.replay.block_samples,
         )
-    return identify(cut(bench, None, bench.start_s + n / bench.rate_hz), rig), n
+    reporter.finish()
+    summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)
+    return Track(header=top, lines=tuple(lines), summary=summary)
+
+
+def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:
+    """Take the columns of a stretch apart."""
+    n = stretch.values.shape[1] - (0 if forcing is None else 2)
+    u, y, extra = np.split(stretch.values, [n_u, n], axis=1)
+    return Samples(
+        u=np.ascontiguousarray(u),
+        y=np.ascontiguousarray(y),
+        forcing=None if forcing is None else np.ascontiguousarray(extra),
+    )
+
+
+def _start(
+    source: BenchRows, rig: Rig, start: Estimate | str | Path | None, start_s: float | None
+) -> tuple[Estimate, int]:
+    """The estimate to begin with, and the number of the first sample that is tracked."""
+    rate = source.replay.rate_hz
+    if start is not None:
+        estimate = start if isinstance(start, Estimate) else _read_start(start)
+        known = float(str(estimate.record["rate_hz"]))
+        if estimate.model != rig.model or abs(known / rate - 1.0) > 1e-6:
+            raise EstimationError(
+                f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at"
+                f" {rate:g} Hz; they have to agree. Identify a start from this bench at this rate"
+            )
+        return estimate, 0
+    length = source.duration_s
+    wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if start_s is None else start_s
+    n = round(wanted * rate)
+    if not 0 < n < length * rate:
+        raise EstimationError(
+            f"a start of {wanted:g} s leaves nothing of {length:g} s to track. Give a shorter one, or an estimate"
+        )
+    part, first = source.clean_part(n, begin_anywhere=start_s is None)
+    return identify(part, rig), first
 
 
 def _read_start(path: str | Path) -> Estimate:
@@ -173,33 +188,3 @@ def _read_start(path: str | Path) -> Estimate:
             " wrote"
         )
     return found
-
-
-def _columns(bench: Record, plant: LinearModel, forcing: Forcing | None) -> Record:
-    """The channels that the tracker takes, forcing included, in its order."""
-    roles = (*plant.inputs, *plant.outputs)
-    more = () if forcing is None else forcing.columns.T
-    extra = [Channel(name=name, unit="1", values=column) for name, column in zip(_FORCING, more, strict=False)]
-    return replace(bench, channels=(*(bench.channel(role) for role in roles), *extra))
-
-
-def _run(blocks: Iterable[Block], guard: StreamGuard, plant: LinearModel, reporter: Reporter) -> None:
-    """Pass blocks through the guard into the tracker."""
-    for block in blocks:
-        for passed in guard.take(block):
-            _consume(passed, plant, reporter)
-    for passed in guard.flush():
-        _consume(passed, plant, reporter)
-
-
-def _consume(passed: Passed, plant: LinearModel, reporter: Reporter) -> None:
-    if isinstance(passed, Rejection):
-        reporter.reject(passed)
-        return
-    n_u, n = len(plant.inputs), len(plant.inputs) + len(plant.outputs)
-    values = passed.values
-    forcing = np.ascontiguousarray(values[:, n:]) if values.shape[1] > n else None
-    samples = Samples(
-        u=np.ascontiguousarray(values[:, :n_u]), y=np.ascontiguousarray(values[:, n_u:n]), forcing=forcing
-    )
-    reporter.consume(samples, passed.first, restart=passed.restart)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -49,6 +49,22 @@ class Replay:
     rate_hz: float
     block_samples: int
     irregular: int = 0
+
+    def since(self, first: int) -> Replay:
+        """Return the rows whose numbers are `first` or more, in the order in which they come.
+
+        Parameters
+        ----------
+        first : int
+
+        Returns
+        -------
+        Replay
+        """
+        kept = self.numbers >= first
+        if kept.all():
+            return self
+        return replace(self, values=self.values[kept], numbers=self.numbers[kept], time_s=self.time_s[kept])
 
     def __iter__(self) -> Iterator[Block]:
         steps = np.diff(self.numbers)

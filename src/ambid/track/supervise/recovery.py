@@ -11,6 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ambid.track.lines import Event
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples
@@ -44,6 +45,8 @@ class Recovery:
 
     Attributes
     ----------
+    event : Event
+        What was said of it when it was found.
     suspects : tuple of str
         Numbers each of which may have moved, the likeliest first.
     size : float
@@ -57,6 +60,7 @@ class Recovery:
     attempts : int
     """
 
+    event: Event
     suspects: tuple[str, ...]
     size: float
     onset: int

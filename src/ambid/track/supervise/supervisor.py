@@ -35,6 +35,7 @@ _LEVEL_S = 0.1  # over which the error is taken
 _SETTLE_S = 1.0  # in which the detector learns how imperfect the model is, where the start estimate says that it is
 _BLOCKS_AFTER = 3  # of settled evidence before the first search after a change
 _ATTEMPTS = 5
+_BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
 _STRAY = 3.0  # moves by which such a number is widened
 # Numbers that describe the noise are seen through the innovations alone: over short blocks the squares of what they
@@ -244,8 +245,8 @@ class Supervisor:
     def _alarmed(self, alarm: Alarm, t: float) -> None:
         """Begin to deal with a change."""
         numbers, rpem = self.rpem.numbers, self.rpem
-        kind = None if alarm.parameter is None else numbers.kinds[numbers.names.index(alarm.parameter)]
-        moved = kind in ("parameter", "gain")
+        kind = self._kind(alarm.parameter)
+        moved = kind in _BENCH
         event = Event(
             kind="change" if moved else "disturbed",
             t=self._t0 + alarm.onset / self._rate,
@@ -257,6 +258,7 @@ class Supervisor:
         if kind in _DISTURBED and alarm.parameter is not None:
             rpem.filter.widen(numbers.names.index(alarm.parameter), _STRAY * abs(alarm.size))
             self._detector.restart(rpem.stream.sample)
+            self.gate.restart()
             return
         if not moved and alarm.noise > alarm.threshold**0.5:
             rpem.noise_level = max(rpem.noise_level, alarm.noise)
@@ -264,11 +266,18 @@ class Supervisor:
             return
         if moved:
             self.changes.append(event)
-        rivals = [n for n, _ in alarm.rivals if numbers.kinds[numbers.names.index(n)] in ("parameter", "gain")]
-        suspects = (alarm.parameter, *rivals[:2]) if moved and alarm.parameter is not None else tuple(rivals[:3])
-        self._begin_recovery(alarm.onset, suspects, alarm.size)
+        likely = [n for n, _ in alarm.rivals if self._kind(n) in _BENCH]
+        if moved and alarm.parameter is not None:
+            suspects = (alarm.parameter, *likely[:2])
+        else:  # a fault of one thing is likelier than of several at once
+            suspects = tuple(n for n in numbers.names if self._kind(n) in _BENCH)
+        self._begin_recovery(event, alarm.onset, suspects, alarm.size)
 
-    def _begin_recovery(self, onset: int, suspects: tuple[str, ...], size: float) -> None:
+    def _kind(self, name: str | None) -> str | None:
+        numbers = self.rpem.numbers
+        return None if name is None else numbers.kinds[numbers.names.index(name)]
+
+    def _begin_recovery(self, event: Event, onset: int, suspects: tuple[str, ...], size: float) -> None:
         rpem = self.rpem
         block = rpem.block_samples
         before = next((f for first, f in reversed(self._history) if first <= onset), self._history[0][1])
@@ -276,7 +285,9 @@ class Supervisor:
         clean = min(onset + block, rpem.stream.sample)
         ready = clean + rpem.stream.settling_samples + _BLOCKS_AFTER * block
         self.gate.restart()
-        self._recovery = Recovery(suspects=suspects, size=size, onset=clean, before=before.copy(), ready=ready)
+        self._recovery = Recovery(
+            event=event, suspects=suspects, size=size, onset=clean, before=before.copy(), ready=ready
+        )
 
     def _recover(self, evidence: Evidence, t: float) -> None:
         """Search once enough samples have come; go on from what is found."""
@@ -296,16 +307,31 @@ class Supervisor:
         rpem.n_linearised += refined.iterations
         self.update_s = max(self.update_s, found.computing_s)
         names = ", ".join(found.moved)
-        if self.changes and len(found.moved) == 1 and self.changes[-1].parameter != found.moved[0]:
-            last = self.changes[-1]
-            self.changes[-1] = Event(
-                kind="change", t=last.t, why=f"{last.why}; the data after it are explained by {names}",
-                parameter=found.moved[0], values=last.values,
-            )  # fmt: skip
+        self._name(found, t)
         self._fresh_start(t)
         why = f"{names} found anew from the samples after the change in {found.computing_s * 1e3:.1f} ms"
         self._propose(t, why)
         self._unconfirmed = True
+
+    def _name(self, found: Recovered, t: float) -> None:
+        """Say which number moved where the alarm has not, or has named another: more data are there now."""
+        assert self._recovery is not None
+        rpem, before = self.rpem, self._recovery.before
+        places = [rpem.numbers.names.index(name) for name in found.moved]
+        moves = [abs(rpem.filter.q[j] - before.q[j]) / rpem.filter.sd[j] for j in places]
+        name = found.moved[int(np.argmax(moves))]
+        told = self._recovery.event
+        if told.kind == "change" and told.parameter == name:
+            return
+        what = f"the data after it are explained by {', '.join(found.moved)}"
+        event = Event(
+            kind="change", t=told.t, parameter=name, why=f"{what}; {told.why}", values={**told.values, "named": t}
+        )
+        if told.kind == "change":
+            self.changes[-1] = event
+        else:
+            self.changes.append(event)
+        self.log.add(event)
 
     def _give_up(self, t: float) -> None:
         """Let the recursion find what no search has found: all parameters are unknown again."""
