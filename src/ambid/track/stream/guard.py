@@ -177,7 +177,9 @@ class StreamGuard:
         list of Stretch and Rejection
         """
         self._order.finish()
-        self._decide()
+        part, self._undecided = self._undecided, None
+        if part is not None:
+            self._give(part.first, part.values, self._rows.judge(part.values, last=True)[0])
         return self._ledger.taken()
 
     def _part(self, block: Block) -> Part | None:
@@ -231,7 +233,7 @@ class StreamGuard:
             whole = np.vstack([self._undecided.values, part.values])
             part = Part(first=self._undecided.first, time_s=part.time_s, values=whole)
             self._undecided = None
-        self._decide()
+        self._drop_undecided()
         found, held = self._rows.judge(part.values)
         n = part.size - held
         if held:
@@ -239,15 +241,16 @@ class StreamGuard:
         if n:
             self._give(part.first, part.values[:n], {kind: rows[:n] for kind, rows in found.items()})
 
-    def _decide(self) -> None:
-        """Give out undecided rows: what comes next does not follow on them."""
+    def _drop_undecided(self) -> None:
+        """Refuse rows that repeat the last value of a channel when nothing follows to tell whether it was frozen."""
         part, self._undecided = self._undecided, None
         if part is not None:
-            self._give(part.first, part.values, self._rows.unsound(part.values))
+            why = f"{part.size} samples from {part.first} on repeat the last value of a channel up to a gap"
+            self._ledger.reject("stuck", part.size, part.first, why)
 
     def _break(self) -> None:
         """Let the next stretch restart, whatever its number."""
-        self._decide()
+        self._drop_undecided()
         self._restart = True
 
     def _give(self, first: int, values: Array, found: Mapping[RowKind, Mask]) -> None:

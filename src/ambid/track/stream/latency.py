@@ -86,7 +86,7 @@ class LatencyStatistics:
         wanted, seen = max(fraction * self.count, 1.0), 0
         for at, n in enumerate(self._bins):
             seen += n
-            if seen >= wanted:
+            if seen >= wanted and at < len(self._bins) - 1:
                 return min(_LOWEST * float(10.0 ** (at / _PER_DECADE)), self.largest)
         return self.largest
 

@@ -1,13 +1,14 @@
 """Records as streams of blocks: at the pace at which they were taken or as fast as possible, with all their damage.
 
 Sample numbers come from the time column where there is one: a stamp that lies k periods after the one before it has a
-number larger by k. A stamp that runs back means repeated samples if the rows are the same as before, and a clock that
-was set back if they are not.
+number larger by k. A stamp that runs back means repeated samples if the rows are the same as before, late samples if
+they fill a gap, and otherwise a clock that was set back.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,6 +22,7 @@ from ambid.record.sampling import JITTER
 from ambid.track.stream.block import Array, Block, Frame
 
 _LONGEST_GAP_S = 60.0  # or ten times the record: a stamp that leads by more is a clock that was set
+_REMEMBERED = 256  # runs of rows that one that runs back is compared with
 _LONGEST_PAUSE_S = 1.0  # a gap in the numbers takes its time, up to this
 
 
@@ -175,10 +177,36 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
         placed[known[k] : known[k + 1]] = True
     steps = np.ones(time_s.size - 1, dtype=np.int64)
     steps[known[1:] - 1] = whole - (rows - 1)
-    for k in np.flatnonzero(steps < 1) + 1:
-        if not _repeats(values, int(k), 1 - int(steps[k - 1])):
-            steps[k - 1] = 1
-    return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64), placed, irregular
+    return _counted(steps, values), placed, irregular
+
+
+def _counted(steps: NDArray[np.int64], values: Array) -> NDArray[np.int64]:
+    """Add up the steps; one that runs back counts only if its rows came before, or fill a gap that was left."""
+    numbers = np.arange(steps.size + 1, dtype=np.int64)
+    runs: deque[tuple[int, int, int]] = deque(maxlen=_REMEMBERED)  # first row, first number, number after the last
+    row = number = 0
+    for k in (np.flatnonzero(steps != 1) + 1).tolist():
+        after = number + k - row
+        numbers[row:k] = np.arange(number, after)
+        runs.append((row, number, after))
+        target = after - 1 + int(steps[k - 1])
+        if target < after and not _known(values, k, target, runs):
+            target = after  # the clock was set back
+        row, number = k, target
+    numbers[row:] = np.arange(number, number + numbers.size - row)
+    return numbers
+
+
+def _known(values: Array, k: int, target: int, runs: Sequence[tuple[int, int, int]]) -> bool:
+    """Tell whether row k is sample `target` again, or one that was left out after others."""
+    for row, first, stop in runs:
+        if first <= target < stop:
+            before = row + target - first
+            n = min(stop - target, values.shape[0] - k, 8)
+            if np.array_equal(values[k : k + n], values[before : before + n], equal_nan=True):
+                return True
+    lowest = min(first for _, first, _ in runs)
+    return target > lowest and not any(first <= target < stop for _, first, stop in runs)
 
 
 def _without_holes(time_s: Array, numbers: NDArray[np.int64], rate_hz: float) -> Array:
@@ -186,12 +214,6 @@ def _without_holes(time_s: Array, numbers: NDArray[np.int64], rate_hz: float) ->
     known = np.flatnonzero(np.isfinite(time_s))
     last = known[np.maximum(np.searchsorted(known, np.arange(time_s.size), side="right") - 1, 0)]
     return np.where(np.isfinite(time_s), time_s, time_s[last] + (numbers - numbers[last]) / rate_hz)
-
-
-def _repeats(values: Array, k: int, back: int) -> bool:
-    """Tell whether rows from k on are those from `back` rows before on."""
-    n = min(back, values.shape[0] - k, 8)
-    return k >= back and bool(np.array_equal(values[k : k + n], values[k - back : k - back + n], equal_nan=True))
 
 
 def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool] = lambda: False) -> Iterator[Frame]:

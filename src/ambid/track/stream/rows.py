@@ -83,13 +83,15 @@ class RowCheck:
             )
         self._threshold[:] = [_NEVER if n is None else n for n in each]
 
-    def judge(self, values: Array) -> tuple[dict[RowKind, Mask], int]:
+    def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
         """Say which rows must not be used, and how many at the end are not decided yet.
 
         Parameters
         ----------
         values : ndarray, shape (n_samples, n_channels)
             Follows on the rows that were decided before.
+        last : bool
+            Nothing follows, so everything is decided: a run that goes on at the end is a normal one.
 
         Returns
         -------
@@ -101,7 +103,7 @@ class RowCheck:
         found = self.unsound(values)
         if not self._watches:
             return found, 0
-        stuck, held = self._frozen(self._filled(values) if "nan" in found else values)
+        stuck, held = self._frozen(self._filled(values) if "nan" in found else values, last)
         if stuck is not None:
             _add(found, "stuck", stuck[:, None])
         return found, held
@@ -133,7 +135,7 @@ class RowCheck:
         at = np.maximum.accumulate(np.where(known, np.arange(values.shape[0])[:, None], -1), axis=0)
         return np.where(at >= 0, np.take_along_axis(values, np.maximum(at, 0), axis=0), self._last)
 
-    def _frozen(self, values: Array) -> tuple[Mask | None, int]:
+    def _frozen(self, values: Array, last: bool) -> tuple[Mask | None, int]:
         """Return the rows of frozen runs (None without any) and the undecided rows; learn normal runs."""
         n = values.shape[0]
         same = np.empty(values.shape, dtype=bool)
@@ -148,7 +150,7 @@ class RowCheck:
         held = 0
         for j in range(values.shape[1]):
             trailing = self._channel(j, same[:, j], lengths[:, j], stuck)
-            held = max(held, trailing)
+            held = max(held, 0 if last else trailing)
         decided = n - held
         if decided:
             self._last[:], self._run[:] = values[decided - 1], lengths[decided - 1]
