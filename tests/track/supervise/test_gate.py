@@ -171,6 +171,36 @@ def test_revert_goes_back_one_by_one_and_history_is_bounded():
     assert gate.revert().t == 3.0
 
 
+def test_refinements_do_not_crowd_out_what_can_be_gone_back_to():
+    rng = np.random.default_rng(9)
+    gate, P = gate_at(np.zeros(5), rng, kept=4), np.linalg.inv(1000 * INFORMATION)
+    start, n_accepted = gate.accepted, 0
+    for k in range(2000):  # ten seconds, a decision every 20 ms; the truth moves after five
+        truth = moved(15.0) if k >= 1000 else np.zeros(5)
+        if not gate.pending:
+            gate.propose(truth, P, 0.005 * k, "refined" if k != 1000 else "changed")
+        event = gate.judge(evidence(J, truth, k, rng), 0.005 * (k + 1))
+        if event is not None:
+            assert event.kind != "reverted"
+            n_accepted += event.kind == "accepted"
+    assert n_accepted > 450
+    times = np.array([a.t for a in gate.history])
+    assert len(times) == 4
+    assert times[-1] == pytest.approx(10.0, abs=0.1)
+    assert np.all(np.diff(times)[:-1] >= 0.9)
+    assert start not in gate.history
+    # of a chain of refinements longer than what is kept, probation still goes back to what was before all of them
+    gate = gate_at(np.zeros(5), rng, kept=4, apart_s=0.0)
+    start = gate.accepted
+    for step in range(1, 11):
+        gate.propose(moved(2.0 * step), P, float(step), "step")
+        gate.accept(float(step))
+    assert start not in gate.history
+    assert judged(gate, np.zeros(5), rng)[0].kind == "reverted"
+    assert gate.accepted is start
+    assert len(gate.history) == 1
+
+
 def test_a_newer_candidate_takes_the_place_of_one_that_waits():
     rng = np.random.default_rng(5)
     gate = gate_at(np.zeros(5), rng)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,57 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.errors import EstimationError
 from ambid.track.evidence import Evidence
 from ambid.track.lines import Event
+from ambid.track.supervise.comparison import Accepted, Comparison
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Accepted:
-    """Numbers that were accepted.
-
-    Attributes
-    ----------
-    values : ndarray, shape (p,)
-    covariance : ndarray, shape (p, p)
-    t : float
-        When, s of record.
-    why : str
-    """
-
-    values: Array
-    covariance: Array
-    t: float
-    why: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
-    """Candidate q against rival numbers a on evidence (J, r at q): what the gate decides on.
-
-    Attributes
-    ----------
-    blocks : int
-    gain : float
-        Loss of the rival less loss of the candidate: twice the gain in log-likelihood.
-    separation : float
-        |J (q - a)|², the gain to be expected if the candidate is the truth (minus that if the rival is).
-    sd : float
-        Standard deviation of the gain if the candidate is right up to its covariance.
-    misfit : float
-        Whitened square of the candidate's own residual: chi-squared with p degrees of freedom if it is right.
-    claim : float
-        Square of q - a over the sum of both covariances: whether the candidate says that something is not as accepted.
-    scale : float
-        Overdispersion by which these are to be judged, 1 or more.
-    """
-
-    blocks: int
-    gain: float
-    separation: float
-    sd: float
-    misfit: float
-    claim: float
-    scale: float
 
 
 class Gate:
@@ -91,6 +42,8 @@ class Gate:
         Time of the start, s.
     kept : int
         Accepted numbers kept to go back to, the present ones included.
+    apart_s : float
+        Refinements that come sooner after one another replace one another in what is kept, s.
     blocks, longest, probation : int
         Blocks before the first decision, before a refusal for want of information, and on probation.
     level : float
@@ -120,6 +73,7 @@ class Gate:
         covariance: ArrayLike,
         t: float = 0.0,
         kept: int = 8,
+        apart_s: float = 1.0,
         blocks: int = 4,
         longest: int = 200,
         probation: int = 200,
@@ -136,7 +90,7 @@ class Gate:
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
         self._gather, self._weigh = gather, weigh
-        self._blocks, self._longest, self._probation = blocks, longest, probation
+        self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation
         p = len(self.names)
         self._inlet, self._sides, self._out = np.zeros((p + 1, p + 1)), np.zeros((2 * p + 1, p)), np.zeros(5 + p)
         self._scratch = (np.zeros((p, p)), np.zeros((p, p + 1)), np.zeros((p, p + 1)))
@@ -236,7 +190,7 @@ class Gate:
         allowance = max(0.0, 2 * self._z * seen.sd - seen.separation)
         if seen.gain < -allowance:
             return self._refuse(t, seen, f"the accepted numbers predict better; chance allows {allowance:.3g}")
-        return self._accept(new, t, f"{new.why}: {_numbers(seen)}", seen)
+        return self._accept(new, t, f"{new.why}: {seen.text}", seen)
 
     def accept(self, t: float) -> Event:
         """Accept the waiting candidate unjudged, as the operator may order; probation follows all the same.
@@ -273,7 +227,15 @@ class Gate:
         t = left.t if t is None else t
         if len(self._history) < 2:
             return Event(kind="refused", t=t, why="there are no earlier numbers to go back to")
-        self._history.pop()
+        return self._return(self._history[-2], t, why)
+
+    def _return(self, goal: Accepted, t: float, why: str) -> Event:
+        """Put earlier numbers in force again."""
+        left = self.accepted
+        while self._history and self._history[-1].t >= goal.t and self._history[-1] is not goal:
+            self._history.pop()
+        if not self._history or self._history[-1] is not goal:
+            self._history.append(goal)
         self._candidate = self._before = None
         return Event(
             kind="reverted",
@@ -294,9 +256,7 @@ class Gate:
         seen = self._compare(self._watched, self.accepted, self._before)
         if -seen.gain > self._z_back * seen.sd:
             self.last, goal = seen, self._before
-            while len(self._history) > 2 and self._history[-2] is not goal:
-                self._history.pop()
-            return self.revert(t, f"the earlier numbers predict better ({_numbers(seen)})")
+            return self._return(goal, t, f"the earlier numbers predict better ({seen.text})")
         if n >= self._probation:
             self._before = None
         return None
@@ -328,16 +288,20 @@ class Gate:
             self._next = self._blocks
         else:  # the trial goes on against the older numbers: a chain of small steps does not escape it
             self._watched.move(new.values)
-        self._history.append(Accepted(values=new.values, covariance=new.covariance, t=t, why=new.why))
+        refined = seen is not None and seen.claim <= self._misfit
+        kept = self._history
+        if refined and len(kept) > 1 and kept[-1].refined and kept[-1].t - kept[-2].t < self._apart:
+            kept.pop()
+        kept.append(Accepted(values=new.values, covariance=new.covariance, t=t, why=new.why, refined=refined))
         self._candidate = None
-        values = dict(zip(self.names, moved.tolist(), strict=True)) if seen is None else _values(seen)
+        values = dict(zip(self.names, moved.tolist(), strict=True)) if seen is None else dict(seen.values)
         return Event(kind="accepted", t=t, why=why, values=values)
 
     def _refuse(self, t: float, seen: Comparison, why: str) -> Event:
         """Drop the candidate."""
         reason = "" if self._candidate is None else f"{self._candidate.why}: "
         self._candidate = None
-        return Event(kind="refused", t=t, why=f"{reason}{why} ({_numbers(seen)})", values=_values(seen))
+        return Event(kind="refused", t=t, why=f"{reason}{why} ({seen.text})", values=dict(seen.values))
 
     def _checked(self, values: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         """Return copies, or refuse them."""
@@ -371,22 +335,3 @@ class _Sum:
         self.freedom += evidence.freedom
         self.blocks += 1
         return True
-
-
-def _numbers(seen: Comparison) -> str:
-    """Return the reason in numbers."""
-    return (
-        f"over {seen.blocks} blocks gain {seen.gain:.3g}, expected {seen.separation:.3g} with sd {seen.sd:.2g}, "
-        f"misfit {seen.misfit:.3g}"
-    )
-
-
-def _values(seen: Comparison) -> dict[str, float]:
-    return {
-        "blocks": float(seen.blocks),
-        "gain": seen.gain,
-        "separation": seen.separation,
-        "sd": seen.sd,
-        "misfit": seen.misfit,
-        "scale": seen.scale,
-    }
