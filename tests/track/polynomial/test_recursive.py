@@ -21,7 +21,7 @@ SLOW = System(  # a lightly damped plant sampled fast, coloured noise: what a be
     F=(1.0, -1.94, 0.9509),
     sd=0.1,
 )
-BAR_6 = {"armax": SYSTEMS["armax"], "oe": SYSTEMS["oe"], "bj": SYSTEMS["bj"], "slow": SLOW}
+BAR_6 = {name: SYSTEMS[name] for name in ("armax", "oe", "bj", "arma", "ararmax")} | {"slow": SLOW}
 
 
 def distance(found: RecursivePolynomial, fit) -> float:
@@ -49,6 +49,8 @@ def test_final_estimate_is_the_offline_one(name: str, seed: int) -> None:
         np.testing.assert_allclose(r.sd, fit.sd[fit.sd > 0], rtol=0.05)
         np.testing.assert_allclose(r.noise_variance, fit.noise_covariance[0, 0], rtol=0.03)
         np.testing.assert_allclose(r.model.dt, 1e-3)
+        if not data.n_inputs:
+            continue
         at = r.offsets, fit.offsets  # an offset of the input is one of the output as well
         gain = [x.frequency_response(np.zeros(1))[0, 0, 0].real for x in (r.model, fit.model)]
         levels = [o.y[0] - g * o.u[0] for o, g in zip(at, gain, strict=True)]
@@ -172,8 +174,19 @@ def test_coefficients_that_would_be_unstable_are_held_back_and_counted() -> None
         assert abs(p.F[0][1]) < 1
     assert r.n_projected > 0
     assert r.fit().details["projected"] == r.n_projected
+    assert any("unstable C or F" in w for w in r.warnings)
     assert abs(r.estimate[0] - 1.0) < 0.3
     assert abs(r.estimate[2] + 0.97) < 0.03
+
+
+def test_errors_that_grow_are_told() -> None:
+    r, (u, y) = RecursivePolynomial.from_fit(fit_of("armax")), signals("armax")(1000, 2)
+    r.update(u, y)
+    assert not r.warnings
+    r.update(u, y + np.random.default_rng(3).standard_normal(y.size))
+    assert any("times those at the start" in w for w in r.warnings)
+    r.update(np.nan, np.nan)
+    assert any("wait" in w for w in r.warnings)
 
 
 def test_no_excitation_no_wind_up() -> None:

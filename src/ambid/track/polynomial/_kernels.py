@@ -21,9 +21,8 @@ _FORGET, _FINAL, _GROWTH, _SQUARES, _WEIGHT, _NOISE, _LEVELS = range(7)  # of `r
 _FIRST = 2  # free coefficient
 
 _RADIUS = 0.99999  # roots of C and F stay inside
-_HALVINGS = 30
 _RUNG_OUT = 0.01  # of what was unknown at a new beginning: what is left then counts for nothing
-_LONGEST_RING = 20000
+_LONGEST_RING = 5000  # a root at the border would never let it
 _EVERY = 64  # samples between looks at the growth of the covariance
 
 
@@ -101,22 +100,20 @@ def _stable(theta: Array, first: int, n: int, work: Array) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _follow(plan: Table, meta: Table, theta: Array, coef: Array, trial: Array, work: Array) -> int:
-    """Move `coef` towards theta as far as C and F stay stable; return 1 if it stopped short."""
-    share = 1.0
-    for _ in range(_HALVINGS):
-        for j in range(theta.size):
-            x = coef[_FIRST + j]
-            trial[_FIRST + j] = theta[j] if share == 1.0 else x + share * (theta[j] - x)
-        good = True
-        for k in range(meta[_STABLE], meta[_STABLE] + meta[_N_STABLE]):
-            good = good and _stable(trial, plan[k, 0], plan[k, 1], work)
-        if good:
-            for j in range(theta.size):
-                coef[_FIRST + j] = trial[_FIRST + j]
-            break
-        share *= 0.5
-    return int(share != 1.0)
+def follow(plan: Table, meta: Table, theta: Array, coef: Array, work: Array) -> int:
+    """Let the filters have theta; return 1 if roots of C or F had to be drawn towards zero to keep them stable."""
+    drawn = 0
+    for j in range(theta.size):
+        coef[_FIRST + j] = theta[j]
+    for k in range(meta[_STABLE], meta[_STABLE] + meta[_N_STABLE]):
+        first, n, shrink = plan[k, 0], plan[k, 1], 1.0 - _RADIUS
+        while not _stable(coef, first, n, work):
+            drawn, factor = 1, 1.0
+            for j in range(n):
+                factor *= max(1.0 - shrink, 0.0)
+                coef[first + j] = theta[first - _FIRST + j] * factor
+            shrink *= 2.0
+    return drawn
 
 
 @njit(cache=True, nogil=True)
@@ -216,7 +213,7 @@ def _learn(
     for j in range(theta.size):
         theta[j] += gain[j] * e
     level = coef[_FIRST + theta.size - 1]
-    count[_PROJECTED] += _follow(plan, meta, theta, coef, work[2], work[3])
+    count[_PROJECTED] += follow(plan, meta, theta, coef, work[2])
     _shift(plan, meta, coef[_FIRST + theta.size - 1] - level, s, t)
     filter_column(plan, meta, meta[_INPUT], meta[_RESIDUAL], coef, s, t)
     count[_LEARNT] += 1

@@ -15,6 +15,7 @@ from ambid.track.polynomial.state import State, covariance_of, noise_variance_of
 
 Array = NDArray[np.float64]
 
+_WORSE = 1.5  # growth of the innovations' standard deviation that is told
 _INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
 
 
@@ -88,11 +89,20 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful
             f"{name} is biased where a controller is at work, and nothing says that this loop is open: use bj or "
             "armax, or say open_loop if there is no feedback"
         )
-    if state is not None and not np.array_equal(state.theta, state.at):
+    if state is None:
+        return tuple(found)
+    if state.at_border:
         found.append(
-            f"{name}: the data ask for an unstable C or F; stable coefficients are shown and their standard deviations "
-            "are not to be trusted. If the plant is unstable, use armax or arx"
+            f"{name}: the data ask, or often asked, for an unstable C or F; stable coefficients are shown and their "
+            "standard deviations are not to be trusted. If the plant integrates or is unstable, use armax or arx"
         )
+    if state.worse > _WORSE:
+        found.append(
+            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has grown, or the "
+            "structure does not hold what the data show. Raise the orders, or forget faster"
+        )
+    if state.waits:
+        found.append(f"{name}: nothing is learnt at present: the filters wait for history after the start or a gap")
     return tuple(found)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.polynomial_model import PolynomialModel
+from ambid.identify.blackbox.structures import any_structure as structure
 from ambid.identify.polynomial.orders import Layout
 from ambid.track.polynomial.state import Forgetting, State, new_state
 
@@ -59,9 +60,10 @@ def identity_of(fit: BlackBoxFit) -> Identity:
         If it cannot be tracked.
     """
     model = fit.model
-    if not isinstance(model, PolynomialModel):
+    known = structure(fit.structure).home.startswith("ambid.identify.polynomial:")
+    if not known or not isinstance(model, PolynomialModel):
         raise EstimationError(
-            f"{fit.structure} is no polynomial model in q and cannot be tracked as one. Fit armax, say"
+            f"{fit.structure} is no prediction error fit of a polynomial model; it cannot be followed. Fit armax, say"
         )
     if model.n_outputs != 1:
         raise EstimationError(

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Table = NDArray[np.int64]
 
 COUNTED = (3, 4, 5, 6, 7)  # places in `State.count`: used, rejected, waited, projected, held
+_OFTEN = 1e-3
 _COLUMNS = 512  # samples that the buffer takes before its end becomes the next history
 
 
@@ -77,7 +78,7 @@ class State:
     limit : ndarray, shape (n,)
         Variances beyond which forgetting rests.
     signals : ndarray, shape (n_rows, n_columns)
-    work : ndarray, shape (4, 2 + n)
+    work : ndarray, shape (3, 2 + n)
     """
 
     plan: Table
@@ -120,6 +121,21 @@ class State:
         """
         names = ("used", "rejected", "waited", "projected", "held")
         return {name: int(self.count[k]) for name, k in zip(names, COUNTED, strict=True)}
+
+    @property
+    def at_border(self) -> bool:
+        """Whether the filters had to stop short of the estimate often, or do so now."""
+        return bool(self.count[6] > _OFTEN * self.count[8] or not np.array_equal(self.theta, self.at))
+
+    @property
+    def waits(self) -> bool:
+        """Whether nothing is predicted for want of history."""
+        return bool(self.count[1] < self.meta[2] or self.count[2])
+
+    @property
+    def worse(self) -> float:
+        """Standard deviation of the innovations over that of the start."""
+        return float(np.sqrt(self.real[3] / self.real[4] / self.real[5]))
 
     def go_on_counting(self, before: State | None, samples: int) -> None:
         """Take over counters and the forgetting of the moment, as if the samples had been taken in one by one.
@@ -187,6 +203,10 @@ def new_state(
     count = np.zeros(16, dtype=np.int64)
     count[0] = longest
     inverse = np.linalg.inv(factor / np.sqrt(np.diag(P))[:, None]) / np.sqrt(np.diag(P))
+    from ambid.track.polynomial._kernels import follow
+
+    coef, work = np.concatenate([[1.0, -1.0], theta]), np.zeros((3, 2 + theta.size))
+    follow(plan.rows, plan.meta, theta, coef, work[2])
     return State(
         plan=plan.rows,
         meta=plan.meta,
@@ -195,12 +215,12 @@ def new_state(
             [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight, noise_variance], centre]
         ),
         theta=theta.copy(),
-        coef=np.concatenate([[1.0, -1.0], theta]),
+        coef=coef,
         UD=UD,
         S=np.asarray(inverse.T @ inverse) if forgetting.forgets else np.empty((0, 0)),
         limit=limit.copy(),
         signals=np.zeros((plan.n_signals, longest + _COLUMNS)),
-        work=np.zeros((4, 2 + theta.size)),
+        work=work,
     )
 
 
