@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import sys
 import threading
 from collections.abc import Sized
@@ -15,8 +17,9 @@ _ATTACHING = threading.Lock()
 
 def created(size: int) -> SharedMemory:
     """Make a segment of zeros with a name of its own; the resource tracker removes it should this process be killed."""
+    name = f"ambid-{os.getpid()}-{secrets.token_hex(4)}"
     try:
-        return SharedMemory(create=True, size=size)
+        return SharedMemory(name=name, create=True, size=size)
     except OSError as failure:
         raise EstimationError(
             f"no shared memory of {size} bytes for a ring: {failure.strerror or failure}. Use fewer or shorter blocks"

@@ -37,6 +37,10 @@ class StreamReport:
         That came.
     given, rejected, missing : int
         Samples that the consumer got; that came and were not given; that never came.
+    reordered : int
+        Blocks that came too late but in time to be put right.
+    drift : float
+        Of the acquisition's clock, relative to the stated rate.
     events, rejected_samples : Mapping of str to int
         Rejections of each kind, and the samples in them.
     seconds : float
@@ -44,7 +48,7 @@ class StreamReport:
     working_s : float
         Of these, in the guard and the consumer.
     latency : Latency or None
-        None if nothing came.
+        None if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
     torn : int
         Blocks lost because their check value was wrong.
     interrupted : bool
@@ -56,6 +60,8 @@ class StreamReport:
     given: int
     rejected: int
     missing: int
+    reordered: int
+    drift: float
     events: Mapping[RejectionKind, int]
     rejected_samples: Mapping[RejectionKind, int]
     seconds: float
@@ -220,6 +226,8 @@ class _Pump:
             given=guard.n_given,
             rejected=guard.n_rejected,
             missing=guard.n_missing,
+            reordered=guard.n_reordered,
+            drift=guard.drift,
             events=MappingProxyType(dict(guard.events)),
             rejected_samples=MappingProxyType(dict(guard.samples)),
             seconds=time.perf_counter() - self._begun,

@@ -41,6 +41,13 @@ _RETRIES = 100  # of a frame whose check fails: its last bytes may be on their w
 class BlockRing:
     """Blocks in shared memory, one producer and one consumer. Made by `create` or `attach`; closed by ``with``.
 
+    Parameters
+    ----------
+    segment : SharedMemory
+        That holds a ring.
+    owner : bool
+        Whether to remove it in the end.
+
     Attributes
     ----------
     name : str
@@ -49,6 +56,8 @@ class BlockRing:
         Capacity in blocks, and the longest block that goes into one.
     channels : tuple of str
     rate_hz : float
+    torn : int
+        Blocks that were passed over because their check value was wrong.
     """
 
     def __init__(self, segment: SharedMemory, *, owner: bool) -> None:
