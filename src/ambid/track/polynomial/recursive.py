@@ -41,7 +41,10 @@ class RecursivePolynomial:
     noise, whatever is forgotten; how far the estimate lags behind coefficients that move is not in it. `fir` and `oe`
     have no noise model: they are biased under feedback, and `warnings` says so unless `open_loop` is given. ARMAX, BJ
     and the others are consistent under feedback as long as their noise model holds the true one. An unstable plant
-    wants A (arx, armax, ararmax): F has to be stable.
+    wants A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
+
+    A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
+    learnt until the unknown states of the filters have died away (`n_waited`).
 
     Parameters
     ----------
