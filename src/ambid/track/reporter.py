@@ -189,13 +189,14 @@ def header(
     """
     numbers = supervisor.rpem.numbers
     start: dict[str, TrackedValue] = supervisor.parameters
+    gains = [name for name, kind in zip(numbers.names, numbers.kinds, strict=True) if kind == "gain"]
     units = dict(zip(numbers.names, numbers.units, strict=True))
     return TrackHeader(
         rate_hz=numbers.rate_hz,
         limit=limit,
         method=method,
         model=numbers.problem.model.name,
-        units={**{name: units[name] for name in start}, **_EXTRA_UNITS},
+        units={**{name: units[name] for name in (*start, *gains)}, **_EXTRA_UNITS},
         every_s=every_s,
         start=start,
         record=record,

@@ -30,7 +30,7 @@ Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
 UNBALANCE = ("unbalance_cos", "unbalance_sin")
 MEMORY_S = 0.1  # longest memory of the predictor: what happened before cannot disturb the tracking of changes
 _LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
-_LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that does not say how sure it is
+_LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
 _GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
 _GAIN_SD = 0.1  # relative, of an entry of the predictor gain
 _OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
@@ -342,7 +342,8 @@ def _noise(plant: SensorGains, estimate: Estimate, scales: Scales) -> _NoiseNumb
         with np.errstate(divide="ignore"):
             numbers = np.log(np.concatenate([held, sensor[1:]]) / sensor[0])
         if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
-            return _NoiseNumbers(form="levels", numbers=numbers, sd=np.full(numbers.size, _LOG_LEVEL_SD), gain=gain)
+            sd = np.full(numbers.size, _LOG_LEVEL_SD * np.sqrt(_overdispersion(estimate)))
+            return _NoiseNumbers(form="levels", numbers=numbers, sd=sd, gain=gain)
     nothing = np.zeros(0)
     return _NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest))
 

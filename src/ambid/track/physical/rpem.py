@@ -28,11 +28,12 @@ Array = NDArray[np.float64]
 Memory = float | Literal["auto", "all"]
 
 BLOCK_S = 0.005  # of one evidence
-_FEWEST = 4  # samples of one evidence
+_ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at least: the noise shows in what is left
 _START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
 _NOISE_S = 2.0  # time constant with which the noise level is followed
+_TRANSIENT = 2.0  # times the usual noise in one block: more than chance makes, which is why it says something else
 _LOWEST_NOISE = 0.25  # of the level at identification: less is not believed
 _OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of which nothing is known before
 
@@ -48,7 +49,7 @@ class PhysicalRpem:
         Time constant with which old data are forgotten, s; found for each number by maximum likelihood; or all data
         count alike.
     block : int, optional
-        Samples of one evidence; by default 5 ms.
+        Samples of one evidence; by default 5 ms, and enough innovations to tell noise from numbers.
 
     Attributes
     ----------
@@ -76,7 +77,8 @@ class PhysicalRpem:
         at = linearise(numbers, numbers.start)
         if at is None:
             raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
-        size = max(round(BLOCK_S * numbers.rate_hz), _FEWEST) if block is None else block
+        fewest = -(-_ROWS_PER_NUMBER * numbers.start.size // len(numbers.problem.model.outputs))
+        size = max(round(BLOCK_S * numbers.rate_hz), fewest) if block is None else block
         if size < 1:
             raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
         self.numbers, self.block_samples, self.block_s = numbers, size, size / numbers.rate_hz
@@ -150,7 +152,7 @@ class PhysicalRpem:
         """
         self.predict()
         self.drift.add(evidence, self.filter, self.noise)
-        self.filter.absorb(evidence, self.noise)
+        self.filter.absorb(evidence, self.noise_of(evidence))
         self.follow_noise(evidence)
         self.refresh()
 
@@ -164,6 +166,23 @@ class PhysicalRpem:
         moved = self.filter.q - self.stream.at.at
         if np.any(moved * moved > self._curved * self.filter.sd):
             self.move_to(self.filter.q)
+
+    def noise_of(self, evidence: Evidence) -> float:
+        """Return the variance with which a block's residual is taken.
+
+        Parameters
+        ----------
+        evidence : Evidence
+
+        Returns
+        -------
+        float
+            The usual one; where much more is left unexplained than usual, so much larger: a transient that the model
+            does not know must not move the numbers.
+        """
+        own = evidence.rest / evidence.freedom if evidence.freedom else 0.0
+        usual = max(self.noise_level, _LOWEST_NOISE)
+        return self.numbers.overdispersion * (own if own > _TRANSIENT * usual else usual)
 
     def follow_noise(self, evidence: Evidence) -> None:
         """Follow the noise level by the part of a block's innovations that no number explains.

@@ -37,6 +37,7 @@ _BLOCKS_AFTER = 3  # of settled evidence before the first search after a change
 _ATTEMPTS = 5
 _BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
+_TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
 _STRAY = 3.0  # moves by which such a number is widened
 # Numbers that describe the noise are seen through the innovations alone: over short blocks the squares of what they
 # explain are up to half as large again as chi-squared has it (as in the estimate of a root near one)
@@ -225,8 +226,9 @@ class Supervisor:
         if self._recovery is not None:
             self._recover(evidence, t)
         else:
+            self._detector.drift = rpem.drift.variance * rpem.block_s
             alarm = self._detector.update(evidence, rpem.filter.q, rpem.filter.covariance)
-            if alarm is not None:
+            if alarm is not None and not self._undecided(alarm):
                 self._alarmed(alarm, t)
             if self._recovery is None:
                 rpem.drift.add(evidence, rpem.filter, rpem.noise)
@@ -241,6 +243,11 @@ class Supervisor:
         names, active = self.rpem.numbers.names, self.rpem.filter.active
         for name, fresh in self._excitation.fresh.items():
             active[names.index(name)] = fresh
+
+    def _undecided(self, alarm: Alarm) -> bool:
+        """Wait another block or two where a disturbance and a fault of the bench explain the first ones alike."""
+        doubtful = self._kind(alarm.parameter) in _DISTURBED and any(self._kind(n) in _BENCH for n, _ in alarm.rivals)
+        return doubtful and alarm.blocks < _TELLING
 
     def _alarmed(self, alarm: Alarm, t: float) -> None:
         """Begin to deal with a change."""
@@ -260,7 +267,7 @@ class Supervisor:
             self._detector.restart(rpem.stream.sample)
             self.gate.restart()
             return
-        if not moved and alarm.noise > alarm.threshold**0.5:
+        if alarm.by == "noise":
             rpem.noise_level = max(rpem.noise_level, alarm.noise)
             self._detector.restart(rpem.stream.sample)
             return
