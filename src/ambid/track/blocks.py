@@ -6,6 +6,7 @@ filters of two regressions; recursive instrumental variables or least squares gi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import ceil, exp, isfinite
 
 import numpy as np
@@ -23,6 +24,8 @@ _WARM_UP = 4000  # samples, from which scales, means and the start are found
 _BATCH = 256  # samples, at least
 _CORNER = 3.0  # of the default filter, over the pole of the coil
 _FORGOTTEN = 4.0  # time constants after which a filter has forgotten how it began
+_DOUBT = 1e-3  # probability under which a start is not of first order
+_POOR = 0.5  # fit under which the blocks are of no use
 _LONGEST_WAIT = 4  # warm-ups that are given to that
 
 
@@ -32,11 +35,13 @@ class OnlineThreeBlocks:
     The first samples (`warm_up`) are kept: they give means, scales and, without `start`, the off-line estimate from
     which the regressions are linearised; computing that once takes some tenths of a second. From then on memory is
     constant. The filters follow the estimated poles at fixed counts of samples, so that splitting the stream in another
-    way does not change any number.
+    way does not change any number. With `memory_s`, standard deviations are those of blocks that stand still: the lag
+    behind a drift, about memory_s times its speed, comes on top. Where too little moves the blocks, nothing is
+    forgotten and the result says so.
 
     Instruments are what the reference, or in open loop the voltage, makes of current and position through the present
     blocks: no noise of current and position reaches them. Without them (``instruments=False``, the thesis's recursive
-    least squares) noise of the position biases TFb, and noise of both TFc.
+    least squares) noise of the position biases TFb, and noise of both TFc; white noise little, slow noise much.
 
     Parameters
     ----------
@@ -102,7 +107,7 @@ class OnlineThreeBlocks:
         self._why = "still warming up"
         self._at: Linearisation | None = None
         self._filter: StreamingFilter
-        self._wait = 0
+        self._wait, self._start_doubt = 0, 1.0
         self.n_used = self.n_rejected = self._quiet = 0
 
     def update(
@@ -175,24 +180,41 @@ class OnlineThreeBlocks:
         covariance = self._sums.covariance()[np.ix_(keep, keep)] * np.outer(both, both)
         sd = np.sqrt(np.diag(covariance))
         behind = abs(theta[1] - self._at.a) > 3 * sd[1] or abs(theta[3] - self._at.b) > 3 * sd[3]
-        least = (
-            "recursive least squares: noise of current and position is in the regressors and biases the blocks. Use "
-            "instruments where no feedback is at work or a reference is known"
-        )
-        quiet = (
-            f"too little moved the blocks for {self._quiet * self._dt:.3g} s: nothing is forgotten meanwhile, and the "
-            "numbers are mostly from before"
-        )
+        fit = self._sums.fit()
         return blocks_of(
             theta[keep] * unit,
             covariance,
             self._dt,
-            fit=self._sums.fit(),
+            fit=fit,
             doubt=self._sums.doubt(),
             settled=not behind,
             safe=self._safe,
-            remarks=(() if self._instruments else (least,)) + ((quiet,) if self._quiet else ()),
+            remarks=self._remarks(fit),
         )
+
+    def _remarks(self, fit: Mapping[str, float]) -> tuple[str, ...]:
+        out = []
+        if not self._instruments:
+            out.append(
+                "recursive least squares: noise of current and position is in the regressors and biases the blocks. "
+                "Use instruments where no feedback is at work or a reference is known"
+            )
+        if self._quiet:
+            out.append(
+                f"too little moved the blocks for {self._quiet * self._dt:.3g} s: nothing is forgotten meanwhile, and "
+                "the numbers are mostly from before"
+            )
+        if self._start_doubt < _DOUBT:
+            out.append(
+                f"where the start comes from, no blocks of first order were seen (p = {self._start_doubt:.2g}): "
+                "take the numbers as a rough guide, and the grey-box model for the parameters"
+            )
+        out += [
+            f"the blocks explain little of the {name} (fit {part:.2g}): do not use them"
+            for name, part in fit.items()
+            if part < _POOR
+        ]
+        return tuple(out)
 
     def _update_one(self, v: float, i: float, x: ArrayLike, d: ArrayLike) -> Array | None:
         """One sample without the checks of a block; None where it needs them."""
@@ -257,6 +279,7 @@ class OnlineThreeBlocks:
                     open_loop=self._safe,
                 )
             blocks = [start.blocks[name] for name in "abc"]
+            self._start_doubt = min(start.first_order.values(), default=1.0)
             if not (scale > 0).all() or min(blocks[0].pole, blocks[1].pole) <= 0:
                 raise EstimationError("a signal stands still, or the coil is not stable")
         except EstimationError as why:
@@ -286,7 +309,7 @@ class OnlineThreeBlocks:
         self._fresh, self._skip, self._filled = True, self._wait, 0
         self._rows, self._state, self._block_rows = np.empty((self._batch, N_ROW)), np.zeros(N_STATE), block_rows
         factor = 1.0 if self._memory_s is None else exp(-self._dt / self._memory_s)
-        longest = np.inf if self._memory_s is None else self._memory_s / 8
+        longest = np.inf if self._memory_s is None else self._memory_s
         stretch = min(_FORGOTTEN / min(a, b, f), longest) / (self._batch * self._dt)
         self._sums = Sums(
             factor**self._batch, factor ** np.arange(self._batch - 1.0, -1.0, -1.0), ceil(min(stretch, 1e9))
@@ -320,10 +343,12 @@ class OnlineThreeBlocks:
         """Use a batch: sums, coefficients, and the point of linearisation for the next."""
         self._filled = 0
         assert self._at is not None
-        self._quiet = 0 if self._sums.add(self._rows, self._theta) else self._quiet + self._batch
+        starving = self._sums.add(self._rows, self._theta)
+        self._quiet = self._quiet + self._batch if starving else 0
         self._theta = self._sums.solve() or self._theta
-        if self._sums.enough:
+        if self._sums.enough and not starving:
             sd = np.sqrt(np.maximum(np.diag(self._sums.covariance()), 0.0))
             self._at, keep = self._at.moved(np.concatenate(self._theta), sd, self._dt)
-            self._sums.discount(keep)
+            if self._memory_s is None:  # with forgetting, what was linearised elsewhere goes by itself
+                self._sums.discount(keep)
             self._constants = self._at.constants(self._dt, least_squares=not self._instruments)

@@ -26,6 +26,7 @@ _ADOPTED = 0.3  # part of a pole that its standard deviation may be, for the fil
 _LEAST_BATCHES = 8
 _STRETCHES = 32  # kept apart
 _WIND_UP = 16.0  # part of the best variance of a coefficient beyond which nothing is forgotten
+_PATIENCE = 8.0  # memory of the scatter over that of the coefficients
 _RECENT = 16  # batches over which the fit is averaged
 _CURVED = 0.1  # standard deviations by which curvature may move a pole before what is linearised elsewhere counts less
 _UNUSED_BATCHES = 2  # at the start, whose errors are those of the start
@@ -191,16 +192,16 @@ class Sums:
         Returns
         -------
         bool
-            Whether something was forgotten for it: what is left has to tell the coefficients.
+            Whether the sums tell some coefficient so little that nothing was forgotten.
         """
         fresh = [
             (rows[:, z] * self._weights[:, None]).T @ rows[:, part]
             for z, part in zip(_INSTRUMENTS, _REGRESSORS, strict=True)
         ]
         self._batches += 1
-        forgets = not self._starving()
-        if forgets:
-            self.discount(self._factor)
+        starving = self._starving()
+        if not starving:
+            self.discount(self._factor, self._factor ** (1.0 / _PATIENCE))
         self._energy *= min(self._factor, 1.0 - 1.0 / _RECENT)
         scores = []
         for k, (now, at, part) in enumerate(zip(fresh, theta, _REGRESSORS, strict=True)):
@@ -214,23 +215,26 @@ class Sums:
         if self._batches > _UNUSED_BATCHES:
             self._some += 1.0
             self._score(np.concatenate(scores) * np.sqrt(self._all / (self._all + 1.0)))
-        return forgets
+        return starving
 
-    def discount(self, keep: float) -> None:
+    def discount(self, keep: float, keep_scatter: float | None = None) -> None:
         """Give all that was seen so far less weight.
 
         Parameters
         ----------
         keep : float
             0 < keep <= 1.
+        keep_scatter : float, optional
+            Of the scatter of scores, the same if not given: noise is remembered longer than coefficients.
         """
         if keep == 1.0:
             return
+        slow = keep if keep_scatter is None else keep_scatter
         for moments in self.moments:
             moments *= keep
-        self._scores *= keep
-        self._scatter *= keep**2
-        self._all, self._some, self._older = keep**2 * self._all, keep**2 * self._some, keep**2 * self._older
+        self._scores *= slow
+        self._scatter *= slow**2
+        self._all, self._some, self._older = keep**2 * self._all, slow**2 * self._some, slow**2 * self._older
 
     def _starving(self) -> bool:
         """Whether the sums tell some coefficient so much less than they once did that nothing more may be forgotten."""

@@ -119,24 +119,24 @@ def lower(M: Array, rows: int, columns: int) -> None:
         a, rest = M[i, i], 0.0
         for j in range(i + 1, columns):
             rest += M[i, j] * M[i, j]
-        if rest <= _NOTHING * a * a:
-            if a < 0.0:
-                M[i:rows, i] *= -1.0
-            M[i, i + 1 : columns] = 0.0
-            continue
         size = sqrt(a * a + rest)
-        head = -rest / (a + size) if a > 0.0 else a - size
-        scale = -1.0 / (size * head)
-        for k in range(i + 1, rows):
-            along = head * M[k, i]
-            for j in range(i + 1, columns):
-                along += M[i, j] * M[k, j]
-            along *= scale
-            M[k, i] -= head * along
-            for j in range(i + 1, columns):
-                M[k, j] -= M[i, j] * along
+        if rest > _NOTHING * a * a:
+            head = -rest / (a + size) if a > 0.0 else a - size
+            scale = -1.0 / (size * head)
+            for k in range(i + 1, rows):
+                along = head * M[k, i]
+                for j in range(i + 1, columns):
+                    along += M[i, j] * M[k, j]
+                along *= scale
+                M[k, i] -= head * along
+                for j in range(i + 1, columns):
+                    M[k, j] -= M[i, j] * along
+        elif a < 0.0:
+            for k in range(i + 1, rows):
+                M[k, i] = -M[k, i]
         M[i, i] = size
-        M[i, i + 1 : columns] = 0.0
+        for j in range(i + 1, columns):
+            M[i, j] = 0.0
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -185,7 +185,8 @@ def state_scan(
             for j in range(n_u):
                 x += model[i, n + j] * u[k, j]
             work[i, 0] = x
-        memory[:n, n] = work[:n, 0]
+        for i in range(n):
+            memory[i, n] = work[i, 0]
     tally[0] = 1.0 if settled else 0.0
 
 
@@ -364,9 +365,9 @@ def synchronous_scan(y: Array, phase: Array, out: Array, state: Array, constants
             s[17] += 1.0
             out[k, j] = v - s[0] * c - s[1] * d
             e = out[k, j] - s[2]
-            work[:, :] = 0.0
             work[0, 0] = 1.0
             for i in range(3):
+                work[1 + i, 0] = 0.0
                 work[0, 1 + i] = c * s[3 + i] + d * s[6 + i] + s[9 + i]
                 for r in range(3):
                     work[1 + r, 1 + i] = s[3 + 3 * r + i]
