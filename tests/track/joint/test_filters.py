@@ -9,7 +9,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.track.joint import JointEkf, JointUkf, rates_of
-from ambid.track.joint._kernels import rank_one, rank_one_down
+from ambid.track.joint._square_root import rank_one, rank_one_down
 from tests.identify.benches import run
 from tests.track.joint.dense import Dense
 from tests.track.joint.drifting import drifting_resistance

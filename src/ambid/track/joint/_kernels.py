@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ambid.track.joint._square_root import carry, rank_one, rank_one_down, shrink, triangle
+
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -20,58 +22,6 @@ K, USED, REJECTED, PARTIAL, FILLED, FRESH, DUE, REFUSED, MISSED = range(9)
 _ABSURD, _HUGE = 1e3, 1e200  # standard deviations of an innovation beyond which it is no measurement
 _FORGET = 1.0 / 1024.0  # weight of a sample in the running level of the innovations
 _BLIND = 32  # samples without any output after which the state is taken for lost
-
-
-@njit(cache=True, nogil=True)
-def rank_one(T: Array, w: Array, first: int) -> None:
-    """Replace S by the factor of S S^T + w w^T by plane rotations; `w` is zero before `first` and is used up."""
-    n = T.shape[0]
-    for j in range(first, n):
-        r = np.hypot(T[j, j], w[j])
-        c, s = T[j, j] / r, w[j] / r
-        T[j, j], w[j] = r, 0.0
-        for i in range(j + 1, n):
-            t = T[j, i]
-            T[j, i] = c * t + s * w[i]
-            w[i] = c * w[i] - s * t
-
-
-@njit(cache=True, nogil=True)
-def rank_one_down(T: Array, w: Array, b: Array) -> bool:
-    """Replace S by the factor of S S^T - w w^T; leave it as it is and return False where that is not positive.
-
-    With S p = w the difference is S (I - p p^T) S^T; the bracket is factored from the bottom, where 1 - |p|^2 stands,
-    so that nothing cancels (as in Carlson 1973).
-    """
-    n = T.shape[0]
-    rest = 1.0
-    for i in range(n):
-        for j in range(i):
-            w[i] -= T[j, i] * w[j]
-        w[i] /= T[i, i]
-        rest -= w[i] * w[i]
-    if not rest > 1e-8:
-        return False
-    _shrink(T, w, rest, b)
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _shrink(T: Array, f: Array, beta: float, b: Array) -> None:
-    """Replace S by the factor of S (I - f f^T / alpha) S^T, alpha = beta + |f|^2; `b` becomes S f (Carlson 1973)."""
-    n = T.shape[0]
-    for i in range(n):
-        b[i] = 0.0
-    for j in range(n - 1, -1, -1):
-        f_j = f[j]
-        new = beta + f_j * f_j
-        root = np.sqrt(beta * new)
-        keep, take = beta / root, f_j / root
-        for i in range(j, n):
-            t = T[j, i]
-            T[j, i] = keep * t - take * b[i]
-            b[i] += f_j * t
-        beta = new
 
 
 @njit(cache=True, nogil=True)
@@ -96,7 +46,7 @@ def _measure(z: Array, T: Array, C: Array, e: Array, level: Array, f: Array, b: 
             e[o] = np.nan
             continue
         level[o] += (left * left / alpha - level[o]) * _FORGET
-        _shrink(T, f[:n], 1.0, b)
+        shrink(T, f[:n], 1.0, b)
         gain = left / alpha
         for i in range(n):
             z[i] += gain * b[i]
@@ -104,28 +54,6 @@ def _measure(z: Array, T: Array, C: Array, e: Array, level: Array, f: Array, b: 
             f[n + i] += gain * b[s + i]
         taken += 1
     return taken
-
-
-@njit(cache=True, nogil=True)
-def _triangle(T: Array, s: int, W: Array) -> None:
-    """Make the last block of S the lower triangular L with L L^T = W W^T (modified Gram-Schmidt, Bierman 1977)."""
-    n_x, wide = W.shape
-    for i in range(n_x):
-        acc = 0.0
-        for c in range(wide):
-            acc += W[i, c] * W[i, c]
-        length = np.sqrt(acc)
-        T[s + i, s + i] = length
-        back = 1.0 / length if length > 0.0 else 0.0
-        for c in range(wide):
-            W[i, c] *= back
-        for j in range(i + 1, n_x):
-            acc = 0.0
-            for c in range(wide):
-                acc += W[j, c] * W[i, c]
-            T[s + i, s + j] = acc
-            for c in range(wide):
-                W[j, c] -= acc * W[i, c]
 
 
 @njit(cache=True, nogil=True)
@@ -137,7 +65,8 @@ def _spread(T: Array, walk: Array, w: Array) -> None:
             for i in range(j + 1):
                 variance += T[i, j] * T[i, j]
             if variance < walk[1, j] * walk[1, j]:
-                w[:] = 0.0
+                for i in range(w.size):
+                    w[i] = 0.0
                 w[j] = walk[0, j]
                 rank_one(T, w, j)
 
@@ -147,10 +76,17 @@ def _restart(z: Array, T: Array, wide: Array) -> None:
     """Forget the plant's state, and what it had to do with the parameters."""
     n, n_x = z.size, wide.size
     s = n - n_x
-    z[s:] = 0.0
-    T[:, s:] = 0.0
     for i in range(s, n):
+        z[i] = 0.0
+        for j in range(n):
+            T[j, i] = 0.0
         T[i, i] = wide[i - s]
+
+
+@njit(cache=True, nogil=True)
+def _blank(e: Array) -> None:
+    for o in range(e.size):
+        e[o] = np.nan
 
 
 @njit(cache=True, nogil=True)
@@ -170,16 +106,17 @@ def _take(
         if not np.isfinite(u[i]):
             counts[REJECTED] += 1
             counts[FILLED], counts[FRESH] = 0, 1
-            e[:] = np.nan
+            _blank(e)
             return False
     for row in range(past.shape[0] - 1, 0, -1):
-        past[row] = past[row - 1]
+        for i in range(n_u):
+            past[row, i] = past[row - 1, i]
     for i in range(n_u):
         past[0, i] = (u[i] - io[0, i]) / io[1, i]
     counts[FILLED] = min(counts[FILLED] + 1, past.shape[0])
     if counts[FILLED] < past.shape[0]:
         counts[USED if missing < n_y else REJECTED] += 1
-        e[:] = np.nan
+        _blank(e)
         return False
     if missing == n_y:
         counts[REJECTED] += 1
@@ -194,38 +131,16 @@ def _take(
     for o in range(n_y):
         for i in range(n_x):
             e[o] -= C[o, i] * z[s + i]
-    f[n:] = 0.0
+    for i in range(n, n + n_x):
+        f[i] = 0.0
     taken = _measure(z, T, C, e, io[2, n_u:], f, b)
     counts[USED if taken else REJECTED] += 1
     counts[PARTIAL] += 0 < taken < n_y
     if taken == 0:  # an innovation that no noise can make: the state is lost
         counts[FILLED], counts[FRESH] = 0, 1
     if fresh:
-        e[:] = np.nan
+        _blank(e)
     return bool(taken > 0)
-
-
-@njit(cache=True, nogil=True)
-def _carry(T: Array, first: int, s: int, A: Array, J: Array, W: Array) -> None:
-    """Carry rows of x over a step: A S_x + J S_q in columns from `first` on; A S_xx goes to the first of `W`."""
-    n_x = J.shape[0]
-    v = W[:, :n_x]
-    for j in range(first, s):
-        for i in range(n_x):
-            acc = 0.0
-            for c in range(n_x):
-                acc += A[i, c] * T[j, s + c]
-            for c in range(j, s):
-                acc += J[i, c] * T[j, c]
-            v[i, 0] = acc
-        for i in range(n_x):
-            T[j, s + i] = v[i, 0]
-    for i in range(n_x):
-        for j in range(n_x):
-            acc = 0.0
-            for c in range(j, n_x):
-                acc += A[i, c] * T[s + j, s + c]
-            v[i, j] = acc
 
 
 @njit(cache=True, nogil=True)
@@ -242,6 +157,7 @@ def ekf_block(
     s, n_u, n_y, n_d = n - n_x, u.shape[1], y.shape[1], dist.size
     f, b, v, now = work[0, : n + n_x], work[1, :n], work[2, :wide_m], work[3 : 3 + n_x, :wide_m]
     J, W = work[3 + n_x : 3 + 2 * n_x, :s], work[3 + 2 * n_x : 3 + 3 * n_x, : n_x + n_d]
+    whole = 0  # a variable: of a constant the compiler would make one more version of `carry`
     for k in range(first, u.shape[0]):
         counts[K] += 1
         if _take(u[k], y[k], e[k], z, T, C, io, wide, past, counts, f, b):
@@ -274,9 +190,10 @@ def ekf_block(
                 for j in range(n_d):
                     J[i, p + j] = now[i, wide_m - n_d + j]
                     W[i, n_x + j] = now[i, wide_m - n_d + j] * dist[j]
-            _carry(T, 0, s, now, J, W)
-            _triangle(T, s, W)
-        e[k] *= io[1, n_u:]
+            carry(T, whole, s, now, J, W)
+            triangle(T, s, W)
+        for i in range(y.shape[1]):
+            e[k, i] *= io[1, n_u + i]
         if counts[K] % every == 0:
             _spread(T, walk, f[:n])
             for j in range(p):
@@ -347,7 +264,8 @@ def ukf_block(
     D, ends = work[7 : 7 + n_x, : n_x + n_u + n_d], work[7 + n_x : 7 + 3 * n_x, :p]
     A, J = work[7 + 3 * n_x : 7 + 4 * n_x, :n_x], work[7 + 4 * n_x : 7 + 5 * n_x, :s]
     W = work[7 + 5 * n_x : 7 + 6 * n_x, :wide_w]
-    zero[:] = 0.0
+    for i in range(n_u):
+        zero[i] = 0.0
     # points of the linear columns lie about the moved centre: all share its distance from the mean
     centre = cov_0 + 2.0 * other * (n - p)
     for k in range(u.shape[0]):
@@ -355,16 +273,17 @@ def ukf_block(
         if _take(u[k], y[k], e[k], z, T, C, io, wide, past, counts, f, b):
             now, late = past[past.shape[0] - 2], past[past.shape[0] - 1]
             # the central point, and the matrices there: the step is linear in states, offsets and disturbances
-            point[:] = z
+            for i in range(n):
+                point[i] = z[i]
             _fill(q, logs, place, size, start, factor, D, t)
             _move(D, x, now, late, o, fraction, terms, t)
-            up[:] = x
+            for i in range(n_x):
+                up[i] = x[i]
             for j in range(n_x + n_d):
-                x[:], o[:] = 0.0, 0.0
-                if j < n_x:
-                    x[j] = 1.0
-                else:
-                    o[j - n_x] = 1.0
+                for i in range(n_x):
+                    x[i] = 1.0 if i == j else 0.0
+                for i in range(n_d):
+                    o[i] = 1.0 if i == j - n_x else 0.0
                 _move(D, x, zero, zero, o, fraction, terms, t)
                 for i in range(n_x):
                     if j < n_x:
@@ -383,7 +302,7 @@ def ukf_block(
                     for i in range(n_x):
                         ends[side * n_x + i, j] = x[i]
                         still[i] += other * x[i]
-            _carry(T, p, s, A, J, W)
+            carry(T, p, s, A, J, W)
             for i in range(n_x):
                 for j in range(p):
                     plus, minus = ends[i, j], ends[n_x + i, j]
@@ -392,9 +311,10 @@ def ukf_block(
                 x[i] = np.sqrt(abs(centre)) * (up[i] - still[i])
                 W[i, wide_w - 1] = x[i] if centre > 0.0 else 0.0
                 z[s + i] = still[i]
-            _triangle(T, s, W)
+            triangle(T, s, W)
             if centre < 0.0 and not rank_one_down(T[s:, s:], x, b[:n_x]):
                 counts[REFUSED] += 1
-        e[k] *= io[1, n_u:]
+        for i in range(y.shape[1]):
+            e[k, i] *= io[1, n_u + i]
         if counts[K] % every == 0:
             _spread(T, walk, f[:n])

@@ -144,7 +144,10 @@ class JointEkf(JointFilter):
 
     def _renew(self) -> None:
         """Put the linearisation point at the estimate: exact matrices, exact derivatives by the scaled parameters."""
-        now, slopes = self._discrete()
+        with np.errstate(over="ignore", invalid="ignore"):
+            now, slopes = self._discrete()
+        if not all(np.isfinite(d.A).all() and np.isfinite(d.E).all() for d in (now, *slopes)):
+            return  # an estimate beyond all numbers: the last matrices stay, innovations say the rest
         self._at[:] = self._z[: self._at.size]
         self._M[:] = np.hstack([now.A, now.B, now.B_late, now.E])
         for j, d in enumerate(slopes):
