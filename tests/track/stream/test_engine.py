@@ -142,6 +142,21 @@ def test_an_exception_in_another_process_is_raised_here():
         engine(FailingReplay(3, RecordError("gone over there")), Sink(), producer="process")
 
 
+class DyingReplay:
+    """A source whose process dies without a word."""
+
+    def __iter__(self):
+        yield from blocks(X)[:3]
+        os._exit(7)
+
+
+def test_a_process_that_dies_is_told_of_when_what_it_left_is_delivered():
+    sink = Sink()
+    with pytest.raises(EstimationError, match="died with exit code 7"):
+        engine(DyingReplay(), sink, producer="process")
+    np.testing.assert_array_equal(sink.values(), X[:300])
+
+
 def test_a_source_that_cannot_be_sent_is_refused():
     with pytest.raises(EstimationError, match="cannot be sent to another process"):
         engine(failing(5), Sink(), producer="process")
@@ -229,6 +244,18 @@ if __name__ == "__main__":
     report = run(source, consume, guard=StreamGuard(20e3, 1), producer=sys.argv[1], pace="real-time")
     print(report.interrupted, report.given == report.samples, report.given, flush=True)
 """
+
+
+def test_a_producer_whose_consumer_was_killed_ends_too(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(script), "process"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=ROOT
+    )
+    assert process.stdout.readline().strip() == "ready"
+    process.kill()
+    assert process.stdout.read() == ""  # returns when nobody holds the pipe any more: the child has ended
+    assert not list(Path("/dev/shm").glob(f"ambid-{process.pid}-*"))
 
 
 @pytest.mark.parametrize("producer", EVERYWHERE)

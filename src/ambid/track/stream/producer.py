@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from typing import Literal, Protocol
 
@@ -69,7 +69,9 @@ def produced_in(
         raise failure
 
 
-def fill(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
+def fill(
+    source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace, *, alone: Callable[[], bool] = lambda: False
+) -> None:
     """Put the blocks of a source into a ring until they end or the consumer wants no more.
 
     Parameters
@@ -78,27 +80,29 @@ def fill(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -
     ring : BlockRing
     rate_hz : float
     pace : {"fastest", "real-time"}
+    alone : callable, optional
+        Tells whether the consumer is dead.
     """
+
+    def stopped() -> bool:
+        return ring.stopping or alone()
+
     try:
         if pace == "real-time":
-            for frame in paced(source, rate_hz, stopped=_stopping(ring)):
-                if ring.stopping:
+            for frame in paced(source, rate_hz, stopped=stopped):
+                if stopped():
                     return
                 ring.put(frame.block, frame.arrived_s)
             return
         for block in source:
             while not ring.wait_for_room(_LOOK_S):
-                if ring.stopping:
+                if stopped():
                     return
             if ring.stopping:
                 return
             ring.put(block)
     finally:
         ring.end()
-
-
-def _stopping(ring: BlockRing) -> Callable[[], bool]:
-    return lambda: ring.stopping
 
 
 class _Thread:
@@ -176,9 +180,10 @@ def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connectio
     """Fill the ring from another process; interrupts are the consumer's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     outcome: BaseException | None = None
+    parent = parent_process()
     with BlockRing.attach(name) as ring:
         try:
-            fill(pickle.loads(packed), ring, rate_hz, pace)
+            fill(pickle.loads(packed), ring, rate_hz, pace, alone=lambda: parent is not None and not parent.is_alive())
         except Exception as failure:
             outcome = failure
     try:
