@@ -137,6 +137,15 @@ def test_splitting_a_stream_changes_no_number():
     assert np.nanstd(wanted[:, 0]) < 2 * NOISE[0]
 
 
+def test_a_copy_goes_its_own_way(still):
+    online = fed([c[:20_000] for c in still], open_loop=True)
+    other, kept = online.copy(), online.result().covariance
+    found = other.update(*(c[20_000:] for c in still))
+    np.testing.assert_array_equal(online.result().covariance, kept)
+    np.testing.assert_array_equal(online.update(*(c[20_000:] for c in still)), found)
+    np.testing.assert_array_equal(online.result().covariance, other.result().covariance)
+
+
 def test_quiet_neither_winds_up_nor_moves_the_blocks():
     columns = np.array(record(6, 160_000, until=40_000)[:3])
     online = fed(columns[:, :40_000], open_loop=True, memory_s=0.3)

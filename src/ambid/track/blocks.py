@@ -7,7 +7,9 @@ filters of two regressions; recursive instrumental variables or least squares gi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from math import ceil, exp, isfinite
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -191,6 +193,15 @@ class OnlineThreeBlocks:
             safe=self._safe,
             remarks=self._remarks(fit),
         )
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        OnlineThreeBlocks
+        """
+        return deepcopy(self)
 
     def _remarks(self, fit: Mapping[str, float]) -> tuple[str, ...]:
         out = []

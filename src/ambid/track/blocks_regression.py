@@ -3,6 +3,9 @@
 i = K_a/(s + a) V + K_b/(s + b) x + constant is linearised in its poles; (s + c) x = K_c i + constant is divided by
 s + f, which turns the derivative into x - f/(s + f) x. The voltage is held over a sample, current and position are
 straight lines between samples: exact, and nothing is differentiated.
+
+Sums over batches take the place of a recursion by samples: covariance over both equations, doubt of the first order and
+the weight of what was linearised elsewhere all come from them.
 """
 
 from __future__ import annotations
