@@ -18,13 +18,14 @@ from ambid.errors import EstimationError
 from ambid.identify.estimate import Estimate
 from ambid.track.evidence import Evidence
 from ambid.track.physical.evidence_stream import EvidenceStream
-from ambid.track.physical.linearisation import linearise
+from ambid.track.physical.linearisation import Linearisation, linearise
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.signals import Samples, checked
 
 Array = NDArray[np.float64]
 
+_WHOLE = 1 << 40  # samples: a stretch is one block
 _ITERATIONS = 6
 _SETTLED = 0.05  # step, in standard deviations, below which the search has converged
 _HALVINGS = 4
@@ -102,7 +103,7 @@ def refine(
         if at is None:
             return None
         near = at.gain
-        stream = EvidenceStream(numbers, at, 1 << 40)
+        stream = EvidenceStream(numbers, at, _WHOLE)
         stream.restart(first)
         stream.feed(samples)
         evidence = stream.close(block)
@@ -122,6 +123,29 @@ def refine(
             )
         q = found.q.copy()
     return None
+
+
+def evidence_of(numbers: TrackedNumbers, at: Linearisation, samples: Samples, *, first: int = 0) -> Evidence | None:
+    """Return the evidence of a stretch as a whole.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    at : Linearisation
+    samples : Samples
+        Its first part settles the predictor.
+    first : int
+        Number of its first sample in the stream.
+
+    Returns
+    -------
+    Evidence or None
+        None where the stretch is too short to settle.
+    """
+    stream = EvidenceStream(numbers, at, _WHOLE)
+    stream.restart(first)
+    stream.feed(samples)
+    return stream.close(1)
 
 
 class MovingWindow:

@@ -11,14 +11,17 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ambid.track.lines import Event
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples
-from ambid.track.physical.window import Refined, refine
+from ambid.track.physical.window import Refined, evidence_of, refine
 
 _LEAST_SD = 0.3  # of a number that has moved, relative to its magnitude
 _STRAY = 3.0  # moves that the detector's estimate of a move may be off by
+_FEW = 3  # suspects that are searched in full
 _MISFIT = 4.0  # times the number of unknowns: what a right explanation's misfit hardly passes
 
 
@@ -83,31 +86,49 @@ class Recovery:
         """
         begun = time.perf_counter()
         self.attempts += 1
-        first = max(self.onset, recent.first)
+        if self.attempts > 1:  # something in the first half does not belong to what holds now
+            self.onset += (recent.last - self.onset) // 2
+        self.onset = max(self.onset, recent.first)
+        self.ready = recent.last + max(recent.last - self.onset, 1)
         limit = _MISFIT * rpem.numbers.start.size
-        best = self._best(rpem, recent, first, [(name,) for name in self.suspects])
+        best = self._best(rpem, recent, [(name,) for name in self._likeliest(rpem, recent)])
         if best is None or best[0].misfit >= limit:
             numbers = rpem.numbers
             every = tuple(numbers.names[j] for j in numbers.places("parameter"))
-            best = self._best(rpem, recent, first, [every])
-        self.ready = recent.last + max(recent.last - first, 1)
+            best = self._best(rpem, recent, [every])
         if best is None or best[0].misfit >= limit:
             return None
         return Recovered(refined=best[0], moved=best[1], computing_s=time.perf_counter() - begun)
 
+    def _likeliest(self, rpem: PhysicalRpem, recent: RecentSamples) -> tuple[str, ...]:
+        """Of many suspects those few that explain the stretch best to first order."""
+        if len(self.suspects) <= _FEW:
+            return self.suspects
+        samples = recent.since(self.onset)
+        evidence = None if samples is None else evidence_of(rpem.numbers, rpem.stream.at, samples, first=self.onset)
+        if evidence is None:
+            return self.suspects
+        rho, spread = evidence.residual(self.before.q), evidence.J @ self.before.covariance @ evidence.J.T
+        places = [rpem.numbers.names.index(name) for name in self.suspects]
+        toward = evidence.J[:, places]
+        weighted = np.linalg.solve(rpem.noise * np.eye(rho.size) + spread, np.column_stack([rho, toward]))
+        power = np.einsum("ij,ij->j", toward, weighted[:, 1:])
+        gain = (toward.T @ weighted[:, 0]) ** 2 / np.where(power > 0.0, power, np.inf)
+        return tuple(self.suspects[j] for j in np.argsort(-gain)[:_FEW])
+
     def _best(
-        self, rpem: PhysicalRpem, recent: RecentSamples, first: int, choices: Sequence[tuple[str, ...]]
+        self, rpem: PhysicalRpem, recent: RecentSamples, choices: Sequence[tuple[str, ...]]
     ) -> tuple[Refined, tuple[str, ...]] | None:
         """Of several sets of numbers that may be freed, the one that explains the stretch best."""
-        found = [(self._search(rpem, recent, first, freed), freed) for freed in choices]
+        found = [(self._search(rpem, recent, freed), freed) for freed in choices]
         return min(
             ((refined, freed) for refined, freed in found if refined is not None),
             key=lambda pair: pair[0].misfit,
             default=None,
         )
 
-    def _search(self, rpem: PhysicalRpem, recent: RecentSamples, first: int, freed: tuple[str, ...]) -> Refined | None:
-        samples = recent.since(first)
+    def _search(self, rpem: PhysicalRpem, recent: RecentSamples, freed: tuple[str, ...]) -> Refined | None:
+        samples = recent.since(self.onset)
         if samples is None:
             return None
         begin = self.before.copy()

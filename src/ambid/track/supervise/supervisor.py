@@ -35,6 +35,7 @@ _LEVEL_S = 0.1  # over which the error is taken
 _SETTLE_S = 1.0  # in which the detector learns how imperfect the model is, where the start estimate says that it is
 _BLOCKS_AFTER = 3  # of settled evidence before the first search after a change
 _ATTEMPTS = 5
+_SHOWN = 4.0  # standard deviations by which the innovations of a block are larger than before
 _BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
 _TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
@@ -112,7 +113,7 @@ class Supervisor:
         )
         self.log = DecisionLog(listener=listener)
         self._recent = RecentSamples(round(2 * LONGEST_S * self._rate))
-        self._history: deque[tuple[int, ParameterFilter]] = deque(maxlen=round(LONGEST_S / block_s) + 4)
+        self._history: deque[tuple[Evidence, ParameterFilter]] = deque(maxlen=round(LONGEST_S / block_s) + 4)
         self._recovery: Recovery | None = None
         self._unconfirmed = False  # found anew, not yet accepted
         self.updates, self.update_s = 0, 0.0
@@ -221,7 +222,7 @@ class Supervisor:
             self.log.add(event)
         self._activate()
         rpem.predict()
-        self._history.append((evidence.first, rpem.filter.copy()))
+        self._history.append((evidence, rpem.filter.copy()))
         self.level.update(evidence, self.gate.accepted.values)
         if self._recovery is not None:
             self._recover(evidence, t)
@@ -286,15 +287,28 @@ class Supervisor:
 
     def _begin_recovery(self, event: Event, onset: int, suspects: tuple[str, ...], size: float) -> None:
         rpem = self.rpem
-        block = rpem.block_samples
-        before = next((f for first, f in reversed(self._history) if first <= onset), self._history[0][1])
-        # the change lies somewhere in the block of the onset: what comes after it is clean
-        clean = min(onset + block, rpem.stream.sample)
-        ready = clean + rpem.stream.settling_samples + _BLOCKS_AFTER * block
+        before = next((f for e, f in reversed(self._history) if e.first <= onset), self._history[0][1])
+        # the change lies somewhere in the block in which it shows first: what comes after it is clean
+        clean = min(self._first_shown(onset, before) + rpem.block_samples, rpem.stream.sample)
         self.gate.restart()
         self._recovery = Recovery(
-            event=event, suspects=suspects, size=size, onset=clean, before=before.copy(), ready=ready
+            event=event,
+            suspects=suspects,
+            size=size,
+            onset=clean,
+            before=before.copy(),
+            ready=clean + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples,
         )
+
+    def _first_shown(self, onset: int, before: ParameterFilter) -> int:
+        """First sample of the first block since `onset` whose innovations are larger than before; else `onset`."""
+        noise = self.rpem.noise
+        for evidence, _ in self._history:
+            if evidence.first >= onset:
+                n = evidence.n_samples * evidence.n_outputs
+                if evidence.loss(before.q) / noise > n + _SHOWN * np.sqrt(2.0 * n):
+                    return evidence.first
+        return onset
 
     def _recover(self, evidence: Evidence, t: float) -> None:
         """Search once enough samples have come; go on from what is found."""
