@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.track.adaptive.arx.estimators import RecursiveArx, RecursiveIvArx
 from ambid.track.adaptive.gradient import Lms, Nlms
 from ambid.track.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
 from ambid.track.adaptive.least_squares import RecursiveLeastSquares
@@ -34,6 +35,24 @@ def instruments(n: int, seed: int) -> tuple[Array, Array]:
     return np.column_stack([phi, phi @ np.ones((3, 4)) + phi[:, [0, 1, 2, 0]] + noise]), y
 
 
+def loop(n: int, seed: int) -> tuple[Array, Array]:
+    """Input and reference, output, of a second-order plant under feedback with coloured noise."""
+    rng = np.random.default_rng([seed, 6])
+    draws = rng.normal(size=(n, 2))
+    u, y = np.zeros(n + 2), np.zeros(n + 2)
+    for t in range(2, n + 2):
+        v = 0.3 * (draws[t - 2, 1] + 0.9 * (draws[t - 3, 1] if t > 2 else 0.0))
+        y[t] = 1.5 * y[t - 1] - 0.6 * y[t - 2] + 0.5 * u[t - 1] + 0.2 * u[t - 2] + v
+        u[t] = draws[t - 2, 0] - 0.8 * y[t]
+    return np.column_stack([u[2:], draws[:, 0]]), y[2:]
+
+
+def input_alone(n: int, seed: int) -> tuple[Array, Array]:
+    """The same without the reference."""
+    inputs, y = loop(n, seed)
+    return inputs[:, :1], y
+
+
 CASES = [
     Case(name="lms", make=lambda: Lms(4, step=0.01), signals=regression),
     Case(name="nlms", make=lambda: Nlms(("a", "b", "c"), step=0.5, small=1e-3), signals=three),
@@ -53,5 +72,21 @@ CASES = [
         name="iv-forgetting",
         make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4, memory=60, correlation=7),
         signals=instruments,
+    ),
+    Case(
+        name="arx-rls",
+        make=lambda: RecursiveArx(2, 2, offset=True, estimator=lambda names: RecursiveLeastSquares(names, memory=80)),
+        signals=input_alone,
+    ),
+    Case(name="arx-iv-reference", make=lambda: RecursiveIvArx(2, 2, instruments="reference"), signals=loop),
+    Case(
+        name="arx-iv-delayed",
+        make=lambda: RecursiveIvArx(2, 2, instruments="delayed input", memory=100, offset=True),
+        signals=input_alone,
+    ),
+    Case(
+        name="arx-iv-auxiliary",
+        make=lambda: RecursiveIvArx(2, 2, instruments="auxiliary model", memory=100),
+        signals=input_alone,
     ),
 ]

@@ -317,7 +317,8 @@ def _govern(s: Array, p: int) -> None:
     """Reset where it is due, and choose the factor with which P cannot pass its limit before the next look."""
     a, q = HEAD + p, 2 * (p + p * p)
     if s[RESET_EVERY] > 0 and s[USED] > 0 and s[USED] % s[RESET_EVERY] == 0:
-        s[a : a + q] = s[a + q : a + 2 * q]
+        for i in range(a, a + q):
+            s[i] = s[i + q]
     _, D, V, _, _ = _views(s, p)
     _, prior, _, _, _ = _rest(s, p)
     size = 0.0

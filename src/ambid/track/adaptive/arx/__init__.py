@@ -1,0 +1,1 @@
+"""Regressors from signals as they come, and ARX models estimated on them."""
