@@ -140,7 +140,7 @@ class Recovery:
             rpem.numbers,
             begin,
             samples,
-            first=first,
+            first=self.onset,
             block=rpem.block_samples,
             noise=rpem.noise,
             gain=rpem.stream.at.gain,
