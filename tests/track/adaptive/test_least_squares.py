@@ -1,0 +1,216 @@
+"""Recursive least squares against its batch definition, the Kalman filter, and through hard times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambid.errors import EstimationError
+from ambid.track.adaptive.least_squares import RecursiveLeastSquares
+
+N = 300
+
+
+def data(p: int, n: int = N, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    phi = rng.normal(size=(n, p)) @ rng.normal(size=(p, p)) + 0.3
+    return phi, phi @ np.arange(1.0, p + 1) + 0.2 * rng.normal(size=n)
+
+
+def matrix(p: int) -> np.ndarray:
+    A = np.random.default_rng(9).normal(size=(p, p))
+    return 3 * np.eye(p) + A @ A.T
+
+
+@pytest.mark.parametrize("p", [1, 3, 4, 6])  # four have a loop of their own
+@pytest.mark.parametrize("factor", [None, 0.98, 0.6])
+def test_is_weighted_batch_least_squares_with_the_same_prior(p: int, factor: float | None) -> None:
+    phi, y = data(p)
+    start, prior = np.full(p, 0.5), matrix(p)
+    rls = RecursiveLeastSquares(p, start=start, prior=prior, factor=factor, limit=1e12, noise_sd=0.2)
+    errors = rls.update(phi, y)
+    keep = 1.0 if factor is None else factor
+    w = keep ** np.arange(N - 1, -1, -1.0)
+    inverse = np.linalg.inv(prior)
+    information = phi.T @ (w[:, None] * phi) + keep**N * inverse
+    P = np.linalg.inv(information)
+    theta = P @ (phi.T @ (w * y) + keep**N * inverse @ start)
+    squares = phi.T @ (w[:, None] ** 2 * phi) + keep ** (2 * N) * inverse
+    np.testing.assert_allclose(rls.estimate, theta, rtol=1e-9)
+    np.testing.assert_allclose(rls.P, P, rtol=1e-8, atol=1e-9 * np.abs(P).max())
+    np.testing.assert_allclose(rls.covariance, 0.04 * P @ squares @ P, rtol=1e-7, atol=1e-8 * 0.04 * np.abs(P).max())
+    np.testing.assert_allclose(errors[0], y[0] - phi[0] @ start, rtol=1e-13)
+
+
+def test_with_forgetting_the_error_is_smaller_than_the_matrix_by_one_plus_factor() -> None:
+    phi, y = data(4, 60_000)
+    rls = RecursiveLeastSquares(4, factor=0.999, noise_sd=1.0)
+    rls.update(phi, y)
+    np.testing.assert_allclose(np.diag(rls.P) / np.diag(rls.covariance), 1.999, rtol=0.05)
+
+
+def test_a_walk_makes_it_the_kalman_filter() -> None:
+    phi, y = data(3)
+    walk = np.array([1e-2, 0.0, 3e-4])
+    rls = RecursiveLeastSquares(3, prior=4.0, walk=walk, noise_sd=0.2)
+    rls.update(phi, y)
+    theta, P = np.zeros(3), 4 * np.eye(3)
+    for row, out in zip(phi, y, strict=True):
+        P = P + np.diag(walk)
+        K = P @ row / (1 + row @ P @ row)
+        theta = theta + K * (out - row @ theta)
+        P = P - np.outer(K, row @ P)
+    np.testing.assert_allclose(rls.estimate, theta, rtol=1e-9)
+    np.testing.assert_allclose(rls.covariance, 0.04 * P, rtol=1e-8, atol=1e-12)
+
+
+def test_directional_forgetting_is_that_of_cao_and_schwartz_and_its_covariance_that_of_the_error() -> None:
+    phi, y = data(4, 80)
+    rls = RecursiveLeastSquares(4, prior=2.0, forgetting="directional", factor=0.9, noise_sd=0.2, limit=1e9)
+    rls.update(phi, y)
+    theta, R, C = np.zeros(4), np.eye(4) / 2, 2 * np.eye(4)
+    for row, out in zip(phi, y, strict=True):
+        met = R @ row
+        R = R - 0.1 * np.outer(met, met) / (row @ met) + np.outer(row, row)
+        K = np.linalg.solve(R, row)
+        theta = theta + K * (out - row @ theta)
+        left = np.eye(4) - np.outer(K, row)
+        C = left @ C @ left.T + np.outer(K, K)
+    np.testing.assert_allclose(rls.estimate, theta, rtol=1e-8)
+    np.testing.assert_allclose(rls.P, np.linalg.inv(R), rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(rls.covariance, 0.04 * C, rtol=1e-7, atol=1e-12)
+
+
+def test_directional_forgetting_keeps_what_is_not_excited_and_follows_what_is() -> None:
+    phi, y = data(4, 4000)
+    phi[:, 0] += 1.0
+    y = phi @ [1.0, 2.0, 3.0, 4.0]
+    y += 0.01 * np.random.default_rng(1).normal(size=y.size)
+    rls = RecursiveLeastSquares(4, forgetting="directional", factor=0.98)
+    rls.update(phi, y)
+    before = rls.P
+    only = np.zeros((20_000, 4))
+    only[:, 0] = phi[:, 0].mean()
+    rls.update(only, 5.0 * only[:, 0])
+    assert abs(rls.estimate[0] - 5.0) < 1e-6
+    assert (np.diag(rls.P)[1:] < 1.001 * np.diag(before)[1:]).all()
+
+
+def test_wind_up_ends_at_the_limit_and_the_estimate_stays() -> None:
+    phi, y = data(4, 2000)
+    rls = RecursiveLeastSquares(4, prior=2.0, memory=50, limit=10.0)
+    rls.update(phi, y)
+    at, covariance = rls.estimate, rls.covariance
+    rls.update(np.zeros((100_000, 4)), np.zeros(100_000))
+    assert 9.0 < np.mean(np.diag(rls.P) / 2.0) < 10.0 * (1 + 1e-9)
+    np.testing.assert_array_equal(rls.estimate, at)
+    np.testing.assert_allclose(rls.covariance, covariance, rtol=1e-6)  # silence says nothing of the error
+
+
+@pytest.mark.parametrize(
+    "settings", [{"memory": 1000.0}, {"factor": 0.3}, {"forgetting": "directional", "factor": 0.9}, {"walk": 1e-12}]
+)
+def test_ten_million_poor_updates_keep_the_covariance_sound(settings: dict[str, object]) -> None:
+    """Regressors of 1e-9 to 1e6, bursts, collinear stretches and silence."""
+    rng = np.random.default_rng(2)
+    scale = np.array([1e-9, 1.0, 1e3, 1e6])
+    n = 50_000
+    phi = rng.normal(size=(n, 4))
+    phi[n // 5 : 2 * n // 5] = phi[n // 5 : 2 * n // 5, :1]  # all the same
+    phi[2 * n // 5 : 4 * n // 5] = 0.0
+    phi[3 * n // 5] = 1e-3
+    phi *= scale
+    y = phi @ (np.arange(1.0, 5.0) / scale) + 0.1 * rng.normal(size=n)
+    rls = RecursiveLeastSquares(4, prior=1e4 / scale**2, **settings)  # type: ignore[arg-type]
+    turns = 200 if "memory" in settings else 15
+    for _ in range(turns):
+        rls.update(phi, y)
+        for P in (rls.P, rls.covariance):
+            sd = np.sqrt(np.diag(P))
+            assert np.isfinite(P).all()
+            assert (sd > 0).all()
+            assert np.linalg.eigvalsh(P / np.outer(sd, sd))[0] > -1e-14
+        D, _ = rls._factors(0)
+        assert (D > 0).all()
+    assert rls.n_used == turns * n
+    assert (np.abs(rls.estimate * scale - np.arange(1.0, 5.0)) < 6 * np.sqrt(np.diag(rls.covariance)) * scale).all()
+
+
+def test_scale_of_regressors_does_not_matter() -> None:
+    phi, y = data(4)
+    scale = 2.0 ** np.array([-30, 0, 10, 20])
+    one = RecursiveLeastSquares(4, memory=80, prior=100.0)
+    other = RecursiveLeastSquares(4, memory=80, prior=100.0 / scale**2)
+    one.update(phi, y)
+    other.update(phi * scale, y)
+    np.testing.assert_allclose(other.estimate * scale, one.estimate, rtol=1e-12)
+
+
+def test_numbers_that_lead_out_of_range_are_rejected() -> None:
+    rls = RecursiveLeastSquares(4)
+    rls.update(*data(4))
+    at = rls.estimate
+    assert np.isnan(rls.update(np.full(4, 1e120), 1.0))
+    assert np.isnan(rls.update(np.ones(4), 1e200))
+    assert rls.n_rejected == 2
+    np.testing.assert_array_equal(rls.estimate, at)
+
+
+@pytest.mark.parametrize("settings", [{}, {"memory": 50.0}, {"forgetting": "directional", "memory": 50.0}])
+def test_a_reset_forgets_the_covariance_and_keeps_the_estimate(settings: dict[str, object]) -> None:
+    phi, y = data(4)
+    rls = RecursiveLeastSquares(4, prior=5.0, noise_sd=0.2, **settings)  # type: ignore[arg-type]
+    rls.update(phi, y)
+    at = rls.estimate
+    rls.reset()
+    np.testing.assert_array_equal(rls.estimate, at)
+    np.testing.assert_allclose(rls.P, 5 * np.eye(4), rtol=1e-12)
+    np.testing.assert_allclose(rls.covariance, 0.2 * np.eye(4), rtol=1e-12)
+    fresh = RecursiveLeastSquares(4, start=at, prior=5.0, noise_sd=0.2, **settings)  # type: ignore[arg-type]
+    rls.reset(prior=7.0)
+    rls.reset()
+    rls.update(phi[:8], y[:8])
+    fresh.update(phi[:8], y[:8])
+    if not settings:
+        np.testing.assert_allclose(rls.estimate, fresh.estimate, rtol=1e-12)
+    assert np.isfinite(rls.covariance).all()
+
+
+def test_noise_is_found_from_few_samples_and_kept_in_silence() -> None:
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(300):
+        phi = rng.normal(size=(24, 4))
+        rls = RecursiveLeastSquares(4)
+        rls.update(phi, 100 * phi.sum(1) + rng.normal(size=24))
+        found.append(rls.noise_variance)
+    assert 0.9 < np.mean(found) < 1.1
+    rls.update(np.zeros((10_000, 4)), np.zeros(10_000))
+    assert rls.noise_variance == found[-1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"factor": 1.0},
+        {"factor": 0.9, "memory": 10.0},
+        {"memory": 0.5},
+        {"forgetting": "exponential"},
+        {"forgetting": "none", "memory": 10.0},
+        {"forgetting": "sudden", "memory": 10.0},
+        {"memory": 10.0, "walk": 1.0},
+        {"walk": -1.0},
+        {"prior": -1.0},
+        {"prior": np.ones((4, 4))},
+        {"prior": [1.0, 2.0]},
+        {"start": [1.0, np.nan, 0, 0]},
+        {"limit": 0.0},
+        {"noise_sd": 0.0},
+        {"reset_every": -3},
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(EstimationError):
+        RecursiveLeastSquares(4, **settings)  # type: ignore[arg-type]
+    with pytest.raises(EstimationError):
+        RecursiveLeastSquares(("a", "a"))
