@@ -52,9 +52,9 @@ def test_nlms_meets_the_output_with_a_full_step_and_stands_still_on_small_regres
     np.testing.assert_allclose(nlms.estimate @ [3.0, 4.0], 10.0, rtol=1e-6)
     at = nlms.estimate
     nlms.update(np.array([1e-9, 0.0]), 1.0)
-    np.testing.assert_allclose(nlms.estimate, at + [1e-3, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(nlms.estimate, at + np.array([1e-3, 0.0]), rtol=1e-5)
     nlms.update(np.zeros(2), 5.0)
-    np.testing.assert_allclose(nlms.estimate, at + [1e-3, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(nlms.estimate, at + np.array([1e-3, 0.0]), rtol=1e-5)
     assert nlms.n_used == 3
 
 

@@ -244,6 +244,28 @@ def positive(name: str, value: float) -> float:
     return float(value)
 
 
+def count(name: str, value: int) -> int:
+    """Return `value` where it is a whole number of samples, one or more.
+
+    Parameters
+    ----------
+    name : str
+        For the message.
+    value : int
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    EstimationError
+    """
+    if value != int(value) or value < 1:
+        raise EstimationError(f"{name} is {value!r}; it must be a whole number of samples, 1 or more")
+    return int(value)
+
+
 def numbers(name: str, value: ArrayLike, p: int) -> Array:
     """Return `value` as p finite numbers, a single one for all.
 

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive._recursion import Factored, covariance_of, forgetting_factor, numbers, positive, product
+from ambid.track.adaptive._recursion import (
+    Factored,
+    count,
+    covariance_of,
+    forgetting_factor,
+    numbers,
+    positive,
+    product,
+)
 
 Array = NDArray[np.float64]
 Forgetting = Literal["none", "exponential", "directional"]
@@ -115,7 +123,7 @@ class RecursiveLeastSquares(Factored):
         s[at.MEMORY] = 1.0 / (1.0 - kept) if kept < 1.0 else np.inf
         s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
         s[at.LIMIT] = positive("limit", limit)
-        s[at.RESET_EVERY] = 0 if reset_every is None else int(positive("reset_every", reset_every))
+        s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
         s[at.TYPICAL] = 0.1 * p
         s[at.NOISE_RATE] = 1.0 / (
             _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)

@@ -202,6 +202,8 @@ def signals(u: ArrayLike, y: ArrayLike, n_inputs: int, spare: int = 0) -> tuple[
     EstimationError
         If the shapes do not fit, or these are not real numbers.
     """
+    if isinstance(y, float) and isinstance(u, float) and n_inputs == 1 and spare == 0:  # one sample, quickly
+        return np.array([[y, u]]), np.array([y]), ()
     inputs, outputs = np.asarray(u), np.asarray(y)
     if inputs.dtype.kind not in "fiub" or outputs.dtype.kind not in "fiub":
         raise EstimationError(f"input ({inputs.dtype}) and output ({outputs.dtype}) must be real numbers")

@@ -18,6 +18,7 @@ from ambid.track.adaptive._recursion import (
     ENOUGH,
     Recursion,
     coefficient_names,
+    count,
     forgetting_factor,
     numbers,
     positive,
@@ -102,7 +103,7 @@ class RecursiveInstrumentalVariables(Recursion):
         m = p if n_instruments is None else int(n_instruments)
         if m < p:
             raise EstimationError(f"{m} instruments do not determine {p} coefficients. Give {p} or more")
-        lags = int(positive("correlation", correlation))
+        lags = count("correlation", correlation)
         size = p + m * (m + p + 1) + p * p + m * m + lags * m + m + p + m + m * (p + 1) + m + 3 * p + 1
         super().__init__(found, p + m, size, start, None, noise_start)
         s, at = self._s, self._at
