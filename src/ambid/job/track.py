@@ -134,7 +134,7 @@ def track(
             source.replay.since(first),
             lambda stretch: reporter.consume(_samples(stretch, n_u, forcing), stretch.first, restart=stretch.restart),
             reporter.reject,
-            guard=StreamGuard(numbers.rate_hz, source.replay.values.shape[1]),
+            guard=_guard(source, n_u),
             pace=pace,
             producer="process" if pace == "real-time" else "none",
             block_samples=source.replay.block_samples,
@@ -142,6 +142,13 @@ def track(
     reporter.finish()
     summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)
     return Track(header=top, lines=tuple(lines), summary=summary)
+
+
+def _guard(source: BenchRows, n_u: int) -> StreamGuard:
+    """A guard that watches outputs for freezing, but no input and no forcing: these may rest."""
+    n, n_f = source.replay.values.shape[1], 0 if source.forcing is None else 2
+    stuck: list[Literal["auto"] | None] = [None] * n_u + ["auto"] * (n - n_u - n_f) + [None] * n_f
+    return StreamGuard(source.replay.rate_hz, n, stuck=stuck)
 
 
 def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:

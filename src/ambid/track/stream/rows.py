@@ -17,7 +17,7 @@ from ambid.errors import EstimationError
 from ambid.track.stream.outcome import Array, RowKind
 
 Mask = NDArray[np.bool_]
-Stuck = Literal["auto"] | None | int | Sequence[int | None]
+Stuck = Literal["auto"] | None | int | Sequence[int | Literal["auto"] | None]
 
 ABSURD = 1e15  # no quantity of a bearing in SI units is that large; squares stay far from overflow
 _NORMAL_RUN = 20  # a channel with longer runs in normal work (coarse steps, a set point) is not watched
@@ -37,7 +37,7 @@ class RowCheck:
         Largest credible magnitude of each channel, SI.
     saturation : array_like, shape (n_channels, 2), optional
         Rails of each channel, SI: a sample at or beyond one is refused; NaN where a channel has none.
-    stuck : "auto", None, int or sequence of int or None
+    stuck : "auto", None, int, or a sequence of these
         Run of equal values from which a channel counts as frozen; learned; or not watched. A commanded channel, which
         may rest, should have None.
 
@@ -76,12 +76,14 @@ class RowCheck:
             self._learns[:] = True
             return
         each = [stuck] * n_channels if isinstance(stuck, int) else list(stuck)
-        if len(each) != n_channels or any(isinstance(n, str) or (n is not None and n < 2) for n in each):
+        wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
+        if isinstance(stuck, str) or len(each) != n_channels or wrong:
             raise EstimationError(
-                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None, or a run of at least 2"
-                " samples for each. Correct stuck"
+                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None or a run of at least"
+                " 2 samples, for all or for each. Correct stuck"
             )
-        self._threshold[:] = [_NEVER if n is None else n for n in each]
+        self._learns[:] = [n == "auto" for n in each]
+        self._threshold[:] = [n if isinstance(n, int) else _NEVER for n in each]
 
     def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
         """Say which rows must not be used, and how many at the end are not decided yet.

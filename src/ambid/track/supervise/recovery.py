@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.track.evidence import Evidence
 from ambid.track.lines import Event
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
@@ -21,8 +22,61 @@ from ambid.track.physical.window import Refined, evidence_of, refine
 
 _LEAST_SD = 0.3  # of a number that has moved, relative to its magnitude
 _STRAY = 3.0  # moves that the detector's estimate of a move may be off by
+_BLOCKS_AFTER = 3  # of settled evidence before the first search
+_SHOWN = 4.0  # standard deviations by which the innovations of a block are larger than before
 _FEW = 3  # suspects that are searched in full
 _MISFIT = 4.0  # times the number of unknowns: what a right explanation's misfit hardly passes
+
+
+def begin(
+    rpem: PhysicalRpem,
+    history: Sequence[tuple[Evidence, ParameterFilter]],
+    event: Event,
+    *,
+    onset: int,
+    suspects: tuple[str, ...],
+    size: float,
+) -> Recovery:
+    """Prepare the search after an alarm.
+
+    Parameters
+    ----------
+    rpem : PhysicalRpem
+    history : sequence of (Evidence, ParameterFilter)
+        Recent blocks, each with what was known before it.
+    event : Event
+        What was said of the change.
+    onset : int
+        First sample of the window in which it was found.
+    suspects : tuple of str
+    size : float
+
+    Returns
+    -------
+    Recovery
+    """
+    before = next((f for e, f in reversed(history) if e.first <= onset), history[0][1])
+    # the change lies somewhere in the block in which it shows first: what comes after it is clean
+    clean = min(_first_shown(rpem, history, onset, before) + rpem.block_samples, rpem.stream.sample)
+    return Recovery(
+        event=event,
+        suspects=suspects,
+        size=size,
+        onset=clean,
+        before=before.copy(),
+        ready=clean + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples,
+    )
+
+
+def _first_shown(
+    rpem: PhysicalRpem, history: Sequence[tuple[Evidence, ParameterFilter]], onset: int, before: ParameterFilter
+) -> int:
+    """First sample of the first block since `onset` whose innovations are larger than before; else `onset`."""
+    for evidence, _ in history:
+        n = evidence.n_samples * evidence.n_outputs
+        if evidence.first >= onset and evidence.loss(before.q) / rpem.noise > n + _SHOWN * np.sqrt(2.0 * n):
+            return evidence.first
+    return onset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,19 +13,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.errors import EstimationError
 from ambid.track.evidence import Evidence
 from ambid.track.lines import Event, State, TrackedValue
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples, Samples
-from ambid.track.physical.synchronous import amplitude_and_phase
 from ambid.track.supervise.change import Alarm, ChangeDetector
 from ambid.track.supervise.excitation import ExcitationMonitor
 from ambid.track.supervise.gate import Gate
 from ambid.track.supervise.level import ErrorLevel
 from ambid.track.supervise.log import DecisionLog
 from ambid.track.supervise.operator import Operator
-from ambid.track.supervise.recovery import Recovered, Recovery
+from ambid.track.supervise.published import beside, published
+from ambid.track.supervise.recovery import Recovered, Recovery, begin
 
 Array = NDArray[np.float64]
 
@@ -33,9 +34,7 @@ LONGEST_S = 0.5  # window of change detection
 _RELEASE = 0.8  # part of the limit under which the error has to fall to be acceptable again
 _LEVEL_S = 0.1  # over which the error is taken
 _SETTLE_S = 1.0  # in which the detector learns how imperfect the model is, where the start estimate says that it is
-_BLOCKS_AFTER = 3  # of settled evidence before the first search after a change
 _ATTEMPTS = 5
-_SHOWN = 4.0  # standard deviations by which the innovations of a block are larger than before
 _BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
 _TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
@@ -57,6 +56,8 @@ class Supervisor:
     false_alarms_per_hour : float
     t0 : float
         Time of sample 0, s of record.
+    listener : callable, optional
+        Called with each event.
 
     Attributes
     ----------
@@ -116,6 +117,7 @@ class Supervisor:
         self._history: deque[tuple[Evidence, ParameterFilter]] = deque(maxlen=round(LONGEST_S / block_s) + 4)
         self._recovery: Recovery | None = None
         self._unconfirmed = False  # found anew, not yet accepted
+        self._values = numbers.start[numbers.places("parameter", "gain")]
         self.updates, self.update_s = 0, 0.0
         self.changes: list[Event] = []
 
@@ -131,41 +133,12 @@ class Supervisor:
     @property
     def parameters(self) -> dict[str, TrackedValue]:
         """Published physical parameters, SI."""
-        return self._published("parameter")
+        return published(self.rpem.numbers, self.gate.accepted, "parameter", self._excitation.fresh)
 
     @property
     def extra(self) -> dict[str, TrackedValue]:
         """Published numbers beside the parameters: gains of sensors once they are found to have changed, unbalance."""
-        numbers = self.rpem.numbers
-        found = {k: v for k, v in self._published("gain").items() if self.rpem.filter.active[numbers.names.index(k)]}
-        return found | self._unbalance()
-
-    def _unbalance(self) -> dict[str, TrackedValue]:
-        numbers, accepted = self.rpem.numbers, self.gate.accepted
-        if not numbers.synchronous:
-            return {}
-        at = numbers.places("unbalance")
-        size = numbers.magnitude[at]
-        a, b = (accepted.values[at] * size).tolist()
-        covariance = accepted.covariance[np.ix_(at, at)] * np.outer(size, size)
-        amplitude, sd, phase, phase_sd = amplitude_and_phase(a, b, covariance)
-        return {
-            "unbalance": TrackedValue(value=amplitude, sd=sd),
-            "unbalance_phase": TrackedValue(value=phase, sd=phase_sd),
-        }
-
-    def _published(self, kind: str) -> dict[str, TrackedValue]:
-        numbers, accepted = self.rpem.numbers, self.gate.accepted
-        size, fresh = numbers.magnitude, self._excitation.fresh
-        return {
-            name: TrackedValue(
-                value=float(accepted.values[j] * size[j]),
-                sd=float(np.sqrt(accepted.covariance[j, j]) * size[j]),
-                stale=not fresh.get(name, True),
-            )
-            for j, (name, k) in enumerate(zip(numbers.names, numbers.kinds, strict=True))
-            if k == kind
-        }
+        return beside(self.rpem.numbers, self.gate.accepted, self.rpem.filter.active)
 
     def feed(self, samples: Samples, first: int, *, restart: bool = False) -> Array:
         """Take in consecutive samples.
@@ -183,6 +156,11 @@ class Supervisor:
         -------
         ndarray, shape (n_samples, n_outputs), SI
             Innovations of the working predictor.
+
+        Raises
+        ------
+        ValueError
+            If a sample is not finite.
         """
         if restart or first != self.rpem.stream.sample:
             self.rpem.stream.restart(first)
@@ -209,7 +187,10 @@ class Supervisor:
         ----------
         flag : {"track", "hold", "accept", "revert"}
         """
-        self.log.add(self.operator.set(flag, self._now))
+        try:
+            self.log.add(self.operator.set(flag, self._now))
+        except EstimationError as waiting:  # of two orders in one block the first counts
+            self.log.add(Event(kind="refused", t=self._now, why=str(waiting)))
 
     @property
     def _now(self) -> float:
@@ -223,7 +204,7 @@ class Supervisor:
         self._activate()
         rpem.predict()
         self._history.append((evidence, rpem.filter.copy()))
-        self.level.update(evidence, self.gate.accepted.values)
+        self._watch_level(evidence, t)
         if self._recovery is not None:
             self._recover(evidence, t)
         else:
@@ -238,6 +219,14 @@ class Supervisor:
                 rpem.refresh()
                 self._judge(evidence, t)
         self._obey(t)
+
+    def _watch_level(self, evidence: Evidence, t: float) -> None:
+        """Follow the error of the published numbers, and say when it passes its limit."""
+        before = self.level.above
+        error = self.level.update(evidence, self.gate.accepted.values)
+        if self.level.above and not before:
+            why = f"the error is {error:.2f} times that at identification, over the limit of {self.level.limit:g}"
+            self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
 
     def _activate(self) -> None:
         """Let the recursion move what the data inform."""
@@ -269,7 +258,8 @@ class Supervisor:
             self.gate.restart()
             return
         if alarm.by == "noise":
-            rpem.noise_level = max(rpem.noise_level, alarm.noise)
+            if alarm.blocks >= _TELLING:
+                rpem.noise_level = max(rpem.noise_level, alarm.noise)
             self._detector.restart(rpem.stream.sample)
             return
         if moved:
@@ -279,36 +269,12 @@ class Supervisor:
             suspects = (alarm.parameter, *likely[:2])
         else:  # a fault of one thing is likelier than of several at once
             suspects = tuple(n for n in numbers.names if self._kind(n) in _BENCH)
-        self._begin_recovery(event, alarm.onset, suspects, alarm.size)
+        self.gate.restart()
+        self._recovery = begin(rpem, self._history, event, onset=alarm.onset, suspects=suspects, size=alarm.size)
 
     def _kind(self, name: str | None) -> str | None:
         numbers = self.rpem.numbers
         return None if name is None else numbers.kinds[numbers.names.index(name)]
-
-    def _begin_recovery(self, event: Event, onset: int, suspects: tuple[str, ...], size: float) -> None:
-        rpem = self.rpem
-        before = next((f for e, f in reversed(self._history) if e.first <= onset), self._history[0][1])
-        # the change lies somewhere in the block in which it shows first: what comes after it is clean
-        clean = min(self._first_shown(onset, before) + rpem.block_samples, rpem.stream.sample)
-        self.gate.restart()
-        self._recovery = Recovery(
-            event=event,
-            suspects=suspects,
-            size=size,
-            onset=clean,
-            before=before.copy(),
-            ready=clean + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples,
-        )
-
-    def _first_shown(self, onset: int, before: ParameterFilter) -> int:
-        """First sample of the first block since `onset` whose innovations are larger than before; else `onset`."""
-        noise = self.rpem.noise
-        for evidence, _ in self._history:
-            if evidence.first >= onset:
-                n = evidence.n_samples * evidence.n_outputs
-                if evidence.loss(before.q) / noise > n + _SHOWN * np.sqrt(2.0 * n):
-                    return evidence.first
-        return onset
 
     def _recover(self, evidence: Evidence, t: float) -> None:
         """Search once enough samples have come; go on from what is found."""
@@ -393,7 +359,10 @@ class Supervisor:
 
     def _decided(self, event: Event) -> None:
         if event.kind == "accepted":
-            self.updates += 1
+            own = self.rpem.numbers.places("parameter", "gain")
+            values = self.gate.accepted.values[own]
+            self.updates += not np.array_equal(values, self._values)
+            self._values = values
             if self._unconfirmed:
                 self.log.add(event)
                 self._unconfirmed = False

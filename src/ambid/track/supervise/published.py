@@ -1,0 +1,73 @@
+"""The accepted numbers as an operator reads them: SI values with standard deviations, stale ones marked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.track.lines import TrackedValue
+from ambid.track.physical.numbers import Kind, TrackedNumbers
+from ambid.track.physical.synchronous import amplitude_and_phase
+from ambid.track.supervise.comparison import Accepted
+
+
+def published(
+    numbers: TrackedNumbers, accepted: Accepted, kind: Kind, fresh: Mapping[str, bool]
+) -> dict[str, TrackedValue]:
+    """Return the accepted numbers of one kind.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    accepted : Accepted
+    kind : str
+    fresh : Mapping[str, bool]
+        Which are informed by recent data; those that are not in it are not judged.
+
+    Returns
+    -------
+    dict of str to TrackedValue
+        SI.
+    """
+    sd = np.sqrt(np.diag(accepted.covariance)) * numbers.magnitude
+    values = accepted.values * numbers.magnitude
+    return {
+        numbers.names[j]: TrackedValue(
+            value=float(values[j]), sd=float(sd[j]), stale=not fresh.get(numbers.names[j], True)
+        )
+        for j in numbers.places(kind)
+    }
+
+
+def beside(numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_]) -> dict[str, TrackedValue]:
+    """Return what is tracked beside the parameters: gains of sensors that were found to have changed, unbalance.
+
+    Parameters
+    ----------
+    numbers : TrackedNumbers
+    accepted : Accepted
+    active : ndarray of bool, shape (p,)
+        Which numbers the recursion may move.
+
+    Returns
+    -------
+    dict of str to TrackedValue
+        SI; the unbalance in kg m, its phase in rad.
+    """
+    gains = published(numbers, accepted, "gain", {})
+    found = {name: value for name, value in gains.items() if active[numbers.names.index(name)]}
+    if not numbers.synchronous:
+        return found
+    at = numbers.places("unbalance")
+    size = numbers.magnitude[at]
+    a, b = (accepted.values[at] * size).tolist()
+    amplitude, sd, phase, phase_sd = amplitude_and_phase(
+        a, b, accepted.covariance[np.ix_(at, at)] * np.outer(size, size)
+    )
+    return {
+        **found,
+        "unbalance": TrackedValue(value=amplitude, sd=sd),
+        "unbalance_phase": TrackedValue(value=phase, sd=phase_sd),
+    }
