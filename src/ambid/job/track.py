@@ -147,8 +147,8 @@ def track(
 def _guard(source: BenchRows, n_u: int) -> StreamGuard:
     """A guard that watches outputs for freezing, but no input and no forcing: these may rest."""
     n, n_f = source.replay.values.shape[1], 0 if source.forcing is None else 2
-    stuck: list[Literal["auto"] | None] = [None] * n_u + ["auto"] * (n - n_u - n_f) + [None] * n_f
-    return StreamGuard(source.replay.rate_hz, n, stuck=stuck)
+    outputs: list[int | Literal["auto"] | None] = ["auto" for _ in range(n - n_u - n_f)]
+    return StreamGuard(source.replay.rate_hz, n, stuck=[*[None] * n_u, *outputs, *[None] * n_f])
 
 
 def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:
