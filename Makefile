@@ -43,7 +43,7 @@ demo: setup  ## identify the embedded record and print the estimate beside the t
 
 test: setup  ## everything that must hold: lint, types, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
 	@$(MAKE) --no-print-directory -j1 lint types
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 lint: setup  ## formatting and lint
 	$(BIN)/ruff format --check .
@@ -52,13 +52,13 @@ lint: setup  ## formatting and lint
 types: setup  ## strict type check
 	$(BIN)/mypy
 
-peers: bench/.venv/linear/.setup  ## make the environment of the packages that the benchmarks compare with
+peers: bench/.venv/linear/.setup bench/.venv/tracking/.setup  ## make the environments of the packages that the benchmarks compare with
 
-bench/.venv/linear/.setup: requirements/peers-linear.txt tools/venv.sh
+bench/.venv/%/.setup: requirements/peers-%.txt tools/venv.sh
 	@mkdir -p bench/.venv
-	@sh tools/venv.sh bench/.venv/linear "$(PYTHON)"
-	@echo "Installing the peers into bench/.venv/linear (a minute or two, once) ..." >&2
-	@bench/.venv/linear/bin/python -m pip --disable-pip-version-check --no-input install -qq --require-hashes -r $<
+	@sh tools/venv.sh bench/.venv/$* "$(PYTHON)"
+	@echo "Installing the peers into bench/.venv/$* (a minute or two, once) ..." >&2
+	@bench/.venv/$*/bin/python -m pip --disable-pip-version-check --no-input install -qq --require-hashes -r $<
 	@touch $@
 
 bench: setup peers  ## measure speed and accuracy beside SciPy and peers; writes docs/benchmarks.md (BENCH="speed records" chooses)
