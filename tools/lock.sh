@@ -24,6 +24,7 @@ compile requirements/base.txt pyproject.toml
 compile requirements/dev.txt pyproject.toml requirements/dev.in
 compile requirements/docs.txt requirements/docs.in
 compile requirements/peers-linear.txt requirements/peers-linear.in
+compile requirements/peers-tracking.txt requirements/peers-tracking.in
 if grep -n '://' requirements/*; then
     echo "ambid: an address got into the requirements (above)" >&2
     exit 1
