@@ -36,6 +36,8 @@ class EvidenceStream:
     at : Linearisation
     sample : int
         Number of the next sample of the stream.
+    latest : Evidence or None
+        Of the last block.
     """
 
     def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
@@ -56,6 +58,7 @@ class EvidenceStream:
         self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
         self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(numbers.innovation_covariance)))
         self._fresh = True
+        self.latest: Evidence | None = None
 
     def relinearise(self, at: Linearisation) -> None:
         """Go on with the predictor of another point; the state moves along to first order.
@@ -176,6 +179,7 @@ class EvidenceStream:
         )
         self._triangle[:] = 0.0
         self._counts[2] = 0
+        self.latest = found
         return found
 
     def copy(self) -> EvidenceStream:

@@ -32,6 +32,7 @@ _ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at 
 _START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
+_STALE = 0.01  # part of the innovations' variance that a predictor behind the estimate may add
 _NOISE_S = 2.0  # time constant with which the noise level is followed
 _TRANSIENT = 2.0  # times the usual noise in one block: more than chance makes, which is why it says something else
 _LOWEST_NOISE = 0.25  # of the level at identification: less is not believed
@@ -162,10 +163,18 @@ class PhysicalRpem:
             self.filter.walk(np.sqrt(self.drift.variance * self.block_s))
 
     def refresh(self) -> None:
-        """Assemble the predictor anew where the estimate has moved too far from it."""
+        """Assemble the predictor anew where the estimate has moved too far from it.
+
+        Too far is where second-order terms matter, or where its innovations are noticeably larger than those at the
+        estimate.
+        """
         moved = self.filter.q - self.stream.at.at
-        if np.any(moved * moved > self._curved * self.filter.sd):
-            self.move_to(self.filter.q)
+        latest = self.stream.latest
+        if latest is not None:
+            step = latest.J @ moved
+            stale = step @ step > _STALE * self.noise_level * latest.n_samples
+            if stale or np.any(moved * moved > self._curved * self.filter.sd):
+                self.move_to(self.filter.q)
 
     def noise_of(self, evidence: Evidence) -> float:
         """Return the variance with which a block's residual is taken.

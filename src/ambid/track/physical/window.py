@@ -21,7 +21,7 @@ from ambid.track.physical.evidence_stream import EvidenceStream
 from ambid.track.physical.linearisation import Linearisation, linearise
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
-from ambid.track.physical.signals import Samples, checked
+from ambid.track.physical.signals import RecentSamples, Samples, checked
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,7 @@ _ITERATIONS = 6
 _SETTLED = 0.05  # step, in standard deviations, below which the search has converged
 _HALVINGS = 4
 _WIDER = 30.0  # how much wider than the start's the standard deviations are that a window begins with
+_ENDLESS = 1 << 40  # samples of one evidence: the stretch is one block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -177,8 +178,7 @@ class MovingWindow:
         at = linearise(numbers, numbers.start)
         if at is None:
             raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
-        stream = EvidenceStream(numbers, at, 1)
-        fewest = stream.settling_samples + 10 * numbers.start.size
+        fewest = EvidenceStream(numbers, at, 1).settling_samples + 10 * numbers.start.size
         if window < fewest:
             raise EstimationError(f"the window has {window} samples; it needs at least {fewest}. Give a longer window")
         self.numbers, self.window = numbers, window
@@ -188,10 +188,9 @@ class MovingWindow:
         wide[np.ix_(own, own)] *= _WIDER**2
         self._begin = ParameterFilter(numbers.start, wide)
         self._begin.active[numbers.places("gain")] = False
-        self._now, self._gain = ParameterFilter(numbers.start, numbers.covariance), at.gain
-        n_u, n_y = len(numbers.problem.model.inputs), len(numbers.problem.model.outputs)
-        self._u, self._y = np.zeros((window, n_u)), np.zeros((window, n_y))
-        self._held = self._since = 0
+        self._now = ParameterFilter(numbers.start, numbers.covariance)
+        self._stream = EvidenceStream(numbers, at, _ENDLESS)
+        self._recent, self._since = RecentSamples(window), 0
         self.n_used = self.n_rejected = self.n_failed = 0
 
     @property
@@ -220,7 +219,7 @@ class MovingWindow:
         Returns
         -------
         ndarray, shape of `outputs`, SI
-            NaN: a window predicts nothing sample by sample.
+            Innovations of the predictor at the estimate so far; NaN for a rejected sample.
 
         Raises
         ------
@@ -228,46 +227,45 @@ class MovingWindow:
             If the shapes do not fit.
         """
         samples = checked(self.numbers, inputs, outputs, None)
+        errors = np.full(samples.y.shape, np.nan)
         n, k = samples.y.shape[0], 0
-        finite = np.asarray(np.isfinite(np.hstack([samples.u, samples.y])).all(axis=1))
         while k < n:
-            if not finite[k]:
-                self.n_rejected += 1
-                self._held, k = 0, k + 1
-                continue
             stop = min(n, k + self.every - self._since)
-            bad = np.flatnonzero(~finite[k:stop])
-            stop = k + int(bad[0]) if bad.size else stop
-            self._push(samples.u[k:stop], samples.y[k:stop])
-            k = stop
+            used, found, _ = self._stream.feed(samples.part(k, stop))
+            errors[k : k + used] = found
+            self._recent.add(samples.part(k, k + used), self._stream.sample)
+            k, self._since, self.n_used = k + used, self._since + used, self.n_used + used
             if self._since >= self.every:
                 self._since = 0
                 self._solve()
-        return np.full(np.shape(outputs), np.nan)
-
-    def _push(self, u: Array, y: Array) -> None:
-        n = u.shape[0]
-        for ring, new in ((self._u, u), (self._y, y)):
-            if n >= self.window:
-                ring[:] = new[-self.window :]
-            else:
-                ring[:-n] = ring[n:]
-                ring[-n:] = new
-        self._held = min(self._held + n, self.window)
-        self._since += n
-        self.n_used += n
+            elif k < stop:
+                self.n_rejected += 1
+                k += 1
+                self._recent.clear()
+                self._stream.restart(self._stream.sample + 1)
+        errors *= self.numbers.problem.scales.output
+        return errors.reshape(np.shape(outputs))
 
     def _solve(self) -> None:
-        if self._held < self.window:
+        first = self._stream.sample - self.window
+        samples = self._recent.since(first)
+        if samples is None:
             return
         begin = self._begin.copy()
         begin.q = self._now.q.copy()  # a warm start; what is known of it is as wide as at the beginning
-        samples = Samples(u=self._u, y=self._y, forcing=None)
-        found = refine(self.numbers, begin, samples, noise=self.numbers.overdispersion, gain=self._gain)
+        found = refine(
+            self.numbers,
+            begin,
+            samples,
+            first=first,
+            block=_ENDLESS,
+            noise=self.numbers.overdispersion,
+            gain=self._stream.at.gain,
+        )
         if found is None or not found.converged:
             self.n_failed += 1
             return
-        self._now, self._gain = found.filter, found.stream.at.gain
+        self._now, self._stream = found.filter, found.stream
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state.
@@ -277,6 +275,6 @@ class MovingWindow:
         MovingWindow
         """
         other = copy.copy(self)
-        other._begin, other._now = self._begin.copy(), self._now.copy()
-        other._u, other._y = self._u.copy(), self._y.copy()
+        other._begin, other._now, other._stream = self._begin.copy(), self._now.copy(), self._stream.copy()
+        other._recent = copy.deepcopy(self._recent)
         return other
