@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 from table import Table
 
-PARTS = ("speed", "change", "alarms", "quiet", "drift", "latency")
+PARTS = ("speed", "change", "quiet", "drift", "latency")
 
 
 def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
@@ -23,8 +23,10 @@ def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
 
 def _part(part: str) -> Callable[[], Iterator[Table]]:
     from tracking_change import change_tables
+    from tracking_drift import drift_tables
+    from tracking_quiet import quiet_tables
 
-    return {"change": change_tables}[part]
+    return {"change": change_tables, "quiet": quiet_tables, "drift": drift_tables}[part]
 
 
 if __name__ == "__main__":

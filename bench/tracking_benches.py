@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
 
@@ -169,13 +169,12 @@ def blocks(samples: Samples, first: int = 0, size: int = BLOCK) -> Iterator[tupl
         yield k, samples.part(k, min(k + size, samples.y.shape[0]))
 
 
-def shifted(event: Event) -> dict[str, object]:
+def told_of(event: Event) -> dict[str, object]:
     """What an event says, for the file of results."""
-    known = replace(event)
     return {
-        "t": known.t,
-        "kind": known.kind,
-        "parameter": known.parameter,
-        "why": known.why,
-        "values": dict(known.values),
+        "t": event.t,
+        "kind": event.kind,
+        "parameter": event.parameter,
+        "why": event.why,
+        "values": dict(event.values),
     }
