@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+_MOST = 0.5  # part of a positive number by which one block may lower it
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -191,20 +194,25 @@ def lower(W: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def absorb(q: Array, S: Array, J: Array, rho: Array, active: NDArray[np.bool_], noise: float) -> float:
-    """Update q and its square-root covariance S by the rows rho + J (q* - q) ~ N(0, noise I); return rho^T V^-1 rho.
+def absorb(
+    q: Array, S: Array, J: Array, r: Array, at: Array, active: Flags, positive: Flags, noise: float
+) -> tuple[float, float]:
+    """Update q and its square-root covariance S by the rows r + J (q* - at) ~ N(0, noise I), J upper triangular.
 
-    The gain is optimal for the numbers that are active and zero for the others (Schmidt), the covariance is Joseph's,
-    so that it is right for any gain. V = noise I + J P J^T.
+    Return rho^T V^-1 rho, where rho = r + J (q - at) and V = noise I + J P J^T, and the part of the step that is taken.
+    The gain is optimal for the numbers that are active and zero for the others (Schmidt). Where the step would take a
+    positive number below half of what it is, gain and step are made smaller: so far a first-order step is not to be
+    believed. The covariance is Joseph's, which is right for any gain.
     """
-    p, m = q.size, rho.size
-    JS = np.zeros((m, p))
+    p, m = q.size, r.size
+    JS, rho = np.zeros((m, p)), np.empty(m)
     for i in range(m):
-        for j in range(p):
+        rho[i] = r[i]
+        for j in range(i, p):
             v = J[i, j]
-            if v != 0.0:
-                for k in range(p):
-                    JS[i, k] += v * S[j, k]
+            rho[i] += v * (q[j] - at[j])
+            for k in range(p):
+                JS[i, k] += v * S[j, k]
     V = np.zeros((m, m))
     for i in range(m):
         for j in range(i + 1):
@@ -228,8 +236,7 @@ def absorb(q: Array, S: Array, J: Array, rho: Array, active: NDArray[np.bool_], 
             v -= V[i, k] * left[k]
         left[i] = v / V[i, i]
         total += left[i] * left[i]
-    K = np.zeros((p, m))
-    row = np.empty(m)
+    K, step, row, part = np.zeros((p, m)), np.zeros(p), np.empty(m), 1.0
     for a in range(p):
         if not active[a]:
             continue
@@ -240,22 +247,23 @@ def absorb(q: Array, S: Array, J: Array, rho: Array, active: NDArray[np.bool_], 
             for k in range(i):
                 v -= row[k] * V[i, k]
             row[i] = v / V[i, i]
-        step = 0.0
         for i in range(m):
-            step += row[i] * left[i]
-        q[a] -= step
+            step[a] += row[i] * left[i]
+        if positive[a] and step[a] > _MOST * q[a]:
+            part = min(part, _MOST * q[a] / step[a])
         for i in range(m - 1, -1, -1):
             v = row[i]
             for k in range(i + 1, m):
                 v -= V[k, i] * K[a, k]
             K[a, i] = v / V[i, i]
     W = np.empty((p, p + m))
-    root = math.sqrt(noise)
+    root = part * math.sqrt(noise)
     for a in range(p):
+        q[a] -= part * step[a]
         for k in range(p):
             v = S[a, k]
             for i in range(m):
-                v -= K[a, i] * JS[i, k]
+                v -= part * K[a, i] * JS[i, k]
             W[a, k] = v
         for i in range(m):
             W[a, p + i] = root * K[a, i]
@@ -263,18 +271,19 @@ def absorb(q: Array, S: Array, J: Array, rho: Array, active: NDArray[np.bool_], 
     for a in range(p):
         for k in range(p):
             S[a, k] = W[a, k]
-    return total
+    return total, part
 
 
 @njit(cache=True, nogil=True)
-def spread(S: Array, step: Array) -> None:
-    """Let the numbers walk: S S^T grows by diag(step^2)."""
+def spread(S: Array, variance: Array, active: Flags, time: float) -> None:
+    """Let the active numbers walk: their diagonal of S S^T grows by time x variance."""
     p = S.shape[0]
     W = np.zeros((p, 2 * p))
     for a in range(p):
         for k in range(p):
             W[a, k] = S[a, k]
-        W[a, p + a] = step[a]
+        if active[a]:
+            W[a, p + a] = math.sqrt(variance[a] * time)
     lower(W)
     for a in range(p):
         for k in range(p):
@@ -282,37 +291,68 @@ def spread(S: Array, step: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def far(q: Array, at: Array, J: Array, S: Array, curved: Array, most: float) -> bool:
+    """Return whether |J (q - at)|^2 passes `most`, or a squared move its standard deviation times `curved`."""
+    p, total = q.size, 0.0
+    for a in range(p):
+        v, s = 0.0, 0.0
+        for k in range(a, p):
+            v += J[a, k] * (q[k] - at[k])
+        for k in range(p):
+            s += S[a, k] * S[a, k]
+        total += v * v
+        if (q[a] - at[a]) ** 2 > curved[a] * math.sqrt(s):
+            return True
+    return total > most
+
+
+@njit(cache=True, nogil=True)
+def gather(R: Array, w: Array, J: Array, r: Array, at: Array, point: Array) -> None:
+    """Fold a block's triangle into R (p + 1, p + 1), which is held at `point`; `w` (p + 1, p) is scratch."""
+    p = r.size
+    for i in range(p):
+        v = r[i]
+        for k in range(p):
+            w[k, i] = J[i, k] if k >= i else 0.0
+            v += w[k, i] * (point[k] - at[k])
+        w[p, i] = v
+    fold(R, w, p)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def walk_score(
-    J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float
-) -> tuple[Array, Array]:
+    J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float,
+    K: Array, errors: Array,
+) -> tuple[Array, Array]:  # fmt: skip
     """Return sums of lambda_j^2 and N_jj over a ring of `count` blocks: their difference is twice the score.
 
     Kalman filter forward over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from
     one block to the next; then the disturbance smoother backward (Koopman and Shephard 1992; Durbin and Koopman 2012,
-    sec. 4.5 and 6.4).
+    sec. 4.5 and 6.4). J (size, p, p) upper triangular; `K` (size, p, p) and `errors` (size, p, 2) are scratch. Inner
+    loops run along rows of symmetric matrices: they take no sums, so that vector instructions fit.
     """
-    size, m, p = J.shape
-    K, error, variance = np.empty((count, m, p)), np.empty((count, m)), np.empty((count, m))
+    size, p = J.shape[0], J.shape[1]
     q, P = q0.copy(), P0.copy()
     for b in range(count):
         block = (first + b) % size
-        for i in range(m):
-            z = J[block, i]
+        for i in range(p):
+            z, g = J[block, i], K[b, i]
             v, F = r[block, i], noise
-            for a in range(p):
+            for a in range(i, p):
                 v += z[a] * (q[a] - at[block, a])
+            g[:] = 0.0
+            for c in range(i, p):
+                w = z[c]
+                for a in range(p):
+                    g[a] += w * P[c, a]
+            for a in range(i, p):
+                F += g[a] * z[a]
+            errors[b, i, 0], errors[b, i, 1] = v, F
             for a in range(p):
-                g = 0.0
+                w = g[a] / F
+                q[a] -= w * v
                 for c in range(p):
-                    g += P[a, c] * z[c]
-                K[b, i, a] = g
-                F += g * z[a]
-            error[b, i], variance[b, i] = v, F
-            for a in range(p):
-                g = K[b, i, a]
-                q[a] -= g * v / F
-                for c in range(p):
-                    P[a, c] -= g * K[b, i, c] / F
+                    P[a, c] -= w * g[c]
         for a in range(p):
             P[a, a] += step[a] * step[a]
     lam, N, drop = np.zeros(p), np.zeros((p, p)), np.zeros(p)
@@ -323,19 +363,28 @@ def walk_score(
             for a in range(p):
                 squares[a] += lam[a] * lam[a]
                 powers[a] += N[a, a]
-        for i in range(m - 1, -1, -1):
-            z, F = J[block, i], variance[b, i]
+        for i in range(p - 1, -1, -1):
+            z, g, v, F = J[block, i], K[b, i], errors[b, i, 0], errors[b, i, 1]
             # L = I - K z / F:  lambda <- -z error / F + L^T lambda,  N <- z z^T / F + L^T N L
-            dot, twice = 0.0, 0.0
+            dot, twice = v, 0.0
+            drop[:] = 0.0
+            for c in range(p):
+                w = g[c]
+                dot += w * lam[c]
+                for a in range(p):
+                    drop[a] += w * N[c, a]
             for a in range(p):
-                dot += K[b, i, a] * lam[a]
-                g = 0.0
-                for c in range(p):
-                    g += N[a, c] * K[b, i, c]
-                drop[a] = g
-                twice += g * K[b, i, a]
+                twice += g[a] * drop[a]
+            twice = (1.0 + twice / F) / F
             for a in range(p):
-                lam[a] -= z[a] * (error[b, i] + dot) / F
+                drop[a] /= F
+            for a in range(i, p):
+                w = z[a]
+                lam[a] -= w * dot / F
                 for c in range(p):
-                    N[a, c] += z[a] * z[c] * (1.0 / F + twice / (F * F)) - (z[a] * drop[c] + drop[a] * z[c]) / F
+                    N[a, c] += w * (z[c] * twice - drop[c]) if c >= i else -w * drop[c]
+            for a in range(p):
+                w = drop[a]
+                for c in range(i, p):
+                    N[a, c] -= w * z[c]
     return squares, powers

@@ -8,11 +8,12 @@ their ratio, raised to a power below one, therefore takes each w_j towards it an
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.track.evidence import Evidence, merge
+from ambid.track.evidence import Evidence
 from ambid.track.physical.parameter_filter import ParameterFilter
 
 Array = NDArray[np.float64]
@@ -44,21 +45,29 @@ class DriftRates:
     ----------
     variance : ndarray, shape (p,)
         Per second.
+    adapts : bool
+        Whether the variances are found from the data.
+    walks : bool
+        Whether any variance is, or may become, positive.
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
-        from ambid.track.physical._kernels import walk_score
+        from ambid.track.physical._kernels import gather, walk_score
 
         p = start.size
         self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
         self.adapts = bool(np.any(ceiling > floor))
-        self._parts: list[Evidence] = []
+        self.walks = self.adapts or bool(np.any(start > 0.0))
         self._per_chunk = max(1, round(CHUNK_S / block_s))
         self._chunk_s = self._per_chunk * block_s
-        self._J, self._r, self._at = np.zeros((_WINDOW, p, p)), np.zeros((_WINDOW, p)), np.zeros((_WINDOW, p))
-        self._q, self._P = np.zeros((_WINDOW, p)), np.zeros((_WINDOW, p, p))
-        self._count = self._next = self._since = self._looks = 0
-        self._score = walk_score
+        room = _WINDOW if self.adapts else 0
+        self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
+        self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
+        self._scratch = np.zeros((room, p, p)), np.zeros((room, p, 2))
+        self._triangle, self._rows = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p))
+        self._point = start
+        self._parts = self._count = self._next = self._since = self._looks = 0
+        self._score, self._gather = walk_score, gather
 
     def add(self, evidence: Evidence, before: ParameterFilter, noise: float) -> None:
         """Take in a block, and adapt the variances now and then.
@@ -75,11 +84,14 @@ class DriftRates:
             return
         if not self._parts:
             self._q[self._next], self._P[self._next] = before.q, before.covariance
-        self._parts.append(evidence)
-        if len(self._parts) < self._per_chunk:
+            self._triangle[:], self._point = 0.0, evidence.at
+        self._gather(self._triangle, self._rows, evidence.J, evidence.r, evidence.at, self._point)
+        self._parts += 1
+        if self._parts < self._per_chunk:
             return
-        chunk, self._parts = merge(self._parts), []
-        self._J[self._next], self._r[self._next], self._at[self._next] = chunk.J, chunk.r, chunk.at
+        self._parts = 0
+        self._J[self._next], self._r[self._next] = self._triangle[:-1, :-1], self._triangle[:-1, -1]
+        self._at[self._next] = self._point
         self._next = (self._next + 1) % _WINDOW
         self._count = min(self._count + 1, _WINDOW)
         self._since += 1
@@ -89,8 +101,7 @@ class DriftRates:
 
     def restart(self) -> None:
         """Forget the window: a jump in it would pass for drift."""
-        self._count = self._next = self._since = 0
-        self._parts = []
+        self._count = self._next = self._since = self._parts = 0
 
     def copy(self) -> DriftRates:
         """Return an independent copy in the same state.
@@ -100,10 +111,18 @@ class DriftRates:
         DriftRates
         """
         other = copy.copy(self)
-        other._parts = list(self._parts)
-        for name in ("variance", "_J", "_r", "_at", "_q", "_P"):
+        for name in ("variance", "_J", "_r", "_at", "_q", "_P", "_triangle"):
             setattr(other, name, getattr(self, name).copy())
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_score", "_gather")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from ambid.track.physical._kernels import gather, walk_score
+
+        self.__dict__.update(state)
+        self._score, self._gather = walk_score, gather
 
     def _adapt(self, active: NDArray[np.bool_], noise: float) -> None:
         ratio = np.ones(self.variance.size)
@@ -122,7 +141,8 @@ class DriftRates:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
         first = (self._next - count) % _WINDOW
         squares, powers = self._score(
-            self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise
-        )
+            self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise,
+            *self._scratch,
+        )  # fmt: skip
         told = active & (powers > 0.0)
         return np.where(told, squares / np.where(told, powers, 1.0), 1.0)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.predictor import assemble
+from ambid.identify.threads import one_thread
 from ambid.track.physical.numbers import TrackedNumbers
 
 Array = NDArray[np.float64]
@@ -55,7 +56,8 @@ def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> L
         None where there is no stable predictor or no physical plant.
     """
     problem = numbers.problem
-    found = assemble(problem, numbers.vector(q), near=near)
+    with one_thread():  # matrices of a few rows, and the next block waits
+        found = assemble(problem, numbers.vector(q), near=near)
     if found is None:
         return None
     n, count = found.x0.size, problem.slices["initial"].start

@@ -91,6 +91,12 @@ class TrackedNumbers:
         """Whether the unbalance is among the numbers."""
         return "unbalance" in self.kinds
 
+    @property
+    def positive(self) -> NDArray[np.bool_]:
+        """Which numbers physics allows positive values of only, shape (p,): mass, resistance, inductance, gains."""
+        allowed = {s.name for s in self.problem.model.parameters if s.positive}
+        return np.array([name in allowed for name in self.names])
+
     def places(self, *kinds: Kind) -> NDArray[np.int64]:
         """Return where the numbers of some kinds stand in q.
 

@@ -6,12 +6,15 @@ not moved (Schmidt). The covariance is symmetric and positive definite by constr
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.track.evidence import Evidence
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 class ParameterFilter:
@@ -22,22 +25,28 @@ class ParameterFilter:
     start : ndarray, shape (p,)
     covariance : ndarray, shape (p, p)
         Positive definite.
+    positive : ndarray of bool, shape (p,), optional
+        Numbers that are positive and stay so; default none.
 
     Attributes
     ----------
     q : ndarray, shape (p,)
     active : ndarray of bool, shape (p,)
         Which numbers evidence may move, and which may walk.
+    n_shortened : int
+        Steps that were shortened because a positive number would have lost more than half of itself.
     """
 
-    def __init__(self, start: Array, covariance: Array) -> None:
-        from ambid.track.physical._kernels import absorb, spread
+    def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
+        from ambid.track.physical._kernels import absorb, far, spread
 
         self.q = start.copy()
         size = np.sqrt(np.diag(covariance))
         self._S = np.ascontiguousarray(size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size)))
         self.active = np.ones(start.size, dtype=np.bool_)
-        self._absorb, self._spread = absorb, spread
+        self._positive = np.zeros(start.size, dtype=np.bool_) if positive is None else positive
+        self._absorb, self._spread, self._far = absorb, spread, far
+        self.n_shortened = 0
 
     @property
     def covariance(self) -> Array:
@@ -49,15 +58,17 @@ class ParameterFilter:
         """Standard deviations of `q`, shape (p,)."""
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", self._S, self._S)))
 
-    def walk(self, step: Array) -> None:
+    def walk(self, variance: Array, time: float = 1.0) -> None:
         """Let the active numbers walk.
 
         Parameters
         ----------
-        step : ndarray, shape (p,)
-            Standard deviations of the steps.
+        variance : ndarray, shape (p,)
+            Of the walks, per second.
+        time : float
+            s.
         """
-        self._spread(self._S, np.where(self.active, step, 0.0))
+        self._spread(self._S, variance, self.active, time)
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
         """Take in a block's evidence.
@@ -74,8 +85,30 @@ class ParameterFilter:
             Squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model and
             the covariance are right.
         """
-        rho = evidence.residual(self.q)
-        return float(self._absorb(self.q, self._S, evidence.J, rho, self.active, noise))
+        misfit, part = self._absorb(
+            self.q, self._S, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise
+        )
+        self.n_shortened += part < 1.0
+        return float(misfit)
+
+    def far(self, at: Array, J: Array, curved: Array, most: float) -> bool:
+        """Return whether the estimate has left the neighbourhood of a point.
+
+        Parameters
+        ----------
+        at : ndarray, shape (p,)
+        J : ndarray, shape (p, p)
+            Upper triangle of a block's evidence.
+        curved : ndarray, shape (p,)
+            Squared moves over standard deviations that are too much.
+        most : float
+            |J (q - at)|^2 that is too much.
+
+        Returns
+        -------
+        bool
+        """
+        return bool(self._far(self.q, at, J, self._S, curved, most))
 
     def widen(self, place: int, sd: float) -> None:
         """Forget what is known of one number, but not the others: it may have moved by about `sd`.
@@ -85,9 +118,9 @@ class ParameterFilter:
         place : int
         sd : float
         """
-        step = np.zeros(self.q.size)
-        step[place] = sd
-        self._spread(self._S, step)
+        variance = np.zeros(self.q.size)
+        variance[place] = sd * sd
+        self._spread(self._S, variance, np.ones_like(self.active), 1.0)
 
     def set(self, q: Array, covariance: Array) -> None:
         """Go on from other numbers.
@@ -108,6 +141,15 @@ class ParameterFilter:
         ParameterFilter
         """
         other = ParameterFilter.__new__(ParameterFilter)
+        other.__dict__.update(self.__dict__)
         other.q, other._S, other.active = self.q.copy(), self._S.copy(), self.active.copy()
-        other._absorb, other._spread = self._absorb, self._spread
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_absorb", "_spread", "_far")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from ambid.track.physical._kernels import absorb, far, spread
+
+        self.__dict__.update(state)
+        self._absorb, self._spread, self._far = absorb, spread, far

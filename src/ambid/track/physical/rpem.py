@@ -22,7 +22,7 @@ from ambid.track.physical.evidence_stream import EvidenceStream
 from ambid.track.physical.linearisation import linearise
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
-from ambid.track.physical.signals import checked
+from ambid.track.physical.signals import Samples, checked
 
 Array = NDArray[np.float64]
 Memory = float | Literal["auto", "all"]
@@ -83,13 +83,14 @@ class PhysicalRpem:
         if size < 1:
             raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
         self.numbers, self.block_samples, self.block_s = numbers, size, size / numbers.rate_hz
-        self.filter = ParameterFilter(numbers.start, numbers.covariance)
+        self.filter = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
         self.filter.active[numbers.places("gain")] = False
         self.stream = EvidenceStream(numbers, at, size)
         self.drift = _rates(numbers, memory, self.block_s)
         self.n_used = self.n_rejected = self.n_linearised = 0
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
+        self._unit = numbers.problem.scales.output
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
 
     @property
@@ -128,8 +129,10 @@ class PhysicalRpem:
             If the shapes do not fit.
         """
         samples = checked(self.numbers, inputs, outputs, forcing)
-        errors = np.full(samples.y.shape, np.nan)
         k, n = 0, samples.y.shape[0]
+        if n == 1:
+            return self._one(samples).reshape(np.shape(outputs))
+        errors = np.full(samples.y.shape, np.nan)
         while k < n:
             used, found, evidence = self.stream.feed(samples.part(k))
             errors[k : k + used] = found
@@ -141,8 +144,20 @@ class PhysicalRpem:
                 self.n_rejected += 1
                 k += 1
                 self.stream.restart(self.stream.sample + 1)
-        errors *= self.numbers.problem.scales.output
+        errors *= self._unit
         return errors.reshape(np.shape(outputs))
+
+    def _one(self, samples: Samples) -> Array:
+        """Take in one sample; the same as below, without what only a block needs."""
+        used, errors, evidence = self.stream.feed(samples)
+        self.n_used += used
+        if evidence is not None:
+            self.take(evidence)
+        elif not used:
+            self.n_rejected += 1
+            self.stream.restart(self.stream.sample + 1)
+            return np.full(samples.y.shape, np.nan)
+        return errors * self._unit
 
     def take(self, evidence: Evidence) -> None:
         """Take in the evidence of a block.
@@ -159,8 +174,8 @@ class PhysicalRpem:
 
     def predict(self) -> None:
         """Let the numbers walk over one block."""
-        if self.drift.adapts or np.any(self.drift.variance):
-            self.filter.walk(np.sqrt(self.drift.variance * self.block_s))
+        if self.drift.walks:
+            self.filter.walk(self.drift.variance, self.block_s)
 
     def refresh(self) -> None:
         """Assemble the predictor anew where the estimate has moved too far from it.
@@ -168,12 +183,10 @@ class PhysicalRpem:
         Too far is where second-order terms matter, or where its innovations are noticeably larger than those at the
         estimate.
         """
-        moved = self.filter.q - self.stream.at.at
         latest = self.stream.latest
         if latest is not None:
-            step = latest.J @ moved
-            stale = step @ step > _STALE * self.noise_level * latest.n_samples
-            if stale or np.any(moved * moved > self._curved * self.filter.sd):
+            most = _STALE * self.noise_level * latest.n_samples
+            if self.filter.far(self.stream.at.at, latest.J, self._curved, most):
                 self.move_to(self.filter.q)
 
     def noise_of(self, evidence: Evidence) -> float:

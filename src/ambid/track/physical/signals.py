@@ -135,6 +135,17 @@ def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forc
     EstimationError
         If the shapes do not fit each other or the model.
     """
+    if forcing is None and not numbers.synchronous:
+        # one sample as it mostly comes: the checks below would take as long as its use
+        n_u, n_y = numbers.problem.u.shape[1], numbers.problem.y.shape[1]
+        if (
+            type(inputs) is np.ndarray and type(outputs) is np.ndarray
+            and inputs.dtype == np.float64 and outputs.dtype == np.float64
+            and inputs.shape == (n_u,) and outputs.shape == (n_y,)
+        ):  # fmt: skip
+            return Samples(
+                u=np.ascontiguousarray(inputs).reshape(1, n_u), y=np.ascontiguousarray(outputs).reshape(1, n_y)
+            )
     model = numbers.problem.model
     u, y = _columns(inputs, len(model.inputs)), _columns(outputs, len(model.outputs))
     extra = None if forcing is None else _columns(forcing, 2)

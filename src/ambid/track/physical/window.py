@@ -186,9 +186,9 @@ class MovingWindow:
         wide = numbers.covariance.copy()
         own = numbers.places("parameter", "noise")
         wide[np.ix_(own, own)] *= _WIDER**2
-        self._begin = ParameterFilter(numbers.start, wide)
+        self._begin = ParameterFilter(numbers.start, wide, numbers.positive)
         self._begin.active[numbers.places("gain")] = False
-        self._now = ParameterFilter(numbers.start, numbers.covariance)
+        self._now = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
         self._stream = EvidenceStream(numbers, at, _ENDLESS)
         self._recent, self._since = RecentSamples(window), 0
         self.n_used = self.n_rejected = self.n_failed = 0
