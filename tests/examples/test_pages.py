@@ -20,12 +20,17 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
-def test_python_pieces_of_the_howto_run_in_their_order(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("page", "printed"),
+    [("howto", "k_i with the mass free"), ("online", "k_i changed at 1.5")],
+    ids=["howto", "online"],
+)
+def test_python_pieces_of_a_page_run_in_their_order(page, printed, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for number, piece in enumerate(blocks(ROOT / "docs" / "howto.md", "python"), start=1):
-        exec(compile(piece, f"howto.md, piece {number}", "exec"), names)
-    assert "k_i with the mass free" in capsys.readouterr().out
+    for number, piece in enumerate(blocks(ROOT / "docs" / f"{page}.md", "python"), start=1):
+        exec(compile(piece, f"{page}.md, piece {number}", "exec"), names)
+    assert printed in capsys.readouterr().out
 
 
 RIGS = [(page, k, text) for page in PAGES for k, text in enumerate(blocks(page, "toml"), start=1)]
