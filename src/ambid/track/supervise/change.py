@@ -145,7 +145,7 @@ class ChangeDetector:
     overdispersion : ndarray, shape (n_windows, n_hypotheses + 2)
         Present factors; the last two columns are all numbers together and the unexplained part.
     noise : float
-        Present usual level of the unexplained part per degree of freedom.
+        Present usual level of the unexplained part per degree of freedom. May be set anew at any time.
     """
 
     def __init__(
@@ -208,6 +208,10 @@ class ChangeDetector:
     @property
     def noise(self) -> float:  # noqa: D102
         return math.exp(self._state[0])
+
+    @noise.setter
+    def noise(self, value: float) -> None:
+        self._state[0] = math.log(value)
 
     def update(self, evidence: Evidence, estimate: Array, covariance: Array) -> Alarm | None:
         """Take in one block.

@@ -41,7 +41,9 @@ def published(
     }
 
 
-def beside(numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_]) -> dict[str, TrackedValue]:
+def beside(
+    numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_], *, stale: bool = False
+) -> dict[str, TrackedValue]:
     """Return what is tracked beside the parameters: gains of sensors that were found to have changed, unbalance.
 
     Parameters
@@ -50,14 +52,19 @@ def beside(numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_
     accepted : Accepted
     active : ndarray of bool, shape (p,)
         Which numbers the recursion may move.
+    stale : bool
+        Whether they are no longer informed, or known to be no longer right.
 
     Returns
     -------
     dict of str to TrackedValue
         SI; the unbalance in kg m, its phase in rad.
     """
-    gains = published(numbers, accepted, "gain", {})
-    found = {name: value for name, value in gains.items() if active[numbers.names.index(name)]}
+    gains = tuple(numbers.names[j] for j in numbers.places("gain") if active[j])
+    if not gains and not numbers.synchronous:
+        return {}
+    found = published(numbers, accepted, "gain", dict.fromkeys(gains, not stale))
+    found = {name: found[name] for name in gains}
     if not numbers.synchronous:
         return found
     at = numbers.places("unbalance")
@@ -68,6 +75,6 @@ def beside(numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_
     )
     return {
         **found,
-        "unbalance": TrackedValue(value=amplitude, sd=sd),
-        "unbalance_phase": TrackedValue(value=phase, sd=phase_sd),
+        "unbalance": TrackedValue(value=amplitude, sd=sd, stale=stale),
+        "unbalance_phase": TrackedValue(value=phase, sd=phase_sd, stale=stale),
     }

@@ -1,8 +1,8 @@
 """After a change: find the moved number anew from the raw samples since, beside what was known before.
 
 Each suspect alone is given its freedom back; the one that explains the stretch best is the one that moved. Where none
-does, all physical parameters are freed. The search is the off-line Gauss-Newton step on a few thousand samples at most,
-so that it takes milliseconds.
+does, all physical parameters are freed. An explanation has to bring the innovations down to what they were. The search
+is the off-line Gauss-Newton step on a few thousand samples at most, so that it takes milliseconds.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ _BLOCKS_AFTER = 3  # of settled evidence before the first search
 _SHOWN = 4.0  # standard deviations by which the innovations of a block are larger than before
 _FEW = 3  # suspects that are searched in full
 _MISFIT = 4.0  # times the number of unknowns: what a right explanation's misfit hardly passes
+_LEFT = 2.0  # times the usual variance of innovations that a right explanation may leave, as it is over few blocks
+_VAGUE = 0.1  # relative standard deviation above which nothing is said to have been found
+_QUIET = 3.0  # standard deviations of chi-squared under which what was known before explains a stretch
 
 
 def begin(
@@ -35,7 +38,8 @@ def begin(
     *,
     onset: int,
     suspects: tuple[str, ...],
-    size: float,
+    size: float = 0.0,
+    blocks: int = 0,
 ) -> Recovery:
     """Prepare the search after an alarm.
 
@@ -50,6 +54,8 @@ def begin(
         First sample of the window in which it was found.
     suspects : tuple of str
     size : float
+    blocks : int
+        Length of that window; 0 where it does not matter.
 
     Returns
     -------
@@ -63,6 +69,7 @@ def begin(
         suspects=suspects,
         size=size,
         onset=clean,
+        short=0 < blocks <= _BLOCKS_AFTER,
         before=before.copy(),
         ready=clean + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples,
     )
@@ -85,13 +92,14 @@ class Recovered:
 
     Attributes
     ----------
-    refined : Refined
+    refined : Refined or None
+        None where nothing has moved.
     moved : tuple of str
         Numbers that were freed.
     computing_s : float
     """
 
-    refined: Refined
+    refined: Refined | None
     moved: tuple[str, ...]
     computing_s: float
 
@@ -110,6 +118,8 @@ class Recovery:
         How far the likeliest has moved, in units of its magnitude, as far as is known.
     onset : int
         First sample after the change.
+    short : bool
+        The alarm came from so few blocks that as many after the change have to show it too.
     before : ParameterFilter
         What was known before it.
     ready : int
@@ -121,6 +131,7 @@ class Recovery:
     suspects: tuple[str, ...]
     size: float
     onset: int
+    short: bool
     before: ParameterFilter
     ready: int
     attempts: int = 0
@@ -138,29 +149,55 @@ class Recovery:
         Recovered or None
             None where nothing explains them; the next attempt is due when twice as many are there.
         """
-        begun = time.perf_counter()
+        begun = time.thread_time()
         self.attempts += 1
         if self.attempts > 1:  # something in the first half does not belong to what holds now
             self.onset += (recent.last - self.onset) // 2
         self.onset = max(self.onset, recent.first)
         self.ready = recent.last + max(recent.last - self.onset, 1)
-        limit = _MISFIT * rpem.numbers.start.size
-        best = self._best(rpem, recent, [(name,) for name in self._likeliest(rpem, recent)])
-        if best is None or best[0].misfit >= limit:
+        best: tuple[Refined | None, tuple[str, ...]] | None = None
+        samples = recent.since(self.onset)
+        evidence = None if samples is None else evidence_of(rpem.numbers, rpem.stream.at, samples, first=self.onset)
+        if evidence is not None:
+            best = self._explanation(rpem, recent, evidence)
+        if best is None:
+            return None
+        return Recovered(refined=best[0], moved=best[1], computing_s=time.thread_time() - begun)
+
+    def restart(self, sample: int, rpem: PhysicalRpem) -> None:
+        """Wait for samples behind a gap: those before it cannot be used together with them.
+
+        Parameters
+        ----------
+        sample : int
+            First one behind the gap.
+        rpem : PhysicalRpem
+        """
+        self.onset = sample
+        self.ready = sample + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples
+        self.attempts = max(self.attempts - 1, 0)
+
+    def _explanation(
+        self, rpem: PhysicalRpem, recent: RecentSamples, evidence: Evidence
+    ) -> tuple[Refined | None, tuple[str, ...]] | None:
+        """What explains the samples since the onset, if anything does: nothing has moved, one number has, or all."""
+        p = rpem.numbers.start.size
+        if self.short and self.attempts == 1 and self._unmoved(rpem, evidence) < p + _QUIET * np.sqrt(2.0 * p):
+            return None, ()
+        best = self._best(rpem, recent, [(name,) for name in self._likeliest(rpem, evidence)])
+        if best is None or best[0].misfit >= _MISFIT * p:
             numbers = rpem.numbers
             every = tuple(numbers.names[j] for j in numbers.places("parameter"))
             best = self._best(rpem, recent, [every])
-        if best is None or best[0].misfit >= limit:
-            return None
-        return Recovered(refined=best[0], moved=best[1], computing_s=time.perf_counter() - begun)
+        return best if best is not None and best[0].misfit < _MISFIT * p else None
 
-    def _likeliest(self, rpem: PhysicalRpem, recent: RecentSamples) -> tuple[str, ...]:
+    def _unmoved(self, rpem: PhysicalRpem, evidence: Evidence) -> float:
+        """Misfit of what was known before: chi-squared with p degrees of freedom if nothing has moved."""
+        return self.before.copy().absorb(evidence, rpem.noise)
+
+    def _likeliest(self, rpem: PhysicalRpem, evidence: Evidence) -> tuple[str, ...]:
         """Of many suspects those few that explain the stretch best to first order."""
         if len(self.suspects) <= _FEW:
-            return self.suspects
-        samples = recent.since(self.onset)
-        evidence = None if samples is None else evidence_of(rpem.numbers, rpem.stream.at, samples, first=self.onset)
-        if evidence is None:
             return self.suspects
         rho, spread = evidence.residual(self.before.q), evidence.J @ self.before.covariance @ evidence.J.T
         places = [rpem.numbers.names.index(name) for name in self.suspects]
@@ -199,4 +236,8 @@ class Recovery:
             noise=rpem.noise,
             gain=rpem.stream.at.gain,
         )
-        return found if found is not None and found.converged else None
+        if found is None or not found.converged:
+            return None
+        left = found.evidence.rest / found.evidence.freedom if found.evidence.freedom else 1.0
+        vague = max(found.filter.sd[rpem.numbers.names.index(name)] for name in freed) > _VAGUE
+        return None if vague or left > _LEFT * max(rpem.noise_level, 1.0) else found

@@ -1,0 +1,324 @@
+"""What a block shows that the estimate does not explain, and what is done about it.
+
+A number of the bench that jumped is searched in the samples after the jump; a disturbance is given its freedom; a knock
+is set aside; noise that has risen for good is taken as such; and where nothing explains the data nothing is learned.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Literal
+
+import numpy as np
+
+from ambid.track.evidence import Evidence
+from ambid.track.lines import Event
+from ambid.track.physical.parameter_filter import ParameterFilter
+from ambid.track.physical.rpem import PhysicalRpem
+from ambid.track.physical.signals import RecentSamples, Samples
+from ambid.track.supervise.change import Alarm, ChangeDetector
+from ambid.track.supervise.log import DecisionLog
+from ambid.track.supervise.publication import Publication
+from ambid.track.supervise.recovery import Recovered, Recovery, begin
+from ambid.track.supervise.unexplained import WILD, Unexplained, unexplained
+
+LONGEST_S = 0.5  # window of change detection
+_SETTLE_S = 1.0  # in which the detector learns how imperfect the model is, where the start estimate says that it is
+_ATTEMPTS = 5
+_BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
+_DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
+_TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
+_STRAY = 3.0  # moves by which such a number is widened
+_UNKNOWN = 0.3  # relative standard deviation of a parameter of which nothing is known any more
+
+
+class Diagnosis:
+    """Watches the evidence of a working estimate, and deals with what it finds.
+
+    Parameters
+    ----------
+    rpem : PhysicalRpem
+    publication : Publication
+    log : DecisionLog
+    t0 : float
+        Time of sample 0, s of record.
+    false_alarms_per_hour : float
+
+    Attributes
+    ----------
+    unexplained : Unexplained
+    settling : bool
+        Whether a disturbance is being learned.
+    renewed : bool
+        Whether the working estimate was put elsewhere by the last block.
+    changes : list of Event
+        Changes found, the name being that of the number which explains the data after it.
+    update_s : float
+        Computing time of the slowest search after a change, s.
+    """
+
+    def __init__(
+        self, rpem: PhysicalRpem, publication: Publication, log: DecisionLog, *, t0: float, false_alarms_per_hour: float
+    ) -> None:
+        numbers, imperfect = rpem.numbers, rpem.numbers.overdispersion
+        self._rpem, self._publication, self._log, self._t0 = rpem, publication, log, t0
+        kinds = dict(zip(numbers.names, numbers.kinds, strict=True))
+        self._kinds = kinds
+        self._bench = tuple(n for n, kind in kinds.items() if kind in _BENCH)
+        self._detector = ChangeDetector(
+            numbers.names,
+            hypotheses=[n for n, kind in kinds.items() if kind != "noise"],
+            block_s=rpem.block_s,
+            false_alarms_per_hour=false_alarms_per_hour,
+            longest_s=LONGEST_S,
+            overdispersion=imperfect,
+            settle_s=_SETTLE_S if imperfect > 1.0 else 0.0,
+        )
+        self._recent = RecentSamples(round(2 * LONGEST_S * numbers.rate_hz))
+        self._history: deque[tuple[Evidence, ParameterFilter]] = deque(maxlen=round(LONGEST_S / rpem.block_s) + 4)
+        self._recovery: Recovery | None = None
+        self.unexplained = Unexplained()
+        self.settling = self.renewed = False
+        self.changes: list[Event] = []
+        self.update_s = 0.0
+
+    @property
+    def searching(self) -> bool:
+        """Whether a change was found, and its new value was not."""
+        return self._recovery is not None
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the published numbers are known to be no longer right, and better ones have not been confirmed."""
+        return self._recovery is not None or self._publication.unconfirmed or self.unexplained.deaf
+
+    @property
+    def noise(self) -> float:
+        """Variance of the noise over that at identification, as it was taken: 1 if it never rose."""
+        return self.unexplained.noise
+
+    def keep(self, samples: Samples, last: int) -> None:
+        """Keep samples for a search.
+
+        Parameters
+        ----------
+        samples : Samples
+            Those that follow the ones before.
+        last : int
+            Number of the sample after them.
+        """
+        self._recent.add(samples, last)
+
+    def restart(self, sample: int) -> None:
+        """Start the predictor anew, as after a gap; a search waits for samples from then on.
+
+        Parameters
+        ----------
+        sample : int
+            Number of the next sample.
+        """
+        self._rpem.stream.restart(sample)
+        self._recent.clear()
+        if self._recovery is not None:
+            self._recovery.restart(sample, self._rpem)
+
+    def forget(self, sample: int) -> None:
+        """Look for changes from a sample on, as after a long gap.
+
+        Parameters
+        ----------
+        sample : int
+        """
+        self._history.clear()
+        self._detector.restart(sample)
+
+    def look(self, evidence: Evidence, t: float) -> bool:
+        """Judge a block before it is used.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        t : float
+            Its end, s of record.
+
+        Returns
+        -------
+        bool
+            Whether the recursion may learn from it.
+        """
+        rpem, self.renewed = self._rpem, False
+        self._history.append((evidence, rpem.filter.copy()))
+        if self._recovery is not None:
+            self._recover(evidence, t)
+            return False
+        if self.unexplained.deaf:
+            self._listen(evidence, t)
+            return False
+        self._detector.drift = rpem.drift.variance * rpem.block_s
+        alarm = self._detector.update(evidence, rpem.filter.q, rpem.filter.covariance)
+        if alarm is not None and not self._undecided(alarm):
+            return self._alarmed(alarm, evidence, t)
+        if self.unexplained.blocks and unexplained(evidence) <= WILD * self._detector.noise:
+            self.unexplained.over()
+        return True
+
+    def _undecided(self, alarm: Alarm) -> bool:
+        """Wait another block or two where a disturbance and a fault of the bench explain the first ones alike."""
+        doubtful = self._kind(alarm.parameter) in _DISTURBED and any(self._kind(n) in _BENCH for n, _ in alarm.rivals)
+        return doubtful and alarm.blocks < _TELLING
+
+    def _kind(self, name: str | None) -> str | None:
+        return None if name is None else self._kinds[name]
+
+    def _alarmed(self, alarm: Alarm, evidence: Evidence, t: float) -> bool:
+        """Begin to deal with an alarm; tell whether the block may be used."""
+        name, kind = alarm.parameter, self._kind(alarm.parameter)
+        moved: Literal["change", "disturbed"] = "change" if kind in _BENCH else "disturbed"
+        event = Event(
+            kind=moved,
+            t=self._t0 + alarm.onset / self._rpem.numbers.rate_hz,
+            why=alarm.why,
+            parameter=name,
+            values={"statistic": alarm.statistic, "threshold": alarm.threshold, "detected": t},
+        )
+        if alarm.by == "noise":
+            return self._noisy(alarm, event, unexplained(evidence))
+        self._log.add(event)
+        self.unexplained.over()
+        self._publication.restart()
+        if name is not None and kind in _DISTURBED:
+            self._rpem.filter.widen(self._rpem.numbers.names.index(name), _STRAY * abs(alarm.size))
+            self._detector.restart(self._rpem.stream.sample)
+            self.settling = True
+            return alarm.blocks > 1  # in its own block the jump has a beginning: that says nothing of what holds now
+        suspects = self._bench  # a fault of one thing is likelier than of several at once
+        if name is not None and kind in _BENCH:
+            self.changes.append(event)
+            suspects = (name, *[n for n, _ in alarm.rivals if self._kind(n) in _BENCH][:2])
+        self._search(event, alarm.onset, suspects, size=alarm.size, blocks=alarm.blocks)
+        return False
+
+    def _noisy(self, alarm: Alarm, event: Event, variance: float) -> bool:
+        """Deal with innovations that no number explains; tell whether the block may be used."""
+        usual, sample = self._detector.noise, self._rpem.stream.sample
+        if variance <= WILD * usual:  # a little more, or less, than usual over many blocks
+            if alarm.noise > 1.0:
+                self._log.add(event)
+            self._take_as_noise(usual * alarm.noise)
+            return True
+        self.unexplained.count(variance)
+        if self.unexplained.blocks == 1:
+            self._log.add(event)
+        if self.unexplained.persists:
+            self._search(event, alarm.onset, self._bench)
+        else:
+            self.restart(sample)
+            self._detector.restart(sample)
+        return False
+
+    def _take_as_noise(self, variance: float) -> None:
+        """Go on with another noise level."""
+        self._rpem.noise_level = variance
+        self.unexplained.noise = max(variance, 1.0)
+        self._detector.noise = variance
+        self._detector.restart(self._rpem.stream.sample)
+
+    def _listen(self, evidence: Evidence, t: float) -> None:
+        """Wait until the model explains the data again; look now and then whether a change explains them."""
+        sample = self._rpem.stream.sample
+        if unexplained(evidence) <= WILD * self._detector.noise:
+            self.unexplained.over()
+            self._detector.restart(sample)
+            self._log.add(Event(kind="thawed", t=t, why="the model explains the data again"))
+        elif self.unexplained.search_due(t):
+            why = "the model does not explain the data"
+            self._search(Event(kind="disturbed", t=t, why=why, values={"detected": t}), sample, self._bench)
+
+    def _search(
+        self, event: Event, onset: int, suspects: tuple[str, ...], *, size: float = 0.0, blocks: int = 0
+    ) -> None:
+        self._recovery = begin(
+            self._rpem, self._history, event, onset=onset, suspects=suspects, size=size, blocks=blocks
+        )
+
+    def _recover(self, evidence: Evidence, t: float) -> None:
+        """Search once enough samples have come; go on from what is found."""
+        assert self._recovery is not None
+        if evidence.last < self._recovery.ready:
+            return
+        found = self._recovery.attempt(self._rpem, self._recent)
+        if found is not None:
+            self._adopt(found, t)
+        elif self.unexplained.blocks:
+            self._no_change(t)
+        elif self._recovery.attempts >= _ATTEMPTS and unexplained(evidence) > WILD * self._detector.noise:
+            self.unexplained.count(unexplained(evidence))
+            self._no_change(t)
+        elif self._recovery.attempts >= _ATTEMPTS:
+            self._give_up(t)
+
+    def _adopt(self, found: Recovered, t: float) -> None:
+        """Go on with numbers that were found anew, as a candidate for publication."""
+        rpem, refined = self._rpem, found.refined
+        self.update_s = max(self.update_s, found.computing_s)
+        if refined is None or not found.moved:  # it was a knock: nothing has moved
+            self._fresh_start()
+            return
+        rpem.filter, rpem.stream = refined.filter, refined.stream
+        rpem.n_linearised += refined.iterations
+        self.unexplained.over()
+        self._name(found, t)
+        self._fresh_start()
+        names = ", ".join(found.moved)
+        why = f"{names} found anew from the samples after the change in {found.computing_s * 1e3:.1f} ms"
+        self._publication.propose(t, why)
+        self._publication.unconfirmed = self.renewed = True
+
+    def _name(self, found: Recovered, t: float) -> None:
+        """Say which number moved where the alarm has not, or has named another: more data are there now."""
+        assert self._recovery is not None
+        rpem, before = self._rpem, self._recovery.before
+        places = [rpem.numbers.names.index(name) for name in found.moved]
+        moves = [abs(rpem.filter.q[j] - before.q[j]) / rpem.filter.sd[j] for j in places]
+        name = found.moved[int(np.argmax(moves))]
+        told = self._recovery.event
+        if told.kind == "change" and told.parameter == name:
+            return
+        what = f"the data after it are explained by {', '.join(found.moved)}"
+        event = Event(
+            kind="change", t=told.t, parameter=name, why=f"{what}; {told.why}", values={**told.values, "named": t}
+        )
+        if told.kind == "change":
+            self.changes[-1] = event
+        else:
+            self.changes.append(event)
+        self._log.add(event)
+
+    def _no_change(self, t: float) -> None:
+        """No change explains wild innovations: they are noise as long as that can be believed."""
+        level, deaf = self.unexplained.level, self.unexplained.deaf
+        seen = f"the innovations' variance is {level:.3g} times that at identification"
+        self._fresh_start()
+        if self.unexplained.believable and not deaf:
+            self.unexplained.over()
+            self._take_as_noise(level)
+            self._log.add(Event(kind="disturbed", t=t, why=f"{seen}, and no change explains it: taken as noise"))
+            return
+        if not deaf:
+            self._log.add(Event(kind="frozen", t=t, why=f"{seen}: the model fails, and nothing is learned meanwhile"))
+        self.unexplained.close_ears(t)
+
+    def _give_up(self, t: float) -> None:
+        """Let the recursion find what no search has found: all parameters are unknown again."""
+        for place in self._rpem.numbers.places("parameter"):
+            self._rpem.filter.widen(int(place), _UNKNOWN)
+        why = "nothing explains the data after the change; all parameters are found anew"
+        self._log.add(Event(kind="disturbed", t=t, why=why))
+        self._fresh_start()
+        self._publication.unconfirmed = True
+
+    def _fresh_start(self) -> None:
+        self._recovery = None
+        self._history.clear()
+        self._rpem.drift.restart()
+        self._detector.restart(self._rpem.stream.sample)
