@@ -9,8 +9,9 @@ from typing import Literal
 
 State = Literal["tracking", "frozen", "changed", "hold"]
 EventKind = Literal[
-    "change", "rejected", "accepted", "refused", "reverted", "frozen", "thawed", "operator", "disturbed"
-]
+    "change", "rejected", "accepted", "refused", "reverted", "frozen", "thawed", "operator", "disturbed", "excluded",
+    "restored",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +40,8 @@ class Event:
     kind : str
         ``change`` (a parameter moved), ``disturbed`` (offset, noise or something unexplained changed), ``rejected``
         (samples were not used), ``accepted`` and ``refused`` (a candidate passed its validation or not), ``reverted``,
-        ``frozen`` and ``thawed`` (information went and came), ``operator`` (a flag was set).
+        ``frozen`` and ``thawed`` (information went and came), ``operator`` (a flag was set), ``excluded`` and
+        ``restored`` (a sensor is not used any more, is used again; `parameter` is its name).
     t : float
         When it happened, s of record; for a change the estimated onset.
     why : str

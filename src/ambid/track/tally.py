@@ -12,7 +12,8 @@ from ambid.track.lines import Event, TrackHeader, TrackLine, TrackSummary
 
 # What a reader has to know first, when several things happened in one reporting interval.
 _IMPORTANCE = (
-    "change", "reverted", "disturbed", "refused", "accepted", "operator", "rejected", "frozen", "thawed",
+    "change", "reverted", "excluded", "disturbed", "refused", "accepted", "operator", "restored", "rejected", "frozen",
+    "thawed",
 )  # fmt: skip
 
 
