@@ -45,7 +45,7 @@ class SensorFusion:
     **Faults.** With three or more working sensors they are compared with each other alone, so that no shock to the
     rotor accuses one: log-likelihood CUSUMs for a step, more noise and a loss of gain of each sensor, plus missing
     values, rails and values that stand still. With two, the motion model takes part; where it does not decide, the
-    event says "one of", both are used, and the standard deviation covers either being right until they agree. A sensor
+    event says "one of", both are used, and the standard deviation covers either being right until they agree. One that
     is alone is only excluded if it gives nothing, stands at a rail or stands still. A single value beyond 4 standard
     deviations is not used. A fault that is slower than the sensor's drift is taken for drift.
 
