@@ -30,7 +30,7 @@ from ambid.identify.blackbox.state_space import StateSpaceModel
 from ambid.identify.blackbox.structures import structure as registered
 
 HERE = Path(__file__).resolve().parent
-ENVIRONMENT = HERE / ".venv" / "linear" / "bin" / "python"
+ENVIRONMENT, TRACKING = (HERE / ".venv" / name / "bin" / "python" for name in ("linear", "tracking"))
 Array = np.ndarray
 Model = PolynomialModel | StateSpaceModel
 
@@ -59,6 +59,7 @@ WAYS = (
     Way(label="SciPy by hand", program="scipy", structures=("oe", "armax", "bj")),
 )
 PACKAGES = ("pysib", "sippy-unipi", "sysidentpy", "nfoursid", "numpy", "scipy", "casadi")
+TRACKERS = ("padasip", "filterpy", "statsmodels")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,10 +87,20 @@ class Bench:
         """Fit one record, u and y of shape (n_samples,); the peers take for granted that it begins at rest."""
         if way.program == "ambid":
             return _ambid(structure, orders, u, y, open_loop, at_rest)
+        said = self.ask(way.program, structure, orders, u, y, mode=way.mode, limit_s=limit_s)
+        if "problem" in said:
+            return Answer(seconds=said["seconds"], problem=said["problem"])
+        return Answer(seconds=said["seconds"], model=model_of({k: np.array(v) for k, v in said["found"].items()}))
+
+    def ask(
+        self, program: str, structure: str, orders: Mapping[str, Any], u: Array, y: Array, *, mode: str = "",
+        limit_s: float = 60.0,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Have a peer do one job; seconds and what it found, or the problem."""
         data = self.folder / "record.npz"
         np.savez(data, u=u, y=y)
-        job = {"structure": structure, "orders": dict(orders), "mode": way.mode, "data": str(data)}
-        child = self._child(way.program)
+        job = {"structure": structure, "orders": dict(orders), "mode": mode, "data": str(data)}
+        child = self._child(program)
         assert child.stdin is not None
         assert child.stdout is not None
         before = time.perf_counter()
@@ -97,22 +108,19 @@ class Bench:
             child.stdin.write(json.dumps(job) + "\n")
             child.stdin.flush()
         except BrokenPipeError:
-            self._stop(way.program)
-            return Answer(seconds=0.0, problem="the process ended")
+            self._stop(program)
+            return {"seconds": 0.0, "problem": "the process ended"}
         ready, _, _ = select.select([child.stdout], [], [], limit_s)
         line = child.stdout.readline() if ready else ""
         if not line:
-            self._stop(way.program)
+            self._stop(program)
             spent = time.perf_counter() - before
-            return Answer(seconds=spent, problem="the process ended" if ready else f"more than {limit_s:.0f} s")
-        said = json.loads(line)
-        if "problem" in said:
-            return Answer(seconds=said["seconds"], problem=said["problem"])
-        return Answer(seconds=said["seconds"], model=model_of({k: np.array(v) for k, v in said["found"].items()}))
+            return {"seconds": spent, "problem": "the process ended" if ready else f"more than {limit_s:.0f} s"}
+        return dict(json.loads(line))
 
     def _child(self, program: str) -> subprocess.Popen[str]:
         if program not in self.children:
-            python = Path(sys.executable) if program == "scipy" else ENVIRONMENT
+            python = Path(sys.executable) if program == "scipy" else TRACKING if program in TRACKERS else ENVIRONMENT
             self.children[program] = subprocess.Popen(
                 [str(python), str(HERE / f"peer_{program}.py")],
                 stdin=subprocess.PIPE,
@@ -137,7 +145,7 @@ class Bench:
 @contextmanager
 def bench() -> Iterator[Bench]:
     """Open a bench whose children end with it."""
-    if not ENVIRONMENT.exists():
+    if not (ENVIRONMENT.exists() and TRACKING.exists()):
         raise SystemExit("the peers are not installed: make peers")
     with tempfile.TemporaryDirectory() as folder:
         found = Bench(folder=Path(folder))
@@ -154,8 +162,11 @@ def ways(structure: str) -> list[Way]:
 def versions() -> dict[str, str]:
     """Of the peers and of what they compute with."""
     code = "import sys; from importlib.metadata import version; [print(version(x)) for x in sys.argv[1:]]"
-    done = subprocess.run([str(ENVIRONMENT), "-c", code, *PACKAGES], capture_output=True, text=True, check=True)
-    return dict(zip(PACKAGES, done.stdout.split(), strict=True))
+    found: dict[str, str] = {}
+    for python, packages in ((ENVIRONMENT, PACKAGES), (TRACKING, TRACKERS)):
+        done = subprocess.run([str(python), "-c", code, *packages], capture_output=True, text=True, check=True)
+        found |= dict(zip(packages, done.stdout.split(), strict=True))
+    return found
 
 
 def io_data(u: Array, y: Array, dt: float = 1.0, *, open_loop: bool = True) -> IOData:

@@ -24,9 +24,17 @@ def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
 def _part(part: str) -> Callable[[], Iterator[Table]]:
     from tracking_change import change_tables
     from tracking_drift import drift_tables
+    from tracking_latency import latency_tables
     from tracking_quiet import quiet_tables
+    from tracking_speed import speed_tables
 
-    return {"change": change_tables, "quiet": quiet_tables, "drift": drift_tables}[part]
+    return {
+        "speed": speed_tables,
+        "change": change_tables,
+        "quiet": quiet_tables,
+        "drift": drift_tables,
+        "latency": latency_tables,
+    }[part]
 
 
 if __name__ == "__main__":

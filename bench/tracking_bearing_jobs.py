@@ -1,0 +1,201 @@
+"""Jobs on the record of a bearing under feedback: physical parameters, states, and position sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ambid.physics.loop import Noise
+from ambid.physics.models import model
+from ambid.physics.presets import preset
+from ambid.track.fusion.fusion import SensorFusion
+from ambid.track.fusion.motion import free_motion
+from ambid.track.fusion.sensor import FusedSensor
+from ambid.track.joint import JointEkf, JointStart, JointUkf
+from ambid.track.physical.rpem import PhysicalRpem
+from ambid.track.physical.signals import Samples
+from ambid.track.physical.window import MovingWindow
+from peers import Array, Bench
+from tracking_benches import PHYSICAL, RATE, preset_bench, start_of
+from tracking_job import Job, Same
+
+NAME = "unstable-bearing"
+N, N_JOINT = 200_000, 8_000
+SPREAD = 0.02  # of the start of the joint filters, relative
+WIDE = np.array([1e-3, 1.0, 1.0])  # m, m/s, A
+OFFSET = np.array([10.0, 0.5])  # N, V
+WINDOW = 4000
+
+
+@cache
+def _record() -> Samples:
+    return preset_bench().samples("steady", 7, N / RATE)
+
+
+def bearing_jobs() -> Iterator[Job]:
+    """Jobs with physical parameters, then the fusion of sensors."""
+    for memory in ("all", "auto"):
+        yield _rpem(memory)
+    yield _joint("joint EKF, 5 physical parameters, 3 states, 2 offsets", JointEkf, "filterpy, EKF", "ekf")
+    yield _joint("joint UKF, 5 physical parameters, 3 states, 2 offsets", JointUkf, "filterpy, UKF", "ukf")
+    yield _window()
+    yield _fusion()
+
+
+def _on_record(name: str, n: int, make: Callable[[], Any], **more: Any) -> Job:
+    samples = _record()
+
+    def feed() -> Callable[[int, int], object]:
+        made = make()
+        return lambda a, b: made.update(samples.u[a:b], samples.y[a:b])
+
+    def single() -> Callable[[int], object]:
+        made = make()
+        return lambda k: made.update(samples.u[k], samples.y[k])
+
+    return Job(name=name, n=n, feed=feed, single=single, **more)
+
+
+def _rpem(memory: str) -> Job:
+    def make() -> PhysicalRpem:
+        return PhysicalRpem(start_of(NAME), memory="all" if memory == "all" else "auto")
+
+    def compare(found: dict[str, Array]) -> Same:
+        made = make()
+        made.update(_record().u[:N_JOINT], _record().y[:N_JOINT])
+        return _beside(made.estimate, np.sqrt(np.diag(made.covariance)), found)
+
+    # the peer does the job that comes nearest: its start is what the RPEM starts from
+    return _on_record(
+        f"RPEM, 5 physical parameters, 3 states, memory {memory}", N, make, peer="filterpy, EKF", peer_n=N_JOINT,
+        ask=lambda children, _: _ask(children, "ekf", _start_of_rpem()), compare=compare,
+    )  # fmt: skip
+
+
+def _joint(name: str, kind: type[JointEkf] | type[JointUkf], peer: str, structure: str) -> Job:
+    start = _start()
+
+    def compare(found: dict[str, Array]) -> Same:
+        made = kind(start)
+        made.update(_record().u[:N_JOINT], _record().y[:N_JOINT])
+        return _beside(made.estimate[:5], np.sqrt(np.diag(made.covariance))[:5], found)
+
+    return _on_record(
+        name, N if kind is JointEkf else N // 4, lambda: kind(start), peer=peer, peer_n=N_JOINT,
+        ask=lambda children, _: _ask(children, structure, _orders(start)), compare=compare,
+    )  # fmt: skip
+
+
+@cache
+def _start() -> JointStart:
+    bench, rng = preset(NAME), np.random.default_rng(3)
+    values = dict(bench.parameters)
+    draw = rng.standard_normal(5)
+    values |= {k: values[k] * (1 + SPREAD * d) for k, d in zip(PHYSICAL, draw, strict=True)}
+    return _joint_start(values, SPREAD)
+
+
+def _joint_start(values: dict[str, float], spread: float) -> JointStart:
+    bench = preset(NAME)
+    noise: Noise = bench.noise
+    force, voltage = noise.held_rms(RATE)
+    return JointStart(
+        model=model("one-axis"), rate_hz=RATE, values=values, free=PHYSICAL,
+        covariance=np.diag([(spread * values[k]) ** 2 for k in PHYSICAL]),
+        sensor_sd={"position": noise.position, "current": noise.current},
+        disturbance_sd={"force": force, "voltage": voltage}, delay=bench.loop.delay,
+        offset_sd={"force": float(OFFSET[0]), "voltage": float(OFFSET[1])},
+    )  # fmt: skip
+
+
+def _start_of_rpem() -> dict[str, Any]:
+    numbers = start_of(NAME)
+    found = {**preset(NAME).parameters, **numbers.values(numbers.start)}
+    sd = np.sqrt(np.diag(numbers.covariance))[: len(PHYSICAL)]
+    return _orders(_joint_start({k: found[k] for k in preset(NAME).parameters}, float(np.median(sd))))
+
+
+def _orders(start: JointStart) -> dict[str, Any]:
+    return {
+        "dt": 1.0 / RATE,
+        "values": [start.values[k] for k in PHYSICAL],
+        "sensor": [start.sensor_sd[k] for k in ("position", "current")],
+        "disturbance": [start.disturbance_sd[k] for k in ("force", "voltage")],
+        "spread": float(np.sqrt(start.covariance[0, 0]) / start.values["m"]),
+        "wide": WIDE.tolist(),
+        "offset": OFFSET.tolist(),
+    }
+
+
+def _ask(children: Bench, structure: str, orders: dict[str, Any]) -> dict[str, Any]:
+    """The peer gets the input as the plant does: a sample of delay is taken off."""
+    u, delay = _record().u[:N_JOINT, 0], round(preset(NAME).loop.delay)
+    late = np.concatenate([np.full(delay, u[0]), u[: u.size - delay]])
+    return children.ask("filterpy", structure, orders, late, _record().y[:N_JOINT], limit_s=120.0)
+
+
+def _beside(ours: Array, sd: Array, found: dict[str, Array]) -> Same:
+    """Errors against the truth of both, and how far they are apart."""
+    truth = np.array([preset(NAME).parameters[k] for k in PHYSICAL])
+    mine, theirs = (np.sqrt(np.mean((x / truth - 1) ** 2)) for x in (ours, found["estimate"]))
+    apart = float(np.max(np.abs(ours - found["estimate"]) / sd))
+    return Same(
+        text=f"rms error {mine:.2%}, peer {theirs:.2%}; at most {apart:.2g} sd apart",
+        numbers={
+            "rms_error": float(mine), "peer_rms_error": float(theirs), "apart_sd": apart,
+            "sd": sd.tolist(), "peer_sd": found["sd"].tolist(),
+        },
+    )  # fmt: skip
+
+
+def _window() -> Job:
+    return _on_record(
+        f"moving window of {WINDOW}, Gauss-Newton every 1000", N // 2,
+        lambda: MovingWindow(start_of(NAME), window=WINDOW, every=1000),
+    )  # fmt: skip
+
+
+def _fusion() -> Job:
+    """Three sensors; the peer has no drift of offsets and watches none."""
+    n, n_peer = 200_000, 20_000
+    rng = np.random.default_rng(4)
+    t = np.arange(n) / RATE
+    x = 2e-5 * np.sin(2 * np.pi * 11.0 * t)
+    sd = np.array([1e-6, 1.5e-6, 2e-6])
+    y = x[:, None] + sd * rng.standard_normal((n, 3))
+    motion = free_motion(RATE, q=1e-2)
+    sensors = [FusedSensor(name=f"s{j}", gain=1.0, noise_sd=float(s), resolution=0.0) for j, s in enumerate(sd)]
+
+    def make() -> SensorFusion:
+        return SensorFusion(RATE, sensors, motion=motion)
+
+    def feed() -> Callable[[int, int], object]:
+        made = make()
+        return lambda a, b: made.update(y[a:b])
+
+    def single() -> Callable[[int], object]:
+        made = make()
+        return lambda k: made.update(y[k])
+
+    state = motion.state
+    orders = {
+        "A": state.A.tolist(), "C": np.tile(state.C, (3, 1)).tolist(), "Q": state.Q.tolist(),
+        "R": np.diag(sd**2).tolist(), "P0": np.diag(motion.start_sd**2).tolist(), "truth": x[:n_peer].tolist(),
+    }  # fmt: skip
+
+    def compare(found: dict[str, Array]) -> Same:
+        ours = float(np.sqrt(np.mean((make().update(y[:n_peer])[:, 0] - x[:n_peer]) ** 2)))
+        theirs = float(found["rms"][0])
+        return Same(
+            text=f"rms error {ours * 1e9:.4g} nm, peer {theirs * 1e9:.4g} nm",
+            numbers={"rms_error_m": ours, "peer_rms_error_m": theirs},
+        )
+
+    return Job(
+        name="fusion of 3 position sensors, faults watched", n=n, feed=feed, single=single,
+        peer="filterpy, faults not watched", peer_n=n_peer,
+        ask=lambda children, _: children.ask("filterpy", "kalman", orders, y[:1], y[:n_peer]), compare=compare,
+    )  # fmt: skip
