@@ -57,10 +57,9 @@ def preset_bench() -> TrackBench:
     bench = preset("unstable-bearing")
 
     def stream(scenario: str, seed: int, seconds: float, at_s: float) -> Iterator[tuple[int, Samples]]:
-        excited: dict[str, float] = {} if scenario == "quiet" else {"amplitude": _amplitude()}
-        for block in scenario_blocks(
-            scenario, bench, duration_s=seconds, seed=seed, at_s=at_s, block=_CHUNK, **excited
-        ):
+        more: dict[str, float] = {} if scenario == "quiet" else {"amplitude": _amplitude()}
+        more |= {} if scenario in ("quiet", "steady") else {"at_s": at_s}
+        for block in scenario_blocks(scenario, bench, duration_s=seconds, seed=seed, block=_CHUNK, **more):
             s = block.signals
             yield block.first, _samples(s["voltage"], s["position"], s["current"])
 
