@@ -127,14 +127,14 @@ class Follower:
         if found is None and self._tally is not None:
             taken = float("nan") if self._real_time else time.perf_counter() - self._begin_wall
             found = self._tally.summary(computing_s=taken, complete=False)
-        if self._writer is not None and found is not None:
+        if self._writer is not None and self._writer.begun and found is not None:
             self._writer.summary(found)
             self._writer.close()
         return None if self.last is None else found
 
     def _abandon(self) -> None:
         """After an error: leave a file that says that it is not complete, if it can still be written."""
-        if self._writer is not None and self._tally is not None:
+        if self._writer is not None and self._writer.begun and self._tally is not None:
             with suppress(AmbidError, OSError, ValueError):
                 self._writer.summary(self._tally.summary(complete=False))
             with suppress(OSError, ValueError):
@@ -185,13 +185,24 @@ class Follower:
             self._say(stage)
 
     def on_header(self, header: TrackHeader) -> None:
-        """Take the header: the file begins, and the live view.
+        """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older one.
 
         Parameters
         ----------
         header : TrackHeader
+
+        Raises
+        ------
+        AmbidError
+            If the reporting interval is shorter than a sample.
         """
         from ambid.track.tally import Tally
+
+        if header.every_s * header.rate_hz < 1.0 - 1e-9:
+            raise AmbidError(
+                f"--every {header.every_s:g} s is less than one sample at {header.rate_hz:g} Hz; a line needs a sample."
+                f" Give {1.0 / header.rate_hz:g} or more"
+            )
 
         self._before_header.close()
         self._tally = Tally(header)
@@ -199,8 +210,6 @@ class Follower:
             from ambid.report.track_history import TrackHistory
 
             self.history = TrackHistory(header)
-        if self._writer is not None:
-            self._writer.header(header)
         self._begin_wall = time.perf_counter()
         self.header = header
         if self._live:
@@ -226,6 +235,8 @@ class Follower:
         assert self.header is not None
         assert self._tally is not None
         if self._writer is not None:
+            if not self._writer.begun:
+                self._writer.header(self.header)
             self._writer.line(line)
         if self.last is None:
             self._begin_s = line.t - self.header.every_s

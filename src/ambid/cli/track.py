@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 _FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
+_SHORTEST_S, _LONGEST_S = 1e-3, 1e9  # of --memory: below a block, and beyond any record
 
 
 def command(
@@ -142,7 +143,7 @@ def command(
                 kept = f"; {path} holds the track" if path else ""
                 print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                 raise typer.Exit(INTERRUPTED) from None
-    _finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict)
+    _finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict, flags=flags)
 
 
 def _check(every: float, limit: float, start: Path | None, start_seconds: float | None) -> None:
@@ -181,6 +182,11 @@ def memory_of(text: str) -> float | Literal["auto", "all"]:
         seconds = math.nan
     if not (math.isfinite(seconds) and seconds > 0):
         raise AmbidError(f"--memory {text} is neither auto nor all nor a positive number of seconds. Correct it")
+    if not _SHORTEST_S <= seconds <= _LONGEST_S:
+        raise AmbidError(
+            f"--memory {text} is out of range: {_SHORTEST_S:g} to {_LONGEST_S:g} s. Give 'all' where nothing is to be"
+            " forgotten"
+        )
     return seconds
 
 
@@ -284,8 +290,16 @@ def _may_hold_truth(record: Path) -> bool:
         return False
 
 
-def _finish(follower: Follower, summary: TrackSummary | None, written: list[str], *, table: bool, strict: bool) -> None:
-    """Print the table, say what was interrupted, and end with the exit code."""
+def _finish(
+    follower: Follower,
+    summary: TrackSummary | None,
+    written: list[str],
+    *,
+    table: bool,
+    strict: bool,
+    flags: Sequence[tuple[float, Flag]],
+) -> None:
+    """Print the table, say what was interrupted or not reached, and end with the exit code."""
     header, last = follower.header, follower.last
     if summary is None or header is None or last is None:
         if follower.code:
@@ -295,11 +309,17 @@ def _finish(follower: Follower, summary: TrackSummary | None, written: list[str]
     from ambid.report.track_text import track_text, troubles_of
 
     troubles = troubles_of(header, last, follower.open_changes)
+    if not summary.samples:
+        troubles = (*troubles, "no sample of the record was used: these are the values of the start")
     if table:
         typer.echo(track_text(header, last, summary, events=follower.told, troubles=troubles, paint=painter()))
     if follower.code:
         kept = f"; {' and '.join(written)} hold{'s' if len(written) == 1 else ''} the track so far" if written else ""
         print(f"ambid: interrupted at {last.t:.4g} s of record{kept}", file=sys.stderr)
         raise typer.Exit(follower.code)
+    for t, flag in flags:
+        if t > last.t:
+            said = f"the last line is at {last.t:.6g} s, so it was never set. Give a time in the record"
+            print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
     if strict and troubles:
         raise typer.Exit(FAILED_CHECK)

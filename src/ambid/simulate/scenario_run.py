@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values onl
 Array = NDArray[np.float64]
 
 _CHUNK = 16384  # samples that are simulated at once
+_LARGEST = 10**8  # samples of one record: it has to fit into memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,6 +108,11 @@ def simulate_scenario(
         If a rig lacks what a simulation needs.
     """
     run = _Run(name, bench, duration_s, rate_hz, seed, amplitude, at_s, size, closed)
+    if run.n_samples > _LARGEST:
+        raise ModelError(
+            f"{run.duration_s:g} s at {run.bench.rate_hz:g} Hz is {run.n_samples:g} samples; one record takes"
+            f" {_LARGEST:g}. Make it shorter"
+        )
     stretches, excitations = [], []
     for first in range(0, run.n_samples, _CHUNK):
         u = run.excitation(first, min(_CHUNK, run.n_samples - first))
@@ -206,6 +212,8 @@ class _Run:
                 f"{self.duration_s:g} s at {b.rate_hz:g} Hz is {count:g} samples; it must be at least one. Correct one"
             )
         self.n_samples = round(count)
+        if at_s is not None and not self.scenario.size_is:
+            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Leave the time out")
         self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s
         if not 0.0 <= self.at_s < self.duration_s:
             raise ModelError(

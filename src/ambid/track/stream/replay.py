@@ -22,6 +22,8 @@ from ambid.record.sampling import JITTER
 from ambid.track.stream.block import Array, Block, Frame
 
 _LONGEST_GAP_S = 60.0  # or ten times the record: a stamp that leads by more is a clock that was set
+_EQUAL = 0.05  # of a period: stamps that are as close are the same
+_COARSE = 0.1  # of the rows: so many different ones under equal stamps are no accident
 _REMEMBERED = 256  # runs of rows that one that runs back is compared with
 _LONGEST_PAUSE_S = 1.0  # a gap in the numbers takes its time, up to this
 
@@ -157,7 +159,8 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
     Raises
     ------
     RecordError
-        If less than half of the intervals are one period within 5 %: the stamps are too coarse, or the rate is wrong.
+        If less than half of the intervals are one period within 5 %, or many stamps are equal although the rows
+        differ: the stamps are too coarse, or the rate is wrong.
     """
     known = np.flatnonzero(np.isfinite(time_s))
     rows = np.diff(known)
@@ -166,6 +169,13 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
         raise RecordError(
             f"less than half of the time stamps are one period of {rate_hz:g} Hz apart; samples cannot be numbered."
             " Print time with more digits, or correct the rate"
+        )
+    equal = known[1:][(rows == 1) & (np.abs(advance) <= _EQUAL)]
+    coarse = int((values[equal] != values[equal - 1]).any(axis=1).sum())
+    if coarse > _COARSE * rows.size:
+        raise RecordError(
+            f"{coarse} of {time_s.size} rows have the time stamp of the row before them, but other values; at"
+            f" {rate_hz:g} Hz they are no samples of their own. Print time with more digits, or correct the rate"
         )
     longest = max(_LONGEST_GAP_S * rate_hz, 10.0 * time_s.size)
     whole = np.rint(np.clip(advance, -(2.0**53), 2.0**53)).astype(np.int64)
