@@ -32,6 +32,7 @@ _ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at 
 _START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
+_APPROACH = (1.0, 0.5, 0.25, 0.125)  # parts of the way tried where there is no predictor at its end
 _STALE = 0.01  # part of the innovations' variance that a predictor behind the estimate may add
 _NOISE_S = 2.0  # time constant with which the noise level is followed
 _TRANSIENT = 2.0  # times the usual noise in one block: more than chance makes, which is why it says something else
@@ -66,6 +67,8 @@ class PhysicalRpem:
     n_used, n_rejected : int
     n_linearised : int
         Times that the predictor was assembled anew.
+    n_unreached : int
+        Times that there was no predictor at the estimate: the one in use is the nearest that was found on the way.
 
     Raises
     ------
@@ -87,7 +90,7 @@ class PhysicalRpem:
         self.filter.active[numbers.places("gain")] = False
         self.stream = EvidenceStream(numbers, at, size)
         self.drift = _rates(numbers, memory, self.block_s)
-        self.n_used = self.n_rejected = self.n_linearised = 0
+        self.n_used = self.n_rejected = self.n_linearised = self.n_unreached = 0
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
         self._unit = numbers.problem.scales.output
@@ -186,8 +189,9 @@ class PhysicalRpem:
         latest = self.stream.latest
         if latest is not None:
             most = _STALE * self.noise_level * latest.n_samples
-            if self.filter.far(self.stream.at.at, latest.J, self._curved, most):
-                self.move_to(self.filter.q)
+            far = self.filter.far(self.stream.at.at, latest.J, self._curved, most)
+            if far and not self.move_to(self.filter.q):
+                self.filter.q = self.stream.at.at.copy()  # numbers without a predictor are none of a bench
 
     def noise_of(self, evidence: Evidence) -> float:
         """Return the variance with which a block's residual is taken.
@@ -231,14 +235,17 @@ class PhysicalRpem:
         Returns
         -------
         bool
-            False where there is no predictor: it stays where it is.
+            False where there is no predictor: it comes as near as it can, and `n_unreached` counts.
         """
-        at = linearise(self.numbers, q, self.stream.at.gain)
-        if at is None:
-            return False
-        self.stream.relinearise(at)
-        self.n_linearised += 1
-        return True
+        near = self.stream.at
+        for part in _APPROACH:
+            at = linearise(self.numbers, near.at + part * (q - near.at), near.gain)
+            if at is not None:
+                self.stream.relinearise(at)
+                self.n_linearised += 1
+                break
+        self.n_unreached += at is None or part < 1.0
+        return at is not None and part == 1.0
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state.
@@ -254,8 +261,8 @@ class PhysicalRpem:
 
 def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRates:
     """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory."""
-    own = np.diag(numbers.covariance) * numbers.information_s
-    one_second = np.where(np.isin(numbers.kinds, ("offset", "unbalance")), _OFFSET_RATE, own)
+    rate = np.diag(numbers.covariance) * numbers.information_s
+    one_second = np.where(np.isin(numbers.kinds, ("offset", "unbalance")), _OFFSET_RATE, rate)
     one_second[numbers.places("gain")] = 0.0
     if memory == "all":
         return DriftRates(np.zeros_like(one_second), np.zeros_like(one_second), np.zeros_like(one_second), block_s)
@@ -264,4 +271,9 @@ def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRate
             raise EstimationError(f"the memory is {memory} s; it must be positive. Give seconds, 'auto' or 'all'")
         held = one_second / memory**2
         return DriftRates(held, held, held, block_s)
-    return DriftRates(one_second / _START_MEMORY_S**2, one_second / _LONGEST_S**2, one_second / _SHORTEST_S**2, block_s)
+    begin, slowest, fastest = (one_second / s**2 for s in (_START_MEMORY_S, _LONGEST_S, _SHORTEST_S))
+    if numbers.problem.noise == "gain":
+        # entries of a gain that follow every transient leave the region of good predictors
+        own = numbers.places("noise")
+        begin[own] = fastest[own] = slowest[own]
+    return DriftRates(begin, slowest, fastest, block_s)

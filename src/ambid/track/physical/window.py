@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 _WHOLE = 1 << 40  # samples: a stretch is one block
 _ITERATIONS = 6
-_SETTLED = 0.05  # step, in standard deviations, below which the search has converged
+_SETTLED = 0.05  # in standard deviations: the search has converged where the next step is shorter
 _HALVINGS = 4
 _WIDER = 30.0  # how much wider than the start's the standard deviations are that a window begins with
 _ENDLESS = 1 << 40  # samples of one evidence: the stretch is one block
@@ -44,7 +44,7 @@ class Refined:
     stream : EvidenceStream
         The predictor at the estimate, at the end of the stretch.
     evidence : Evidence
-        Of the stretch, linearised at the estimate or within a few hundredths of a standard deviation of it.
+        Of the stretch, linearised where the last step began.
     misfit : float
         Squared distance of the estimate from what was known before and from the stretch: chi-squared with p degrees of
         freedom if both are right.
@@ -93,7 +93,7 @@ def refine(
     Refined or None
         None where the stretch is too short to settle, or no step leads to a predictor.
     """
-    q, near = before.q.copy(), gain
+    q, near, last = before.q.copy(), gain, 0.0
     for iteration in range(1, _ITERATIONS + 1):
         at = linearise(numbers, q, near)
         for _ in range(_HALVINGS):
@@ -112,14 +112,16 @@ def refine(
             return None
         found = before.copy()
         misfit = found.absorb(evidence, noise)
-        step = np.max(np.abs(found.q - q) / found.sd)
-        if step < _SETTLED or iteration == _ITERATIONS:
+        step = float(np.max(np.abs(found.q - q) / found.sd))
+        # steps shrink at least as fast as they have: what the next one would be needs no look
+        left, last = step * min(1.0, step / last) if last else step, step
+        if left < _SETTLED or iteration == _ITERATIONS:
             return Refined(
                 filter=found,
                 stream=stream,
                 evidence=evidence,
                 misfit=misfit,
-                converged=bool(step < _SETTLED),
+                converged=left < _SETTLED,
                 iterations=iteration,
             )
         q = found.q.copy()
