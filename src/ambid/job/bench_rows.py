@@ -13,7 +13,9 @@ from ambid.job.physical import load
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.record import Channel, Record, read_rows
-from ambid.rig import Rig, bench_record
+from ambid.rig import Rig, bench_record, default_rig
+from ambid.rig.load import OPTIONAL_ROLES
+from ambid.rig.rig import RigChannel
 from ambid.track.physical.synchronous import Forcing, forcing_of
 from ambid.track.stream.replay import Replay, blocks_of
 
@@ -124,7 +126,7 @@ def rows_of(
     else:
         rows = read_rows(record, rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz)
         bench, stamps = _part(
-            bench_record(rows.record, rig),
+            bench_record(rows.record, _with_rotation(rig, rows.record)),
             rows.time_s,
             rig.record.from_s if from_s is None else from_s,
             rig.record.to_s if to_s is None else to_s,
@@ -135,6 +137,18 @@ def rows_of(
     replay = blocks_of(stream, max(1, round(_BLOCK_S * bench.rate_hz)), time_s=stamps)
     t0 = bench.start_s if stamps is None else float(stamps[np.isfinite(stamps)][0])
     return BenchRows(record=bench, replay=replay, forcing=forcing, t0=t0)
+
+
+def _with_rotation(rig: Rig, record: Record) -> Rig:
+    """Where nothing is known of the bench, columns named speed and angle, in these units, are what they say."""
+    if rig != default_rig(rig.model):
+        return rig
+    turning = tuple(
+        RigChannel(role=role, column=role)
+        for role in ("speed", "angle")
+        if role in record.names and record.channel(role).unit == OPTIONAL_ROLES[role]
+    )
+    return replace(rig, channels=(*rig.channels, *turning))
 
 
 def _part(bench: Record, time_s: Array | None, from_s: float | None, to_s: float | None) -> tuple[Record, Array | None]:

@@ -31,6 +31,7 @@ from ambid.track.stream.engine import run
 from ambid.track.stream.guard import StreamGuard
 from ambid.track.stream.outcome import Stretch
 from ambid.track.supervise.supervisor import Supervisor
+from ambid.track.supervise.warm_up import warm_up
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Pace = Literal["fastest", "real-time"]
@@ -64,7 +65,8 @@ def track(
     record : Record, str or Path
         A file in the rig's columns, or a record whose channels are named by role. Gaps are met, not refused.
     rig : Rig, str or Path, optional
-        What is known of the bench; default: columns voltage, current and position, everything free.
+        What is known of the bench; default: columns voltage, current and position, of a turning rotor also speed and
+        angle, everything free.
     start : Estimate, str or Path, optional
         Where tracking begins; default: an identification of the first part of the record.
     start_s : float, optional
@@ -121,9 +123,10 @@ def track(
             lines.append(line)
         return None if on_line is None else on_line(line)
 
+    warm_up(numbers, memory)
     reporter = Reporter(supervisor, every_s=every_s, on_line=emit, flags=flags, t0=source.t0, first=first)
     top = header(
-        supervisor, limit=limit, every_s=every_s, method=f"rpem, memory {memory}",
+        supervisor, limit=limit, every_s=reporter.every_s, method=f"rpem, memory {memory}",
         record={**source.origin, "samples": int(np.count_nonzero(source.replay.numbers >= first))},
     )  # fmt: skip
     if on_header is not None:

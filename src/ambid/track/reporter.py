@@ -1,6 +1,7 @@
 """From samples to lines: feeds the supervisor, and reports once in every reporting interval.
 
-Intervals are counted from the beginning of the stream, so that lines come at the same times whatever the blocks.
+Intervals are counted from the beginning of the stream, so that lines come at the same times whatever the blocks. Where
+samples are missing or rejected the lines go on: they say so.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from ambid.track.stream.outcome import Rejection
 
 
+_LONGEST_GAP_S = 60.0  # a longer gap has no lines
+_PASSING = ("gap", "nan", "range", "saturated", "stuck")  # rejections of samples that had their place in the stream
 _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 
 
@@ -42,6 +45,8 @@ class Reporter:
 
     Attributes
     ----------
+    every_s : float
+        Reporting interval, at least one sample long.
     lines, samples, rejected : int
         Lines made, samples used, samples rejected.
     """
@@ -58,9 +63,12 @@ class Reporter:
     ) -> None:
         self.supervisor, self._on_line, self._t0 = supervisor, on_line, t0
         self._rate = supervisor.rpem.numbers.rate_hz
-        self._every = max(1, round(every_s * self._rate))
-        self._next = (first // self._every + 1) * self._every
-        self._flags = sorted(flags)
+        self.every_s = max(every_s, 1.0 / self._rate)
+        self._count = int(first / (self.every_s * self._rate))
+        self._next = 0
+        self._pass_interval()
+        supervisor.diagnosis.restart(first)
+        self._flags = sorted(flags, key=lambda flag: flag[0])
         self._events: list[Event] = []
         self.lines = self.samples = self.rejected = 0
 
@@ -85,7 +93,8 @@ class Reporter:
         restart : bool
             Samples are missing before it.
         """
-        self._skip_to(first)
+        self._pass(first)
+        self._obey(first)
         k, n = 0, samples.y.shape[0]
         while k < n:
             stop = min(n, self._next - first)
@@ -103,6 +112,10 @@ class Reporter:
         rejection : Rejection
         """
         self.rejected += rejection.samples
+        first = round(rejection.t * self._rate)
+        passing = rejection.kind in _PASSING
+        if passing:
+            self._pass(first)
         self.supervisor.log.add(
             Event(
                 kind="rejected",
@@ -111,32 +124,51 @@ class Reporter:
                 samples=rejection.samples,
             )
         )
+        if passing:
+            self._pass(first + rejection.samples)
 
     def finish(self) -> None:
         """Report what has happened since the last line."""
         if self._events:
             self._report()
 
-    def _skip_to(self, first: int) -> None:
-        """Pass over intervals in which nothing came: a stream's gap has no lines."""
-        while self._next <= first:
-            self._next += self._every
+    def _pass_interval(self) -> None:
+        """Go to the end of the next interval, a whole number of samples."""
+        before = self._next
+        while self._next <= before:
+            self._count += 1
+            self._next = round(self._count * self.every_s * self._rate)
+
+    def _pass(self, sample: int) -> None:
+        """Report intervals that end before a sample: nothing came in the rest of them."""
+        if sample - self._next > _LONGEST_GAP_S * self._rate:
+            self._report()
+            self._count = int((sample - 1) / (self.every_s * self._rate))
+            self._pass_interval()
+        while self._next <= sample:
+            self._report()
+
+    def _obey(self, sample: int) -> None:
+        """Set the flags that are due."""
+        t = self._t0 + sample / self._rate
+        while self._flags and self._flags[0][0] <= t:
+            self.supervisor.order(self._flags.pop(0)[1])
 
     def _report(self) -> None:
-        s, t = self.supervisor, self._t0 + self._next / self._rate
-        while self._flags and self._flags[0][0] <= t:
-            s.order(self._flags.pop(0)[1])
+        s = self.supervisor
+        self._obey(self._next)
+        s.wait(self._next)
         events, self._events = tuple(self._events), []
         error = s.level.error
         line = TrackLine(
-            t=t,
+            t=self._t0 + self._count * self.every_s,
             parameters=s.parameters,
             error=error if np.isfinite(error) else 1.0,
             state=s.state,
             events=events,
             extra=s.extra,
         )
-        self._next += self._every
+        self._pass_interval()
         self.lines += 1
         for flag in self._on_line(line) or ():
             s.order(flag)

@@ -27,6 +27,7 @@ _SETTLE_S = 1.0  # in which the detector learns how imperfect the model is, wher
 _ATTEMPTS = 5
 _BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
+_SUDDEN = 16  # blocks of the longest window in which something unnamed is taken for a jump
 _TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
 _STRAY = 3.0  # moves by which such a number is widened
 _UNKNOWN = 0.3  # relative standard deviation of a parameter of which nothing is known any more
@@ -191,6 +192,9 @@ class Diagnosis:
             self._detector.restart(self._rpem.stream.sample)
             self.settling = True
             return alarm.blocks > 1  # in its own block the jump has a beginning: that says nothing of what holds now
+        if alarm.kind != "moved" and alarm.blocks > _SUDDEN:  # nothing jumped: the recursion has to follow
+            self._detector.restart(self._rpem.stream.sample)
+            return True
         suspects = self._bench  # a fault of one thing is likelier than of several at once
         if name is not None and kind in _BENCH:
             self.changes.append(event)

@@ -27,6 +27,7 @@ _SHOWN = 4.0  # standard deviations by which the innovations of a block are larg
 _FEW = 3  # suspects that are searched in full
 _MISFIT = 4.0  # times the number of unknowns: what a right explanation's misfit hardly passes
 _LEFT = 2.0  # times the usual variance of innovations that a right explanation may leave, as it is over few blocks
+_TOLD = 25.0  # by which a number has to lessen the misfit to be named where the alarm named none
 _VAGUE = 0.1  # relative standard deviation above which nothing is said to have been found
 _QUIET = 3.0  # standard deviations of chi-squared under which what was known before explains a stretch
 
@@ -182,14 +183,19 @@ class Recovery:
     ) -> tuple[Refined | None, tuple[str, ...]] | None:
         """What explains the samples since the onset, if anything does: nothing has moved, one number has, or all."""
         p = rpem.numbers.start.size
-        if self.short and self.attempts == 1 and self._unmoved(rpem, evidence) < p + _QUIET * np.sqrt(2.0 * p):
+        before = self._unmoved(rpem, evidence)
+        if self.short and self.attempts == 1 and before < p + _QUIET * np.sqrt(2.0 * p):
             return None, ()
         best = self._best(rpem, recent, [(name,) for name in self._likeliest(rpem, evidence)])
         if best is None or best[0].misfit >= _MISFIT * p:
             numbers = rpem.numbers
             every = tuple(numbers.names[j] for j in numbers.places("parameter"))
             best = self._best(rpem, recent, [every])
-        return best if best is not None and best[0].misfit < _MISFIT * p else None
+        if best is None or best[0].misfit >= _MISFIT * p:
+            return None
+        if self.event.kind != "change" and before - best[0].misfit < _TOLD and before < _MISFIT * p:
+            return None, ()
+        return best
 
     def _unmoved(self, rpem: PhysicalRpem, evidence: Evidence) -> float:
         """Misfit of what was known before: chi-squared with p degrees of freedom if nothing has moved."""

@@ -179,8 +179,11 @@ class Supervisor:
         sample : int
             Number of the sample up to which nothing came.
         """
+        missing = sample - self.rpem.stream.sample
+        if missing <= 0:
+            return
         t = self._t0 + sample / self._rate
-        if not self._silent and sample - self.rpem.stream.sample >= SILENT_S * self._rate:
+        if not self._silent and missing >= SILENT_S * self._rate:
             self._silent = True
             self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {SILENT_S:g} s"))
         self._obey(t)
