@@ -136,4 +136,11 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
     printed = capsys.readouterr().out
     assert re.search(r"^m    60 g .* fixed$", printed, re.MULTILINE)  # the edit took
     assert "NOT SHOWN" not in printed
-    assert {"mine.json", "mine.png", "mine.html"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"mine.json", "mine.png", "mine.html", "track.jsonl", "track.png"} <= {p.name for p in tmp_path.iterdir()}
+    rows = re.compile(r"^(m|k_x|k_i|R|L) +(-?[\d.]+) ± ([\d.]+) .* tracked$", re.MULTILINE)
+    shown = rows.findall((ROOT / "README.md").read_text(encoding="utf-8"))
+    found = {name: (float(value), float(sd)) for name, value, sd in rows.findall(printed)}
+    assert [name for name, _, _ in shown] == list(found) == ["m", "k_x", "k_i", "R", "L"]
+    for name, value, sd in shown:  # what the page shows of a track is what comes out
+        assert abs(float(value) - found[name][0]) < 0.5 * found[name][1], name
+        assert float(sd) == pytest.approx(found[name][1], rel=0.2), name
