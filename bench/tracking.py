@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 from table import Table
 
-PARTS = ("speed", "change", "quiet", "drift", "latency")
+PARTS = ("speed", "change", "quiet", "rest", "drift", "latency")
 
 
 def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
@@ -26,12 +26,14 @@ def _part(part: str) -> Callable[[], Iterator[Table]]:
     from tracking_drift import drift_tables
     from tracking_latency import latency_tables
     from tracking_quiet import quiet_tables
+    from tracking_rest import rest_tables
     from tracking_speed import speed_tables
 
     return {
         "speed": speed_tables,
         "change": change_tables,
         "quiet": quiet_tables,
+        "rest": rest_tables,
         "drift": drift_tables,
         "latency": latency_tables,
     }[part]

@@ -94,13 +94,15 @@ def hours_of(bench: str, scenario: str, seed: int, seconds: float) -> Hours:
 
 def _covariance(found: Hours, supervisor: Supervisor) -> None:
     """Count a second in which both covariances, published and working, are symmetric and positive definite."""
-    smallest = min(_smallest(supervisor.gate.accepted.covariance), _smallest(supervisor.rpem.filter.covariance))
+    smallest = min(
+        smallest_eigenvalue(supervisor.gate.accepted.covariance), smallest_eigenvalue(supervisor.rpem.filter.covariance)
+    )
     found.smallest_eigenvalue = min(found.smallest_eigenvalue, smallest)
     found.definite += smallest > 0.0
 
 
-def _smallest(covariance: Array) -> float:
-    """Smallest eigenvalue of the correlations; below zero where the matrix is not symmetric."""
+def smallest_eigenvalue(covariance: Array) -> float:
+    """The smallest eigenvalue of the correlations; below zero where the matrix is not symmetric."""
     size = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(size > 0.0) and np.array_equal(covariance, covariance.T)):
         return -1.0
