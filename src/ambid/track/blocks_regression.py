@@ -335,7 +335,8 @@ class Sums:
         return out
 
     def _inverses(self) -> tuple[Array, Array]:
-        return (np.linalg.inv(self.moments[0][:5, :5]), np.linalg.inv(self.moments[1][:3, :3]))
+        electric, mechanic = self.moments
+        return np.asarray(np.linalg.inv(electric[:5, :5])), np.asarray(np.linalg.inv(mechanic[:3, :3]))
 
     def _scaled_scatter(self) -> Array:
         recent = self._scores[: self._closed + 1]

@@ -9,7 +9,7 @@ from ambid.errors import EstimationError
 from ambid.track.adaptive.arx.estimators import RecursiveArx, RecursiveIvArx
 from ambid.track.adaptive.arx.regressor import Regressor
 from ambid.track.adaptive.least_squares import RecursiveLeastSquares
-from tests.track.cases_adaptive import loop
+from tests.track.cases_adaptive import input_alone, loop
 
 
 def test_rows_are_those_of_the_definition_however_the_signals_come() -> None:
@@ -83,3 +83,15 @@ def test_a_reference_as_instrument_is_consistent_under_feedback() -> None:
     plain = RecursiveArx(2, 2, estimator=RecursiveLeastSquares)
     plain.update(inputs[:, 0], y)
     assert np.abs((plain.estimate - truth) / np.sqrt(np.diag(plain.covariance))).max() > 8
+
+
+@pytest.mark.parametrize("instruments", ["delayed input", "auxiliary model"])
+@pytest.mark.parametrize("sizes", [(1e3, 1e-6), (1e3, 1e3), (1e-6, 1e6)])
+def test_the_units_of_the_signals_do_not_matter(instruments: str, sizes: tuple[float, float]) -> None:
+    u, y = input_alone(3000, 2)
+    one, other = (RecursiveIvArx(2, 1, instruments=instruments) for _ in range(2))  # type: ignore[arg-type]
+    one.update(u, y)
+    other.update(u * sizes[0], y * sizes[1])
+    unit = np.array([1.0, 1.0, sizes[1] / sizes[0]])
+    np.testing.assert_allclose(other.estimate, one.estimate * unit, rtol=1e-4)
+    np.testing.assert_allclose(other.covariance, one.covariance * np.outer(unit, unit), rtol=1e-3, atol=0)

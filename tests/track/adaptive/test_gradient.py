@@ -66,3 +66,13 @@ def test_steps_out_of_range_are_refused(step: float) -> None:
         Lms(2, step=-abs(step))
     with pytest.raises(EstimationError):
         Nlms(2, step=1.0, small=0.0)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e3])
+def test_without_a_prior_the_start_may_be_far_off_in_any_unit(size: float) -> None:
+    rng = np.random.default_rng(4)
+    phi = rng.normal(size=(30, 3)) * size
+    y = phi @ np.ones(3) + 1e-3 * size * rng.normal(size=30)
+    for made in (Lms(3, step=0.1 / size**2, noise_sd=1e-3 * size), Nlms(3, step=0.5, small=1e-3 * size**2)):
+        made.update(phi, y)
+        assert (np.abs(made.estimate - 1.0) < 4 * np.sqrt(np.diag(made.covariance))).all()

@@ -214,3 +214,25 @@ def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
         RecursiveLeastSquares(4, **settings)  # type: ignore[arg-type]
     with pytest.raises(EstimationError):
         RecursiveLeastSquares(("a", "a"))
+
+
+@pytest.mark.parametrize("settings", [{}, {"memory": 500}, {"memory": 500, "forgetting": "directional"}], ids=str)
+@pytest.mark.parametrize("size", [1e-7, 1e6])
+def test_without_a_prior_the_units_of_the_signals_do_not_matter(settings: dict[str, object], size: float) -> None:
+    phi, y = data(4, 3000)
+    scale = np.array([1.0, size, 1.0, size])
+    rls = RecursiveLeastSquares(4, **settings)  # type: ignore[arg-type]
+    rls.update(phi * scale, y * 1e-6)
+    sd = np.sqrt(np.diag(rls.covariance))
+    assert (np.abs(rls.estimate - np.arange(1.0, 5.0) * 1e-6 / scale) < 4 * sd).all()
+    assert (sd * scale < 0.2 * 1e-6).all()
+    assert rls.noise_variance == pytest.approx(0.04e-12, rel=0.15)
+
+
+def test_silence_winds_up_to_a_limit_without_a_prior_too() -> None:
+    phi, y = data(4, 3000)
+    rls = RecursiveLeastSquares(4, memory=50)
+    rls.update(phi, y)
+    best = np.diag(rls.P).mean()
+    rls.update(np.zeros((100_000, 4)), np.zeros(100_000))
+    assert 1e10 * best < np.diag(rls.P).mean() < 1e13 * best

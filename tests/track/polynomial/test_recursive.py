@@ -93,15 +93,34 @@ def test_arx_is_least_squares_with_a_prior() -> None:
 def test_covariance_with_forgetting_is_that_of_the_error() -> None:
     fit, (u, y) = fit_of("arx"), signals("arx")(400, 4)
     r = RecursivePolynomial.from_fit(fit, samples=100, forgetting=Forgetting(final=0.98, first=0.9, growth=0.95))
-    r.update(u, y)
+    errors = r.update(u, y)[3:]
     rows = np.column_stack([-y[1:-1], -y[:-2], u[1:-1], u[:-2], np.ones(y.size - 2)])[1:]
     first = np.diag(0.09 / np.append(fit.covariance[fit.sd > 0][:, fit.sd > 0].diagonal(), 0.09 / 100))
-    once, twice, forget = first, first, 0.9
-    for row in rows:
-        once, twice = forget * once + np.outer(row, row), forget**2 * twice + np.outer(row, row)
+    once, twice, forget, squares, weight = first, 0.09 * first, 0.9, 9.0, 100.0
+    for row, e in zip(rows, errors, strict=True):
+        size = 1 + row @ np.linalg.solve(once, row) / forget
+        squares, weight = forget * squares + e**2 / size, forget * weight + 1
+        once = forget * once + np.outer(row, row)
+        twice = forget**2 * twice + squares / weight * np.outer(row, row)
         forget = 0.98 + 0.95 * (forget - 0.98)
     P = np.linalg.inv(once)
-    np.testing.assert_allclose(r.covariance, (P @ twice @ P)[:-1, :-1] * r.noise_variance, rtol=1e-7)
+    np.testing.assert_allclose(r.covariance, (P @ twice @ P)[:-1, :-1], rtol=1e-7)
+    assert r.noise_variance == pytest.approx(squares / weight, rel=1e-9)
+
+
+def test_signals_that_stand_still_make_no_coefficient_surer() -> None:
+    system = SYSTEMS["bj"]
+    data = system.data(1, 4000)
+    r = RecursivePolynomial.from_fit(system.fit(data.part(0, 2000)), forgetting=0.998)
+    r.update(data.u[2000:], data.y[2000:, 0])
+    before = r.sd
+    r.update(np.zeros((30_000, 1)), np.zeros(30_000))
+    assert np.all(r.sd > 0.7 * before)
+    assert any("stand still" in w for w in r.warnings)
+    noise = r.noise_variance
+    r.update(data.u, data.y[:, 0])
+    assert r.noise_variance > 1e3 * noise  # and the calm is forgotten
+    assert r.noise_variance == pytest.approx(system.fit(data).noise_covariance[0, 0], rel=0.5)
 
 
 def test_armax_is_consistent_on_an_unstable_plant_in_a_loop() -> None:

@@ -35,12 +35,13 @@ Array = NDArray[np.float64]
     STEP,
     SMALL,
     LIMITED,  # samples whose step was limited
-) = range(17)
+    VAGUE,  # 1: no prior was given; the limit is counted from the best variances so far
+) = range(18)
 HEAD = 24
 
 LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
 
-_HUGE = 1e200  # a sample that leads there is rejected as one that is not finite
+_HUGE, _WORSE = 1e200, 1e9  # a sample that leads there is rejected; variance over the best one, in place of a prior
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -135,8 +136,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
     """Least squares on samples t, ... until so many have been used: P and the information of squared weights."""
     theta, D, V, E, W = _views(s, p)
     _, _, f, k, a = _rest(s, p)
-    grow = 1.0 / s[FACTOR_NOW]
-    shrink = s[FACTOR_NOW] * s[FACTOR_NOW]
+    grow, shrink = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW]
     while t < y.size and s[USED] < until:
         row, e = phi[t], y[t]
         for j in range(p):
@@ -317,16 +317,17 @@ def _govern(s: Array, p: int) -> None:
     """Reset where it is due, and choose the factor with which P cannot pass its limit before the next look."""
     a, q = HEAD + p, 2 * (p + p * p)
     if s[RESET_EVERY] > 0 and s[USED] > 0 and s[USED] % s[RESET_EVERY] == 0:
-        for i in range(a, a + q):
-            s[i] = s[i + q]
+        s[a : a + q] = s[a + q : a + 2 * q]
     _, D, V, _, _ = _views(s, p)
     _, prior, _, _, _ = _rest(s, p)
     size = 0.0
-    for j in range(p):
-        size += D[j] / prior[j]
-        for i in range(j):
-            size += D[j] * V[j * p + i] ** 2 / prior[i]
-    size /= p * s[LIMIT]
+    for i in range(p):
+        variance = D[i]
+        for j in range(i + 1, p):
+            variance += D[j] * V[j * p + i] ** 2
+        if s[VAGUE] > 0:
+            prior[i] = min(prior[i], _WORSE * variance)
+        size += variance / (prior[i] * p * s[LIMIT])
     s[FACTOR_NOW] = s[FACTOR]
     if size > s[FACTOR] ** s[EVERY]:
         s[FACTOR_NOW] = min(1.0, size ** (1.0 / s[EVERY]))

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 Kernel = Callable[[Array, Array, Array, Array], None]
 
 _SMALLEST_VARIANCE = 1e-200  # exact data; a variance of 0 would not be positive definite
+VAGUE = 1e22  # variance of a coefficient of which nothing is known, whatever its unit
 ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
 _FLOAT = np.dtype(np.float64)
 

@@ -16,6 +16,8 @@ from ambid.track.adaptive._recursion import Factored, covariance_of, positive, p
 
 Array = NDArray[np.float64]
 
+_FAR = 1e12  # variance of the start's error in units of step or of 1 / small, which have the signals' units
+
 
 class _Gradient(Factored):
     """A recursion along the regressor, with the covariance of its error."""
@@ -57,8 +59,8 @@ class Lms(_Gradient):
     step : float
         In units of 1 over the square of the regressor; well below 2 / E φᵀφ.
     start : array_like, shape (p,), optional
-    prior : array_like, shape (), (p,) or (p, p)
-        Covariance of the start's error over the variance of e.
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error over the variance of e; 1e12 step if not given.
     noise_sd : float, optional
         Standard deviation of e, where known; else it is tracked.
     noise_start : float
@@ -85,13 +87,14 @@ class Lms(_Gradient):
         *,
         step: float,
         start: ArrayLike | None = None,
-        prior: ArrayLike = 1e6,
+        prior: ArrayLike | None = None,
         noise_sd: float | None = None,
         noise_start: float = 1.0,
         noise_memory: float = 10_000.0,
     ) -> None:
-        super().__init__(names, start, prior, noise_sd, noise_start, noise_memory)
-        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.LMS, positive("step", step)
+        far = _FAR * positive("step", step)
+        super().__init__(names, start, far if prior is None else prior, noise_sd, noise_start, noise_memory)
+        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.LMS, step
 
     @property
     def n_limited(self) -> int:
@@ -114,8 +117,8 @@ class Nlms(_Gradient):
     small : float
         Regularisation, in squared units of the regressor: regressors below its root move little.
     start : array_like, shape (p,), optional
-    prior : array_like, shape (), (p,) or (p, p)
-        Covariance of the start's error over the variance of e.
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error over the variance of e; 1e12 / small if not given.
     noise_sd : float, optional
         Standard deviation of e, where known; else it is tracked.
     noise_start : float
@@ -141,13 +144,14 @@ class Nlms(_Gradient):
         step: float,
         small: float,
         start: ArrayLike | None = None,
-        prior: ArrayLike = 1e6,
+        prior: ArrayLike | None = None,
         noise_sd: float | None = None,
         noise_start: float = 1.0,
         noise_memory: float = 10_000.0,
     ) -> None:
-        super().__init__(names, start, prior, noise_sd, noise_start, noise_memory)
+        far = _FAR / positive("small", small)
+        super().__init__(names, start, far if prior is None else prior, noise_sd, noise_start, noise_memory)
         if not 0 < step < 2:
             raise EstimationError(f"step is {step!r}; normalised LMS converges for 0 < step < 2")
         self._s[self._at.KIND], self._s[self._at.STEP] = self._at.NLMS, step
-        self._s[self._at.SMALL] = positive("small", small)
+        self._s[self._at.SMALL] = small

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.errors import EstimationError
 from ambid.track.adaptive._recursion import (
+    VAGUE,
     Factored,
     count,
     covariance_of,
@@ -61,8 +62,9 @@ class RecursiveLeastSquares(Factored):
         Names of the p coefficients, or p.
     start : array_like, shape (p,), optional
         Estimate to begin with; zero if not given.
-    prior : array_like, shape (), (p,) or (p, p)
-        Covariance of the start's error **over the variance of e** (P₀).
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error **over the variance of e** (P₀), in the coefficients' units. If not given,
+        nothing is known of the coefficients, whatever the units of the signals: the start has no weight.
     forgetting : {"none", "exponential", "directional"}, optional
         Exponential if not given but `factor` or `memory` is.
     factor : float, optional
@@ -70,7 +72,7 @@ class RecursiveLeastSquares(Factored):
     memory : float, optional
         The same as a time constant in samples, 1 / (1 - factor).
     limit : float
-        Largest mean of P_ii over its prior.
+        Largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
     reset_every : int, optional
         P and C are set back to the prior after so many samples, the estimate kept.
     walk : array_like, shape () or (p,), optional
@@ -100,7 +102,7 @@ class RecursiveLeastSquares(Factored):
         names: Sequence[str] | int,
         *,
         start: ArrayLike | None = None,
-        prior: ArrayLike = 1e6,
+        prior: ArrayLike | None = None,
         forgetting: Forgetting | None = None,
         factor: float | None = None,
         memory: float | None = None,
@@ -122,7 +124,7 @@ class RecursiveLeastSquares(Factored):
         s[at.FACTOR] = s[at.FACTOR_NOW] = kept
         s[at.MEMORY] = 1.0 / (1.0 - kept) if kept < 1.0 else np.inf
         s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
-        s[at.LIMIT] = positive("limit", limit)
+        s[at.LIMIT], s[at.VAGUE] = positive("limit", limit), float(prior is None)
         s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
         s[at.TYPICAL] = 0.1 * p
         s[at.NOISE_RATE] = 1.0 / (
@@ -132,7 +134,7 @@ class RecursiveLeastSquares(Factored):
         if (steps < 0).any():
             raise EstimationError(f"walk is {walk!r}; variances are not negative")
         s[at.HEAD + p + 4 * (p + p * p) :][:p] = steps
-        self._set_prior(covariance_of("prior", prior, p))
+        self._set_prior(covariance_of("prior", VAGUE if prior is None else prior, p))
         self._begin()
 
     @property

@@ -199,17 +199,20 @@ def _learn(
         # not less than at the start: a signal that stands still has no noise, and its P would grow without end
         variance = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE])
         count[_HOLD] = int(_grown(UD, limit, variance))
-    forget = real[_FORGET]
+    forget = keep = real[_FORGET]
     if count[_HOLD]:
         forget = 1.0
         count[_HELD] += 1
     real[_FORGET] = real[_FINAL] + real[_GROWTH] * (real[_FORGET] - real[_FINAL])
     size = _ud(UD, theta.size, psi, forget, gain)
+    # forgotten while the coefficients are held, too: after a long calm the noise would be taken for small too long
+    real[_SQUARES] = keep * real[_SQUARES] + e * e / size
+    real[_WEIGHT] = keep * real[_WEIGHT] + 1.0
+    # the noise of the moment goes with what the moment says: a calm later on makes old samples no better
+    variance = real[_SQUARES] / real[_WEIGHT]
     for i in range(S.shape[0]):
         for j in range(i + 1):
-            S[i, j] = forget * forget * S[i, j] + psi[i] * psi[j]
-    real[_SQUARES] = forget * real[_SQUARES] + e * e / size
-    real[_WEIGHT] = forget * real[_WEIGHT] + 1.0
+            S[i, j] = forget * forget * S[i, j] + variance * psi[i] * psi[j]
     for j in range(theta.size):
         theta[j] += gain[j] * e
     level = coef[_FIRST + theta.size - 1]

@@ -15,7 +15,7 @@ from ambid.track.polynomial.state import State, covariance_of, noise_variance_of
 
 Array = NDArray[np.float64]
 
-_WORSE = 1.5  # growth of the innovations' standard deviation that is told
+_WORSE = 1.5  # growth, or fall to one over it, of the innovations' standard deviation that is told
 _INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
 
 
@@ -100,6 +100,12 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful
         found.append(
             f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has grown, or the "
             "structure does not hold what the data show. Raise the orders, or forget faster"
+        )
+    if state.worse < 1.0 / _WORSE:
+        found.append(
+            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has fallen, or "
+            "the signals stand still and tell nothing; without forgetting, standard deviations are too small then. "
+            "Look at the signals"
         )
     if state.waits:
         found.append(f"{name}: nothing is learnt at present: the filters wait for history after the start or a gap")

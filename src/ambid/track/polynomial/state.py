@@ -1,7 +1,8 @@
 """What a recursive polynomial estimator carries from sample to sample, packed for the compiled recursion.
 
 P = U D U' is the covariance of the coefficients in units of the noise variance; S = sum of (product of the forgetting
-factors)^2 psi psi'. Where nothing is forgotten, the error of the estimate has covariance P; otherwise P S P.
+factors)^2 (noise variance at that time) psi psi'. Where nothing is forgotten, the error of the estimate has covariance
+P times the noise variance; otherwise P S P: a calm after the samples that told the coefficients changes nothing.
 """
 
 from __future__ import annotations
@@ -217,7 +218,7 @@ def new_state(
         theta=theta.copy(),
         coef=coef,
         UD=UD,
-        S=np.asarray(inverse.T @ inverse) if forgetting.forgets else np.empty((0, 0)),
+        S=np.asarray(inverse.T @ inverse) * noise_variance if forgetting.forgets else np.empty((0, 0)),
         limit=limit.copy(),
         signals=np.zeros((plan.n_signals, longest + _COLUMNS)),
         work=work,
@@ -262,13 +263,14 @@ def covariance_of(state: State) -> Array:
     d = np.diag(UD)
     G = np.triu(UD.T, 1) + np.eye(d.size)
     G = G * np.sqrt(d)
-    if state.S.size:
-        lower = np.tril(state.S)
-        S = lower + np.tril(lower, -1).T
-        H = G.T @ S @ G
-        values, vectors = np.linalg.eigh((H + H.T) / 2)
-        G = G @ (vectors * np.sqrt(np.maximum(values, 1e-14)))
-    return np.asarray(noise_variance_of(state) * (G @ G.T))
+    if not state.S.size:
+        return np.asarray(noise_variance_of(state) * (G @ G.T))
+    lower = np.tril(state.S)
+    S = lower + np.tril(lower, -1).T
+    H = G.T @ S @ G
+    values, vectors = np.linalg.eigh((H + H.T) / 2)
+    G = G @ (vectors * np.sqrt(np.maximum(values, 1e-14 * values[-1])))
+    return np.asarray(G @ G.T)
 
 
 def noise_variance_of(state: State) -> float:

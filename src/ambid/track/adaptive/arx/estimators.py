@@ -142,7 +142,7 @@ class RecursiveIvArx(_OnSignals):
     - ``"delayed input"``: na + nb past inputs, from lag nk on, of each input's share. **Open loop only.**
     - ``"auxiliary model"``: past inputs and outputs of the model without noise, with the estimate of up to 64 samples
       ago while it is stable. Near the best in **open loop; biased under feedback** with coloured v, because then u
-      itself holds v. Before the first stable estimate its output is zero.
+      itself holds v. Before the first stable estimate the model is a delay: the instruments are past inputs.
 
     Parameters
     ----------
@@ -171,6 +171,8 @@ class RecursiveIvArx(_OnSignals):
         If a setting is out of its range.
     """
 
+    _estimator: RecursiveInstrumentalVariables
+
     def __init__(
         self,
         na: int,
@@ -195,11 +197,14 @@ class RecursiveIvArx(_OnSignals):
         else:
             raise EstimationError(f"instruments is {instruments!r}; reference, delayed input or auxiliary model")
         more += columns[na + nb :]
-        self._kind, self._na, self._p = instruments, na, p
+        self._kind, self._na, self._nb, self._p = instruments, na, nb, p
         self._n_inputs = 2 if instruments == "reference" else 1
         self._lines = DelayLines([*columns, *more], 2 if instruments == "delayed input" else 3)
         self._estimator = RecursiveInstrumentalVariables(names, n_instruments=len(more), **settings)
         self._model, self._count = np.zeros(p), 0
+        self._modelled = nb == 0
+        if nb:  # a model without output would leave the first a to the prior alone, and never be replaced
+            self._model[na + nb - 1] = 1.0
         if instruments == "auxiliary model":
             self._lines.silence(2)
 
@@ -239,5 +244,20 @@ class RecursiveIvArx(_OnSignals):
     def _renew(self) -> None:
         """Take over the estimate as auxiliary model if it is stable."""
         theta = self._estimator.estimate
-        if np.all(np.abs(np.roots(np.concatenate([[1.0], theta[: self._na]]))) < 1):
-            self._model = theta
+        A = np.concatenate([[1.0], theta[: self._na]])
+        if np.all(np.abs(np.roots(A)) < 1):
+            if not self._modelled:  # the delay was of the input's unit: what it gave has to count as the output's does
+                gain = _gain(A, theta[self._na : self._na + self._nb])
+                self._estimator.scale_instruments(self._na, gain)
+                self._lines.scale(2, gain)
+            self._model, self._modelled = theta, True
+
+
+def _gain(A: Array, B: Array) -> float:
+    """Rms of B/A times white noise over that of the noise; 1 where it is nothing."""
+    from scipy.signal import lfilter
+
+    impulse = np.zeros(1000)
+    impulse[0] = 1.0
+    size = float(np.sqrt(np.sum(lfilter(B, A, impulse) ** 2)))
+    return size if 0 < size < np.inf else 1.0

@@ -142,6 +142,16 @@ class DelayLines:
         """
         self._past[:, channel] = 0.0
 
+    def scale(self, channel: int, factor: float) -> None:
+        """Change the unit of what is remembered of a channel.
+
+        Parameters
+        ----------
+        channel : int
+        factor : float
+        """
+        self._past[:, channel] *= factor
+
 
 def columns_of(
     na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool, output: int = 0

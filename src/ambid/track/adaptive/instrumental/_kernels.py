@@ -31,11 +31,14 @@ Array = NDArray[np.float64]
     NOISE_WEIGHT,
     SUM_OF_SQUARES,  # of the weights of the samples
     PRIOR_LEFT,  # squared weight that the prior still has
-) = range(16)
+    VAGUE,  # 1 where no prior was given: the limit then is counted from the best variances so far
+) = range(17)
 HEAD = 20
 
 _HUGE = 1e200
 _SINGULAR = 1e-12
+_LITTLE = 0.1  # of the usual leverage, at which a sample counts half
+_WORSE = 1e9  # times its best variance: the prior variance, for the limit, of a coefficient without prior
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -112,7 +115,10 @@ def _govern(s: Array, T: Array, prior: Array, unit: Array, solved: Array) -> Non
     for i in range(p):
         unit[:] = 0.0
         unit[i] = 1.0
-        size += _length(T, unit, solved) / prior[i]
+        variance = _length(T, unit, solved)
+        if s[VAGUE] > 0:
+            prior[i] = min(prior[i], _WORSE * variance)
+        size += variance / prior[i]
     size /= p * s[LIMIT]
     s[FACTOR_NOW] = s[FACTOR]
     if size > s[FACTOR] ** s[EVERY]:
@@ -206,11 +212,11 @@ def _account(
     """Track noise and weights, a sample by what its instruments add to those of before."""
     m = zeta.size
     leverage = _length(R[:, :m], zeta, solved)
-    typical = 0.1 * m / min(s[USED] + 1.0, s[MEMORY])
+    typical = _LITTLE * m / min(s[USED] + 1.0, s[MEMORY])
     share = leverage / (leverage + typical)
     _add_noise(s, omega, ring, total, zeta, weighted, share)
     keep = 1.0 - s[NOISE_RATE] * share
     s[NOISE_SUM] = keep * s[NOISE_SUM] + share * weighted * weighted
     s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
-    s[SUM_OF_SQUARES] = factor * factor * s[SUM_OF_SQUARES] + share
+    s[SUM_OF_SQUARES] = factor * factor * s[SUM_OF_SQUARES] + (1.0 + _LITTLE) * share
     s[PRIOR_LEFT] *= factor * factor

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.errors import EstimationError
 from ambid.track.adaptive._recursion import (
     ENOUGH,
+    VAGUE,
     Recursion,
     coefficient_names,
     count,
@@ -50,16 +51,17 @@ class RecursiveInstrumentalVariables(Recursion):
         m, p or more; p if not given.
     start : array_like, shape (p,), optional
         Estimate to begin with; zero if not given.
-    prior : array_like, shape () or (p,)
-        Variances of the start's error over the variance of v.
-    instrument_size : array_like, shape () or (m,)
-        Usual size of the instruments: the prior counts like one sample of that size.
+    prior : array_like, shape () or (p,), optional
+        Variances of the start's error over the variance of v, in the coefficients' units. If not given, nothing is
+        known of the coefficients, whatever the units of the signals: the start has no weight.
+    instrument_size : array_like, shape () or (m,), optional
+        Usual size of the instruments: a prior that is given counts like one sample of that size; 1 if not given.
     factor : float, optional
         Of forgetting, 0 < factor < 1; nothing is forgotten if neither it nor `memory` is given.
     memory : float, optional
         The same as a time constant in samples, 1 / (1 - factor).
     limit : float
-        Of the wind-up.
+        Of the wind-up, see above; over 1e9 times the best variances so far where no prior is given.
     correlation : int
         Samples; several times the time over which v is correlated. 1 for white v.
     noise_start : float
@@ -90,8 +92,8 @@ class RecursiveInstrumentalVariables(Recursion):
         *,
         n_instruments: int | None = None,
         start: ArrayLike | None = None,
-        prior: ArrayLike = 1e6,
-        instrument_size: ArrayLike = 1.0,
+        prior: ArrayLike | None = None,
+        instrument_size: ArrayLike | None = None,
         factor: float | None = None,
         memory: float | None = None,
         limit: float = 100.0,
@@ -114,7 +116,10 @@ class RecursiveInstrumentalVariables(Recursion):
         s[at.LIMIT] = positive("limit", limit)
         s[at.NOISE_RATE] = 1.0 / (_NOISE_MEMORIES * s[at.MEMORY])
         s[at.PRIOR_LEFT] = 1.0
-        self._begin(numbers("prior", prior, p), instrument_size)
+        s[at.VAGUE] = float(prior is None)
+        if instrument_size is None:
+            instrument_size = 1.0 / np.sqrt(VAGUE) if prior is None else 1.0
+        self._begin(numbers("prior", VAGUE if prior is None else prior, p), instrument_size)
 
     def _begin(self, prior: Array, instrument_size: ArrayLike) -> None:
         """Enter the prior as samples whose instruments are the coefficients' own directions."""
@@ -165,6 +170,22 @@ class RecursiveInstrumentalVariables(Recursion):
         """Samples after which the estimate stayed because the instruments did not determine it."""
         return int(self._s[self._at.SINGULAR])
 
+    def scale_instruments(self, first: int, factor: float) -> None:
+        """Count what the first instruments have told as if they had been larger; the estimate stays.
+
+        Parameters
+        ----------
+        first : int
+            How many.
+        factor : float
+        """
+        part, by = self._parts(), np.ones(self._m)
+        by[:first] = factor
+        part["R"][:, : self._m] *= by
+        part["omega"][...] *= np.outer(by, by)
+        for name in ("ring", "total", "size"):
+            part[name][...] *= by
+
     @property
     def covariance(self) -> Array:
         """A copy of the covariance of the estimate's error, shape (p, p)."""
@@ -175,7 +196,8 @@ class RecursiveInstrumentalVariables(Recursion):
         if s[at.NOISE_WEIGHT] >= ENOUGH:
             N = N + part["omega"] * (s[at.SUM_OF_SQUARES] / s[at.NOISE_WEIGHT])
         half = solve_triangular(part["R"][:, :m], _root(N), trans="T")
-        B = np.linalg.lstsq(part["R"][:, m:-1], half, rcond=None)[0]
+        Q, T = np.linalg.qr(part["R"][:, m:-1])  # no singular value is cut: what the data do not see is vague
+        B = solve_triangular(T, Q.T @ half)
         return np.asarray(B @ B.T)
 
 
