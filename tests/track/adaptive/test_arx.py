@@ -95,3 +95,9 @@ def test_the_units_of_the_signals_do_not_matter(instruments: str, sizes: tuple[f
     unit = np.array([1.0, 1.0, sizes[1] / sizes[0]])
     np.testing.assert_allclose(other.estimate, one.estimate * unit, rtol=1e-4)
     np.testing.assert_allclose(other.covariance, one.covariance * np.outer(unit, unit), rtol=1e-3, atol=0)
+
+
+def test_instruments_made_of_the_input_want_an_open_loop_and_say_so() -> None:
+    made = {k: RecursiveIvArx(1, 1, instruments=k) for k in ("reference", "delayed input", "auxiliary model")}
+    assert [len(iv.warnings) for iv in made.values()] == [0, 1, 1]
+    assert not RecursiveIvArx(1, 1, instruments="auxiliary model", open_loop=True).warnings

@@ -151,6 +151,8 @@ class RecursiveIvArx(_OnSignals):
     instruments : {"reference", "delayed input", "auxiliary model"}
     offset : bool
         Whether a constant is estimated; it is its own instrument.
+    open_loop : bool
+        Say that no feedback is at work: the last two want that, and `warnings` tells it.
     n_instruments : int, optional
         Past values of the reference, na + nb or more; na + nb + 2 if not given.
     reference_delay : int
@@ -164,6 +166,7 @@ class RecursiveIvArx(_OnSignals):
     estimate : ndarray, shape (p,)
     covariance : ndarray, shape (p, p)
     n_used, n_rejected : int
+    warnings : tuple of str
 
     Raises
     ------
@@ -181,6 +184,7 @@ class RecursiveIvArx(_OnSignals):
         *,
         instruments: Instruments,
         offset: bool = False,
+        open_loop: bool = False,
         n_instruments: int | None = None,
         reference_delay: int = 1,
         **settings: Any,
@@ -197,7 +201,7 @@ class RecursiveIvArx(_OnSignals):
         else:
             raise EstimationError(f"instruments is {instruments!r}; reference, delayed input or auxiliary model")
         more += columns[na + nb :]
-        self._kind, self._na, self._nb, self._p = instruments, na, nb, p
+        self._kind, self._na, self._nb, self._p, self._open_loop = instruments, na, nb, p, open_loop
         self._n_inputs = 2 if instruments == "reference" else 1
         self._lines = DelayLines([*columns, *more], 2 if instruments == "delayed input" else 3)
         self._estimator = RecursiveInstrumentalVariables(names, n_instruments=len(more), **settings)
@@ -240,6 +244,16 @@ class RecursiveIvArx(_OnSignals):
                 self._renew()
             start = stop
         return errors.reshape(shape)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader of the estimate has to know."""
+        if self._kind == "reference" or self._open_loop:
+            return ()
+        return (
+            f"instruments are made of the input ({self._kind}): biased where a controller is at work, and nothing says "
+            "that this loop is open. Take the reference of the loop, or say open_loop if there is no feedback",
+        )
 
     def _renew(self) -> None:
         """Take over the estimate as auxiliary model if it is stable."""
