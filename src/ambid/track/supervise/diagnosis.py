@@ -28,7 +28,9 @@ _ATTEMPTS = 5
 _BENCH = ("parameter", "gain")  # kinds of numbers that describe the bench
 _DISTURBED = ("offset", "unbalance")  # kinds of numbers that may jump without anything being wrong with the bench
 _SUDDEN = 16  # blocks of the longest window in which something unnamed is taken for a jump
-_TELLING = 3  # blocks after which a disturbance that looks like a fault is taken for what it looks like most
+_TELLING = 2  # further blocks that are waited for where the first ones leave open what it is
+_ALIKE = 0.5  # of the best statistic: what explains so much of the first blocks of a jump is not ruled out by them
+_WORTH = 1.25  # rise of the innovations' variance that is worth a word
 _STRAY = 3.0  # moves by which such a number is widened
 _UNKNOWN = 0.3  # relative standard deviation of a parameter of which nothing is known any more
 
@@ -80,6 +82,7 @@ class Diagnosis:
         self._recovery: Recovery | None = None
         self.unexplained = Unexplained()
         self.settling = self.renewed = False
+        self._waited = 0  # blocks, to see what an alarm is of
         self.changes: list[Event] = []
         self.update_s = 0.0
 
@@ -157,22 +160,36 @@ class Diagnosis:
             return False
         self._detector.drift = rpem.drift.variance * rpem.block_s
         alarm = self._detector.update(evidence, rpem.filter.q, rpem.filter.covariance)
-        if alarm is not None and not self._undecided(alarm):
-            return self._alarmed(alarm, evidence, t)
+        if alarm is not None:
+            return False if self._undecided(alarm) else self._alarmed(alarm, evidence, t)
+        self._waited = 0
         if self.unexplained.blocks and unexplained(evidence) <= WILD * self._detector.noise:
             self.unexplained.over()
         return True
 
     def _undecided(self, alarm: Alarm) -> bool:
-        """Wait another block or two where a disturbance and a fault of the bench explain the first ones alike."""
-        doubtful = self._kind(alarm.parameter) in _DISTURBED and any(self._kind(n) in _BENCH for n, _ in alarm.rivals)
-        return doubtful and alarm.blocks < _TELLING
+        """Wait for another block where the first ones leave open what happened.
+
+        A jump somewhere in its block looks like many things: one whole block behind it tells most. A disturbance and a
+        fault of the bench that explain the first blocks alike get two.
+        """
+        if alarm.by == "noise":
+            return False
+        close = [name for name, _ in alarm.rivals]
+        if alarm.runner_up is not None and alarm.runner_up[1] > _ALIKE * alarm.statistic:
+            close.append(alarm.runner_up[0])
+        named = [alarm.parameter] if alarm.parameter is not None else []
+        mixed = len({self._kind(name) in _DISTURBED for name in (*named, *close)}) > 1
+        self._waited += 1
+        early = alarm.blocks == 1 or (alarm.blocks <= _TELLING + 1 and bool(alarm.rivals))
+        return self._waited <= (_TELLING if mixed else int(early))
 
     def _kind(self, name: str | None) -> str | None:
         return None if name is None else self._kinds[name]
 
     def _alarmed(self, alarm: Alarm, evidence: Evidence, t: float) -> bool:
         """Begin to deal with an alarm; tell whether the block may be used."""
+        self._waited = 0
         name, kind = alarm.parameter, self._kind(alarm.parameter)
         moved: Literal["change", "disturbed"] = "change" if kind in _BENCH else "disturbed"
         event = Event(
@@ -206,7 +223,7 @@ class Diagnosis:
         """Deal with innovations that no number explains; tell whether the block may be used."""
         usual, sample = self._detector.noise, self._rpem.stream.sample
         if variance <= WILD * usual:  # a little more, or less, than usual over many blocks
-            if alarm.noise > 1.0:
+            if alarm.noise > _WORTH:
                 self._log.add(event)
             self._take_as_noise(usual * alarm.noise)
             return True
@@ -274,6 +291,9 @@ class Diagnosis:
         self._name(found, t)
         self._fresh_start()
         names = ", ".join(found.moved)
+        if all(self._kind(name) in _DISTURBED for name in found.moved):
+            self.settling = True
+            return
         why = f"{names} found anew from the samples after the change in {found.computing_s * 1e3:.1f} ms"
         self._publication.propose(t, why)
         self._publication.unconfirmed = self.renewed = True
@@ -288,11 +308,18 @@ class Diagnosis:
         told = self._recovery.event
         if told.kind == "change" and told.parameter == name:
             return
+        disturbed = self._kind(name) in _DISTURBED
         what = f"the data after it are explained by {', '.join(found.moved)}"
         event = Event(
-            kind="change", t=told.t, parameter=name, why=f"{what}; {told.why}", values={**told.values, "named": t}
+            kind="disturbed" if disturbed else "change",
+            t=told.t,
+            parameter=name,
+            why=f"{what}; {told.why}",
+            values={**told.values, "named": t},
         )
-        if told.kind == "change":
+        if disturbed:
+            pass
+        elif told.kind == "change":
             self.changes[-1] = event
         else:
             self.changes.append(event)

@@ -186,9 +186,12 @@ class Recovery:
         before = self._unmoved(rpem, evidence)
         if self.short and self.attempts == 1 and before < p + _QUIET * np.sqrt(2.0 * p):
             return None, ()
-        best = self._best(rpem, recent, [(name,) for name in self._likeliest(rpem, evidence)])
+        numbers = rpem.numbers
+        choices = [(name,) for name in self._likeliest(rpem, evidence)]
+        if self.event.kind != "change" or self.attempts > 1:  # it may have been a load after all
+            choices.append(tuple(numbers.names[j] for j in numbers.places("offset", "unbalance")))
+        best = self._best(rpem, recent, choices)
         if best is None or best[0].misfit >= _MISFIT * p:
-            numbers = rpem.numbers
             every = tuple(numbers.names[j] for j in numbers.places("parameter"))
             best = self._best(rpem, recent, [every])
         if best is None or best[0].misfit >= _MISFIT * p:

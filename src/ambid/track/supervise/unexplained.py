@@ -49,8 +49,8 @@ class Unexplained:
 
     @property
     def level(self) -> float:
-        """Mean variance of the wild blocks."""
-        return self._sum / self.blocks if self.blocks else 1.0
+        """Mean variance of the wild blocks but the first, in which it began."""
+        return self._sum / max(self.blocks - 1, 1) if self.blocks else 1.0
 
     @property
     def persists(self) -> bool:
@@ -70,7 +70,7 @@ class Unexplained:
         variance : float
         """
         self.blocks += 1
-        self._sum += variance
+        self._sum = variance if self.blocks <= 2 else self._sum + variance
 
     def close_ears(self, t: float) -> None:
         """Learn nothing until it is over, or until a search is due.
