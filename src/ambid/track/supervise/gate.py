@@ -25,7 +25,8 @@ class Gate:
     """Hold the accepted numbers; let others pass only if later data agree.
 
     A candidate passes if it predicts the later blocks no worse than the accepted numbers do, but for what chance allows
-    (`level` of the normal distribution of the difference), and if its own residual is no larger than chance allows
+    (`level` of the normal distribution of the difference; twice that distance for one that claims nothing new, as the
+    recursion proposes such every few blocks), and if its own residual is no larger than chance allows
     (`level` of chi-squared). Where it claims to be another number (by its covariance and that of the accepted) and the
     later data cannot tell the two apart, it waits, and is refused after `longest` blocks. After acceptance the numbers
     before it are kept on trial for `probation` blocks: if they predict better than chance allows, the gate goes back.
@@ -181,13 +182,15 @@ class Gate:
         new, old = self._candidate, self.accepted
         seen = self.last = self._compare(self._trial, new, old)
         z = self._z * math.sqrt(seen.scale)
-        if seen.claim > self._misfit and seen.separation < (2 * z) ** 2:
+        claims = seen.claim > self._misfit
+        if claims and seen.separation < (2 * z) ** 2:
             if self._trial.blocks < self._longest:
                 return None
             return self._refuse(t, seen, "the later data cannot tell it from the accepted numbers")
         if seen.misfit > self._misfit * seen.scale:
             return self._refuse(t, seen, f"its own misfit is larger than {self._misfit * seen.scale:.3g}")
-        allowance = max(0.0, 2 * self._z * seen.sd - seen.separation)
+        # what claims nothing new comes every few blocks: it is refused only where chance is out of the question
+        allowance = max(0.0, (1 if claims else 2) * self._z * seen.sd - seen.separation)
         if seen.gain < -allowance:
             return self._refuse(t, seen, f"the accepted numbers predict better; chance allows {allowance:.3g}")
         return self._accept(new, t, f"{new.why}: {seen.text}", seen)
