@@ -144,6 +144,9 @@ DAMAGE = {
     "half a line in the middle": (lambda x: changed(x, 3, '"error"', '"err'), "line 4: it is no JSON"),
     "a missing key": (lambda x: changed(x, 3, '"error"', '"mistake"'), "line 4: 'error' is missing"),
     "a word for a number": (lambda x: changed(x, 2, '"sd": ', '"sd": "x", "y": '), "line 3: 'x' stands where a number"),
+    "no number of JSON": (lambda x: changed(x, 2, '"sd": ', '"sd": NaN, "y": '), "line 3: it is no JSON"),
+    "a word for a count": (lambda x: x.replace('"samples": 14', '"samples": "14"'), "where a count belongs"),
+    "nested without end": (lambda x: x.replace(x.split("\n")[3], "[" * 100_000), "line 4: it is no JSON"),
     "an unknown state": (lambda x: changed(x, 2, '"tracking"', '"asleep"'), "state 'asleep' is unknown"),
     "an unknown event": (lambda x: x.replace('"kind": "change"', '"kind": "miracle"'), "event 'miracle' is unknown"),
     "another parameter": (

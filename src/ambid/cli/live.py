@@ -190,19 +190,8 @@ class Follower:
         Parameters
         ----------
         header : TrackHeader
-
-        Raises
-        ------
-        AmbidError
-            If the reporting interval is shorter than a sample.
         """
         from ambid.track.tally import Tally
-
-        if header.every_s * header.rate_hz < 1.0 - 1e-9:
-            raise AmbidError(
-                f"--every {header.every_s:g} s is less than one sample at {header.rate_hz:g} Hz; a line needs a sample."
-                f" Give {1.0 / header.rate_hz:g} or more"
-            )
 
         self._before_header.close()
         self._tally = Tally(header)

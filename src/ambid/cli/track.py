@@ -18,7 +18,7 @@ from ambid.errors import AmbidError, nearest
 
 if TYPE_CHECKING:
     from ambid.cli.live import Flag, Follower
-    from ambid.track.lines import TrackSummary
+    from ambid.track.lines import TrackHeader, TrackSummary
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 _FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
@@ -115,6 +115,11 @@ def command(
         writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None
         same = json == "-" and sys.stdout.isatty()
         live = not quiet and sys.stderr.isatty() and not same
+
+        def begin(header: TrackHeader) -> None:
+            _check_interval(every, header.rate_hz)
+            follower.on_header(header)
+
         follower = Follower(writer, keep=plot is not None, live=live, real_time=pace == "real-time")
         summary = follower.run(
             lambda: track(
@@ -130,7 +135,7 @@ def command(
                 from_s=from_s,
                 to_s=to_s,
                 rate_hz=rate,
-                on_header=follower.on_header,
+                on_header=begin,
                 on_line=follower.on_line,
                 keep=False,
                 tick=follower.tick,
@@ -153,6 +158,15 @@ def _check(every: float, limit: float, start: Path | None, start_seconds: float 
     if start is not None and start_seconds is not None:
         raise AmbidError(
             "--start-seconds is for a start identified from the record; --start gives one. Leave one of them out"
+        )
+
+
+def _check_interval(every: float, rate_hz: float) -> None:
+    """Refuse an interval that holds no sample, now that the rate is known."""
+    if every * rate_hz < 1.0 - 1e-9:
+        raise AmbidError(
+            f"--every {every:g} s is less than one sample at {rate_hz:g} Hz; a line needs a sample."
+            f" Give {1.0 / rate_hz:g} or more"
         )
 
 

@@ -84,14 +84,26 @@ def read_track(path: str | Path) -> Track:
 
 def _whole(row: bytes) -> bool:
     try:
-        return isinstance(json.loads(row), dict)
+        return isinstance(_loaded(row), dict)
     except ValueError:
         return False
 
 
+def _loaded(row: bytes) -> Any:
+    """Read JSON in the strict sense: without NaN and Infinity, and not nested without end."""
+    try:
+        return json.loads(row, parse_constant=_no_number)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
 def _parsed(path: Path, number: int, row: bytes, read: Callable[[Mapping[str, Any]], T]) -> T:
     try:
-        document = json.loads(row)
+        document = _loaded(row)
     except ValueError:
         raise RecordError(f"track {path}, line {number}: it is no JSON. Restore the file") from None
     try:
@@ -169,9 +181,15 @@ def _event(e: Mapping[str, Any]) -> Event:
         t=_float(e.get("t")),
         why=str(e.get("why", "")),
         parameter=e.get("parameter"),
-        samples=e.get("samples"),
+        samples=_count(e.get("samples")),
         values={name: _float(v) for name, v in e.get("values", {}).items()},
     )
+
+
+def _count(x: Any) -> int | None:
+    if x is not None and (isinstance(x, bool) or not isinstance(x, int)):
+        raise TypeError(f"{x!r} stands where a count belongs")
+    return x
 
 
 def _tracked(v: Mapping[str, Any]) -> TrackedValue:

@@ -249,12 +249,14 @@ if __name__ == "__main__":
 def test_a_producer_whose_consumer_was_killed_ends_too(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    process = subprocess.Popen(
-        [sys.executable, str(script), "process"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=ROOT
-    )
+    with (tmp_path / "said").open("w") as said:
+        process = subprocess.Popen(
+            [sys.executable, str(script), "process"], stdout=subprocess.PIPE, stderr=said, text=True, cwd=ROOT
+        )
     assert process.stdout.readline().strip() == "ready"
     process.kill()
     assert process.stdout.read() == ""  # returns when nobody holds the pipe any more: the child has ended
+    assert "Traceback" not in (tmp_path / "said").read_text()
     assert not list(Path("/dev/shm").glob(f"ambid-{process.pid}-*"))
 
 

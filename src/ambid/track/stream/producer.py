@@ -6,7 +6,7 @@ import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from typing import Literal, Protocol
@@ -186,7 +186,10 @@ def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connectio
             fill(pickle.loads(packed), ring, rate_hz, pace, alone=lambda: parent is not None and not parent.is_alive())
         except Exception as failure:
             outcome = failure
-    try:
-        tell.send(outcome)
-    except Exception:
-        tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Mend the source"))
+    with suppress(BrokenPipeError):  # the consumer was killed: nobody is there to be told
+        try:
+            tell.send(outcome)
+        except BrokenPipeError:
+            raise
+        except Exception:
+            tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Mend the source"))
