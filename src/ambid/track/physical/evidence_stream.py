@@ -48,7 +48,8 @@ class EvidenceStream:
         self.numbers, self.at, self.sample = numbers, at, 0
         self._advance: Callable[..., int] = advance
         self._scale = np.stack([numbers.point, np.concatenate([problem.scales.input, problem.scales.output])])
-        self._lags = np.array([problem.delay + lag for lag in problem.lags], dtype=np.int64)
+        # a lag before now belongs to delays below zero, which no predictor has: its columns are zero
+        self._lags = np.array([max(problem.delay + lag, 0) for lag in problem.lags], dtype=np.int64)
         self._history = np.zeros((int(self._lags.max()) + 1, n_u))
         self._x, self._s = np.zeros(n), np.zeros((n, p))
         self._rows = np.zeros((p + 1, min(block, _ROOM) * n_y))

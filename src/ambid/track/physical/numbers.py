@@ -1,7 +1,8 @@
 """What is tracked beside the physical parameters, where tracking begins, and how sure one is of that.
 
 The tracked numbers q are, in this order: physical parameters that are not fixed, gains of the sensors (1 unless a fault
-is found), the noise description, constant disturbances (offsets), and unbalance where the angle is known. All are in
+is found), the delay where it was estimated as a real number (what is known of the parameters hangs on it), the noise
+description, constant disturbances (offsets), and unbalance where the angle is known. All are in
 units of their own magnitude.
 """
 
@@ -31,6 +32,7 @@ UNBALANCE = ("unbalance_cos", "unbalance_sin")
 MEMORY_S = 0.1  # longest memory of the predictor: what happened before cannot disturb the tracking of changes
 _LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
 _LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
+_WIDE = 0.15  # relative standard deviation above which a first-order step is too long
 _GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
 _GAIN_SD = 0.1  # relative, of an entry of the predictor gain
 _OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
@@ -45,6 +47,7 @@ class TrackedNumbers:
     ----------
     names : tuple of str
     kinds : tuple of {"parameter", "gain", "noise", "offset", "unbalance"}
+        The delay counts as noise: it belongs to the predictor, not to the bench.
     units : tuple of str
         SI units of parameters and gains; "1" for the others, except ``kg m`` for the unbalance.
     magnitude : ndarray, shape (p,)
@@ -66,6 +69,8 @@ class TrackedNumbers:
         explains its record only in part.
     speed : float
         rad/s at which the unbalance force has the size of its magnitude.
+    warnings : tuple of str
+        What to mistrust, one line each.
     """
 
     names: tuple[str, ...]
@@ -80,6 +85,7 @@ class TrackedNumbers:
     information_s: float
     overdispersion: float = 1.0
     speed: float = 1.0
+    warnings: tuple[str, ...] = ()
 
     @property
     def rate_hz(self) -> float:
@@ -214,6 +220,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
         overdispersion=_overdispersion(estimate),
         speed=top_speed,
+        warnings=_poorly_known(estimate),
     )
     if assemble(problem, found.vector(found.start), with_derivatives=False) is None:
         raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
@@ -259,7 +266,8 @@ def _problem(
         prior_sd=np.full(len(names), np.inf),
         scales=scales,
         delay=delay.samples,
-        lag=delay.fraction,
+        lag=0.0 if _tracks_delay(plant, estimate) else delay.fraction,
+        fractional=_tracks_delay(plant, estimate),
         skip=delay.samples + 2,
         noise=noise.form,
         gain=noise.gain,
@@ -288,6 +296,7 @@ def _groups(
             kind="gain", names=gains, units=("1",) * len(gains), magnitude=np.ones(len(gains)),
             start=np.ones(len(gains)), covariance=_GAIN_KNOWN**2 * np.eye(len(gains)),
         ),
+        *_delay(problem, estimate),
         _Group(
             kind="noise", names=tuple(f"noise_{k}" for k in range(count)), units=("1",) * count,
             magnitude=np.ones(count), start=noise.numbers, covariance=np.diag(noise.sd**2),
@@ -307,6 +316,33 @@ def _groups(
             )
         )  # fmt: skip
     return groups
+
+
+def _poorly_known(estimate: Estimate) -> tuple[str, ...]:
+    """Parameters so wide that evidence linearised at the start is worth less than it claims."""
+    return tuple(
+        f"the start knows {name} to {sd / abs(value):.0%} only: what is tracked of it may claim too narrow an interval."
+        " Start from a longer or better excited record"
+        for name, sd in zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True)
+        if sd > _WIDE * abs(value := estimate.values[name])
+    )
+
+
+def _tracks_delay(plant: SensorGains, estimate: Estimate) -> bool:
+    return bool(estimate.delay[plant.inputs[0]].sd)
+
+
+def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
+    """The delay beyond the whole samples, in samples, where the start has estimated it."""
+    if not problem.fractional:
+        return []
+    found = estimate.delay[problem.model.inputs[0]]
+    return [
+        _Group(
+            kind="noise", names=("delay",), units=("1",), magnitude=np.ones(1), start=np.array([found.fraction]),
+            covariance=np.array([[float(found.sd or 0.0) ** 2]]),
+        )
+    ]  # fmt: skip
 
 
 def _rate(estimate: Estimate) -> float:
