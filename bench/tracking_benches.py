@@ -154,12 +154,13 @@ BENCHES: Mapping[str, Callable[[], TrackBench]] = MappingProxyType(
 
 
 def supervised(
-    start: TrackedNumbers | Estimate, *, memory: str = "auto", listener: Callable[[Event], None] | None = None
+    start: TrackedNumbers | Estimate, *, first: int = 0, listener: Callable[[Event], None] | None = None
 ) -> Supervisor:
-    """The supervisor as the command makes it."""
-    assert memory in ("auto", "all")
+    """The supervisor as the command makes it; `first` is the number of its first sample."""
     numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
-    return Supervisor(PhysicalRpem(numbers, memory="auto" if memory == "auto" else "all"), listener=listener)
+    found = Supervisor(PhysicalRpem(numbers), listener=listener)
+    found.diagnosis.restart(first)
+    return found
 
 
 def blocks(samples: Samples, first: int = 0, size: int = BLOCK) -> Iterator[tuple[int, Samples]]:

@@ -56,9 +56,10 @@ class Followed:
 def followed(bench: TrackBench, seed: int) -> Followed:
     """Track one record through its change."""
     samples = bench.samples("change", seed, LENGTH_S, AT_S)
-    supervisor = supervised(identified(samples))
+    begin = round(START_S * RATE)
+    supervisor = supervised(identified(samples), first=begin)
     times, values = [], []
-    for k, part in blocks(samples, round(START_S * RATE)):
+    for k, part in blocks(samples, begin):
         supervisor.feed(part, k)
         times.append((k + part.y.shape[0]) / RATE)
         values.append(supervisor.parameters["k_i"].value)

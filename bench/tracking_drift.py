@@ -35,7 +35,7 @@ def drift_of(bench: TrackBench, seed: int) -> Drift:
     """Track one record; the drift begins where the start's record ends."""
     stream = bench.stream("drift", seed, START_S + DRIFT_S, START_S)
     _, first = next(stream)  # a second
-    supervisor, values, sds, times = supervised(identified(first)), [], [], []
+    supervisor, values, sds, times = supervised(identified(first), first=first.y.shape[0]), [], [], []
     for k, part in stream:
         for j, piece in blocks(part):
             supervisor.feed(piece, k + j)
