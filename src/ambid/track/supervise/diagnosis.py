@@ -215,9 +215,18 @@ class Diagnosis:
         suspects = self._bench  # a fault of one thing is likelier than of several at once
         if name is not None and kind in _BENCH:
             self.changes.append(event)
+            if alarm.blocks > _SUDDEN:
+                self._hasten(name, alarm)
             suspects = (name, *[n for n, _ in alarm.rivals if self._kind(n) in _BENCH][:2])
         self._search(event, alarm.onset, suspects, size=alarm.size, blocks=alarm.blocks)
         return False
+
+    def _hasten(self, name: str, alarm: Alarm) -> None:
+        """Let a number walk faster that moved over a long window: it may go on as it has begun."""
+        drift, place = self._rpem.drift, self._rpem.numbers.names.index(name)
+        if drift.adapts:
+            faster = alarm.size**2 / (alarm.blocks * self._rpem.block_s)
+            drift.variance[place] = max(drift.variance[place], faster)
 
     def _noisy(self, alarm: Alarm, event: Event, variance: float) -> bool:
         """Deal with innovations that no number explains; tell whether the block may be used."""

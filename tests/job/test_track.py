@@ -1,0 +1,259 @@
+"""The on-line job from record to track: scenarios with known truth, damaged files, starts, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.errors import AmbidError
+from ambid.identify.estimate_file import estimate_to_json
+from ambid.job.physical import identify
+from ambid.job.track import track
+from ambid.physics.presets import preset
+from ambid.record import Record, write_record
+from ambid.rig import default_rig
+from ambid.simulate import simulate_scenario, truth_columns
+from tests.track.supervise.runs import RATE, START_S, TRUE, simulated, start, step
+
+BENCH = preset("unstable-bearing")
+ROLES = ("voltage", "current", "position")
+
+
+def scenario(name, seconds, **settings):
+    """A record in roles, and the truth at its end."""
+    made = simulate_scenario(name, BENCH, duration_s=seconds, seed=2, **settings)
+    record = made.record
+    roles = (*ROLES, *(n for n in ("speed", "angle") if n in record.names))
+    truth = {**made.truth, **{n: c.values[-1] for n, c in truth_columns(record).items()}}
+    return replace(record, channels=tuple(record.channel(c) for c in roles)), truth
+
+
+def far(found, truth):
+    """Numbers of the last line that are more than four standard deviations off."""
+    last = {**found.lines[-1].parameters, **found.lines[-1].extra}
+    return {n: (v.value, truth[n]) for n, v in last.items() if n in truth and abs(v.value - truth[n]) > 4.0 * v.sd}
+
+
+def kinds(found):
+    return [e.kind for line in found.lines for e in line.events if e.kind != "refused"]
+
+
+@pytest.mark.parametrize(
+    ("name", "moved"), [("change", "k_i"), ("added-mass", "m"), ("sensor-gain", "gain_position"), ("offset", None)]
+)
+def test_a_scenario_is_told_as_it_was(name, moved):
+    record, truth = scenario(name, 2.4, at_s=1.6)
+    found = track(record)
+    assert [e.parameter for e in found.summary.changes] == ([moved] if moved else [])
+    assert all(e.t == pytest.approx(1.6, abs=0.02) for e in found.summary.changes)
+    assert far(found, truth) == {}
+    assert found.lines[-1].state == "tracking"
+
+
+@pytest.mark.parametrize("name", ["steady", "saturation"])
+def test_nothing_is_told_where_nothing_changes(name):
+    record, truth = scenario(name, 2.5)
+    found = track(record)
+    assert kinds(found) == []
+    assert {line.state for line in found.lines} == {"tracking"}
+    assert far(found, truth) == {}
+
+
+def test_a_coil_that_warms_is_followed_without_an_alarm():
+    record, truth = scenario("drift", 5.0)
+    found = track(record)
+    assert found.summary.changes == ()
+    assert found.lines[-1].parameters["R"].value == pytest.approx(truth["R"], rel=0.01)
+    assert far(found, {n: v for n, v in truth.items() if n != "R"}) == {}
+
+
+def test_a_spin_up_gives_the_unbalance_without_a_rig(tmp_path):
+    record, truth = scenario("spin-up", 3.0, at_s=1.2)
+    write_record(record, tmp_path / "spin.csv")
+    found = track(tmp_path / "spin.csv")
+    assert far(found, truth) == {}
+    last = found.lines[-1].extra
+    assert last["unbalance"].value == pytest.approx(truth["unbalance"], rel=0.05)
+    assert last["unbalance_phase"].value == pytest.approx(truth["unbalance_phase"], abs=0.05)
+    assert found.summary.changes == ()
+
+
+def test_columns_of_other_units_are_no_rotation(tmp_path):
+    record, _ = scenario("spin-up", 1.5, at_s=0.2)
+    wrong = [replace(c, unit="m/s", source_unit="m/s") if c.name == "speed" else c for c in record.channels]
+    write_record(replace(record, channels=tuple(c for c in wrong if c.name != "angle")), tmp_path / "other.csv")
+    assert "unbalance" not in track(tmp_path / "other.csv").lines[-1].extra
+
+
+def test_a_quiet_rotor_after_a_start_from_an_estimate_is_frozen_and_thaws():
+    loud, quiet = simulated(seconds=1.5), simulate_scenario("quiet", BENCH, duration_s=4.0, seed=3).record
+    both = tuple(replace(c, values=np.concatenate([quiet[c.name][: 4 * RATE], c.values])) for c in loud.channels)
+    found = track(replace(loud, channels=both), start=start(), every_s=0.05)
+    assert found.summary.changes == ()
+    states = [line.state for line in found.lines if 2.5 < line.t < 4.0]
+    assert set(states) == {"frozen"}
+    middle = next(line for line in found.lines if line.t >= 3.5)
+    assert all(v.stale for v in middle.parameters.values())
+    assert found.lines[-1].state == "tracking"
+    assert not any(v.stale for v in found.lines[-1].parameters.values())
+    assert far(found, TRUE) == {}
+
+
+@pytest.fixture(scope="module")
+def steady():
+    record = simulated(seconds=2.5, seed=2)
+    return record, track(record, memory="all")
+
+
+def rows(record):
+    columns = np.column_stack([record.time_s, *[record[c] for c in ROLES]])
+    return [",".join(map(repr, row)) for row in columns.tolist()]
+
+
+def written(path, lines):
+    path.write_text("time [s],voltage [V],current [A],position [m]\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def damaged(lines, how):
+    n, m = round(1.6 * RATE), round(1.9 * RATE)
+    lost = 400
+    if how == "nan":
+        for k in range(n, n + lost):
+            lines[k] = lines[k].split(",")[0] + ",,,"
+    elif how == "gap":
+        del lines[n : n + lost]
+    elif how == "repeated":
+        lines[n + lost : n + lost] = lines[n : n + lost]
+    elif how == "late":
+        lines[n : n + 2 * lost] = lines[n + lost : n + 2 * lost] + lines[n : n + lost]
+    elif how == "clock":
+        for k in range(m, len(lines)):
+            t, rest = lines[k].split(",", 1)
+            lines[k] = f"{float(t) - 1000.0!r},{rest}"
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("how", "rejected"), [("nan", 400), ("gap", 400), ("repeated", 400), ("late", None), ("clock", 0)]
+)
+def test_a_damaged_file_ends_at_the_same_estimate_and_says_what_was_left_out(tmp_path, steady, how, rejected):
+    record, plain = steady
+    found = track(written(tmp_path / "r.csv", damaged(rows(record), how)), memory="all")
+    for name, value in found.lines[-1].parameters.items():
+        assert abs(value.value - plain.lines[-1].parameters[name].value) < value.sd
+        assert value.sd < 1.2 * plain.lines[-1].parameters[name].sd
+    assert found.summary.changes == ()
+    if rejected is not None:
+        assert found.summary.rejected_samples == rejected
+    if how != "late":
+        assert found.summary.counts.get("rejected", 0) >= 1
+    told = sum(e.samples or 0 for line in found.lines for e in line.events if e.kind == "rejected")
+    assert told == found.summary.rejected_samples
+    assert np.diff([line.t for line in found.lines]) == pytest.approx(0.01)
+    assert found.summary.complete
+
+
+def test_lost_samples_all_over(tmp_path):
+    from ambid.simulate.damage import losses
+
+    record = simulated(seconds=3.0, seed=2)
+    lines = rows(record)
+    gone = []
+    for x in losses(len(lines), 0.01, 4, first=round(1.2 * RATE)):
+        for k in range(x.first, x.stop):
+            lines[k] = lines[k].split(",")[0] + ",,,"
+            gone.append(k)
+    found = track(written(tmp_path / "r.csv", lines))
+    assert found.summary.rejected_samples == len(gone)
+    assert far(found, TRUE) == {}
+    assert found.summary.changes == ()
+
+
+def test_the_start_passes_over_a_damaged_beginning(tmp_path, steady):
+    lines = rows(steady[0])
+    lines[100] = lines[100].split(",")[0] + ",,,"
+    found = track(written(tmp_path / "r.csv", lines))
+    assert found.lines[0].t > 0.83 + 100 / RATE
+    assert far(found, TRUE) == {}
+    with pytest.raises(AmbidError, match="damaged"):
+        track(tmp_path / "r.csv", start_s=0.5)
+
+
+def test_a_start_from_a_file_begins_at_the_first_sample(tmp_path, steady):
+    record, _ = steady
+    (tmp_path / "e.json").write_text(json.dumps(estimate_to_json(start(2))))
+    found = track(record, start=tmp_path / "e.json", to_s=0.5)
+    assert found.lines[0].t == pytest.approx(0.01)
+    assert found.header.start["k_i"].value == pytest.approx(start(2).values["k_i"])
+    assert found.summary.samples == RATE // 2
+
+
+def test_starts_that_do_not_fit_are_refused(tmp_path, steady):
+    record, _ = steady
+    half = replace(record, rate_hz=RATE / 2)
+    with pytest.raises(AmbidError, match="20000 Hz, the record of 'one-axis' at 10000 Hz"):
+        track(half, start=start(2))
+    with pytest.raises(AmbidError, match="they have to agree"):
+        track(record, replace(default_rig("coil"), record=default_rig().record), start=start(2))
+
+
+def test_records_that_are_too_short_are_refused(steady):
+    record, _ = steady
+    with pytest.raises(AmbidError, match="leaves nothing"):
+        track(record, start_s=5.0)
+    with pytest.raises(AmbidError):
+        track(record, to_s=0.002)
+
+
+def test_flags_and_stops_from_the_outside(steady):
+    record, _ = steady
+    seen = []
+
+    def on_line(line):
+        seen.append(line.state)
+        return ("hold",) if len(seen) == 10 else ()
+
+    found = track(record, on_line=on_line, flags=((2.0, "track"),), keep=False)
+    assert found.lines == ()
+    n = round((2.0 - START_S * 2.5 / 3) * 100)
+    assert set(seen[10 : n - 2]) == {"hold"}
+    assert seen[-1] == "tracking"
+
+
+def test_what_is_published_before_tracking_is_the_identified_start(steady):
+    record, found = steady
+    first = round(2.5 / 3 * RATE)
+    part = replace(record, channels=tuple(replace(c, values=c.values[:first].copy()) for c in record.channels))
+    known = identify(part)
+    for name, value in found.header.start.items():
+        assert value.value == pytest.approx(known.values[name], rel=1e-9)
+
+
+def test_the_working_memory_does_not_grow(steady):
+    record, _ = steady
+
+    def weight(seconds):
+        import tracemalloc
+
+        tracemalloc.start()
+        track(record, start=start(2), to_s=seconds, keep=False)
+        peak = tracemalloc.get_traced_memory()[0]
+        tracemalloc.stop()
+        return peak
+
+    weight(0.5)
+    assert weight(2.5) < weight(1.5) + 200_000
+
+
+def test_a_change_is_followed_at_any_limit_and_interval():
+    record = simulated(step("k_i", 0.85, 1.6), seconds=2.2)
+    for limit, every_s in ((1.1, 0.05), (5.0, 0.003)):
+        found = track(record, limit=limit, every_s=every_s)
+        assert [e.parameter for e in found.summary.changes] == ["k_i"]
+        assert isinstance(record, Record)
+        assert far(found, {**TRUE, "k_i": 0.85 * TRUE["k_i"]}) == {}
+        assert found.header.every_s == every_s
