@@ -16,25 +16,21 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Estimate
-from ambid.identify.innovations import predictor_gain
 from ambid.identify.predictor import assemble
-from ambid.identify.problem import NoiseForm, PredictorProblem, Scales
+from ambid.identify.problem import PredictorProblem, Scales
 from ambid.identify.scaling import scales_for
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.physics.sensor_gain import SensorGains
+from ambid.track.physical.start_noise import NoiseNumbers, noise_numbers, overdispersion_of, rate_of
 
 Array = NDArray[np.float64]
 Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
 
 UNBALANCE = ("unbalance_cos", "unbalance_sin")
-MEMORY_S = 0.1  # longest memory of the predictor: what happened before cannot disturb the tracking of changes
-_LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
-_LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
 _WIDE = 0.15  # relative standard deviation above which a first-order step is too long
 _GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
-_GAIN_SD = 0.1  # relative, of an entry of the predictor gain
 _OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
 _UNBALANCE_SD = 1e4  # likewise
 
@@ -202,7 +198,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
     if estimate.status == "failed" or not estimate.covariance_names:
         raise EstimationError("the start estimate has no estimated parameters. Identify with free parameters first")
     scales = _scales(plant, estimate)
-    noise = _noise(plant, estimate, scales)
+    noise = noise_numbers(plant, estimate, scales)
     free = tuple(estimate.covariance_names)
     sizes = [_size(plant, estimate, k) for k in free] + [1.0] * len(plant.gains)
     problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
@@ -218,7 +214,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         point=np.array([estimate.operating_point[role] for role in (*plant.inputs, *plant.outputs)]),
         innovation_covariance=estimate.noise.innovation_covariance / np.outer(scales.output, scales.output),
         information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
-        overdispersion=_overdispersion(estimate),
+        overdispersion=overdispersion_of(estimate),
         speed=top_speed,
         warnings=_poorly_known(estimate),
     )
@@ -239,24 +235,14 @@ class _Group:
     covariance: Array
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _NoiseNumbers:
-    """Form of the noise, the numbers that describe it, their standard deviations, and a gain where it is held."""
-
-    form: NoiseForm
-    numbers: Array
-    sd: Array
-    gain: Array
-
-
 def _problem(
-    plant: SensorGains, estimate: Estimate, scales: Scales, noise: _NoiseNumbers, names: tuple[str, ...], sizes: Array
+    plant: SensorGains, estimate: Estimate, scales: Scales, noise: NoiseNumbers, names: tuple[str, ...], sizes: Array
 ) -> PredictorProblem:
     delay = estimate.delay[plant.inputs[0]]
     few = delay.samples + 3
     return PredictorProblem(
         model=plant,
-        rate_hz=_rate(estimate),
+        rate_hz=rate_of(estimate),
         u=np.zeros((few, len(plant.inputs))),
         y=np.zeros((few, len(plant.outputs))),
         estimated=names,
@@ -277,7 +263,7 @@ def _problem(
 def _groups(
     problem: PredictorProblem,
     estimate: Estimate,
-    noise: _NoiseNumbers,
+    noise: NoiseNumbers,
     free: tuple[str, ...],
     top_speed: float | None,
 ) -> list[_Group]:
@@ -345,16 +331,6 @@ def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
     ]  # fmt: skip
 
 
-def _rate(estimate: Estimate) -> float:
-    return float(str(estimate.record["rate_hz"]))
-
-
-def _overdispersion(estimate: Estimate) -> float:
-    if estimate.covariance_method == "information":
-        return 1.0
-    return max(float(str(estimate.information.get("robust_over_information_sd", 1.0))) ** 2, 1.0)
-
-
 def _size(plant: LinearModel, estimate: Estimate, name: str) -> float:
     value = estimate.values[name]
     return max(abs(value), plant.references(estimate.values).get(name, 0.0)) or 1.0
@@ -363,61 +339,8 @@ def _size(plant: LinearModel, estimate: Estimate, name: str) -> float:
 def _scales(plant: LinearModel, estimate: Estimate) -> Scales:
     """Scales from the innovations; an input is measured by what moves an output by about its innovation in a sample."""
     outputs = np.sqrt(np.diag(estimate.noise.innovation_covariance))
-    rate = _rate(estimate)
+    rate = rate_of(estimate)
     scales = scales_for(plant, estimate.values, np.ones(len(plant.inputs)), outputs, rate)
     discrete, _ = discretise(plant.matrices(estimate.values), 1.0 / rate)
     reach = np.abs(discrete.C @ discrete.B) + np.abs(discrete.C @ discrete.A @ discrete.B)
     return replace(scales, input=1.0 / np.max(reach / outputs[:, None], axis=0))
-
-
-def _noise(plant: SensorGains, estimate: Estimate, scales: Scales) -> _NoiseNumbers:
-    found = estimate.noise
-    gain = found.gain * scales.output / scales.state[:, None]
-    if found.form == "gain":
-        entries = gain.ravel()
-        return _NoiseNumbers(form="gain", numbers=entries, sd=_GAIN_SD * (np.abs(entries) + 0.1), gain=gain)
-    A, C, E = _discrete(plant, estimate, scales)
-    longest = max(MEMORY_S * _rate(estimate), _LEAST_MEMORY)
-    if found.form == "levels":
-        sensor = np.array([found.sensor_sd[o] for o in plant.outputs]) / scales.output
-        held = np.array([found.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
-        with np.errstate(divide="ignore"):
-            numbers = np.log(np.concatenate([held, sensor[1:]]) / sensor[0])
-        if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
-            sd = np.full(numbers.size, _LOG_LEVEL_SD * np.sqrt(_overdispersion(estimate)))
-            return _NoiseNumbers(form="levels", numbers=numbers, sd=sd, gain=gain)
-    nothing = np.zeros(0)
-    return _NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest))
-
-
-def _discrete(plant: SensorGains, estimate: Estimate, scales: Scales) -> tuple[Array, Array, Array]:
-    """A, C and E of the sampled plant in scaled units."""
-    at, _ = discretise(plant.matrices(estimate.values), 1.0 / _rate(estimate))
-    state = scales.state
-    return (
-        at.A * state / state[:, None],
-        at.C * state / scales.output[:, None],
-        at.E * scales.disturbance / state[:, None],
-    )
-
-
-def _memory(F: Array) -> float:
-    """Memory of a predictor in samples."""
-    radius = float(np.abs(np.linalg.eigvals(F)).max())
-    return np.inf if radius >= 1.0 else 1.0 / (1.0 - radius)
-
-
-def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
-    """Gain of a predictor that forgets soon enough: disturbances are taken a little larger than they are.
-
-    An estimate without disturbances remembers its initial state for ever. The larger variance of the innovations that
-    this costs is about the number of states over the memory in samples.
-    """
-    for level in 10.0 ** np.arange(-4.0, 2.1, 0.25):
-        try:
-            gain = predictor_gain(A, C, level**2 * E @ E.T, np.eye(C.shape[0])).K
-        except np.linalg.LinAlgError:
-            continue
-        if _memory(A - gain @ C) <= longest:
-            return gain
-    raise EstimationError("no predictor of this estimate forgets its start. Give a model whose states the outputs show")
