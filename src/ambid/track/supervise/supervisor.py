@@ -16,6 +16,7 @@ from ambid.track.evidence import Evidence
 from ambid.track.lines import Event, State, TrackedValue
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
+from ambid.track.supervise.comparison import Accepted
 from ambid.track.supervise.diagnosis import LONGEST_S, Diagnosis
 from ambid.track.supervise.excitation import ExcitationMonitor
 from ambid.track.supervise.gate import Gate
@@ -84,6 +85,9 @@ class Supervisor:
         self.publication = Publication(rpem, self.operator, self.log, t0)
         self.diagnosis = Diagnosis(rpem, self.publication, self.log, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
         self._silent = False
+        self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
+        self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
+        self._parameters: dict[str, TrackedValue] = {}
 
     @property
     def gate(self) -> Gate:
@@ -113,12 +117,17 @@ class Supervisor:
         beyond = self.level.above and self.level.error > self.level.limit * self.diagnosis.noise**0.5
         if self.diagnosis.doubted or beyond:
             return "changed"
-        return "frozen" if self._silent or not any(self._excitation.fresh.values()) else "tracking"
+        return "frozen" if self._silent or not any(self._fresh.values()) else "tracking"
 
     @property
     def parameters(self) -> dict[str, TrackedValue]:
         """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
-        return published(self.rpem.numbers, self.publication.accepted, "parameter", self._fresh())
+        shown = (self.publication.accepted, self._fresh, self._trusted())
+        if self._shown is None or any(a is not b for a, b in zip(self._shown, shown, strict=True)):
+            accepted, fresh, trusted = self._shown = shown
+            now = {name: one and trusted for name, one in fresh.items()}
+            self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
+        return dict(self._parameters)
 
     @property
     def extra(self) -> dict[str, TrackedValue]:
@@ -127,10 +136,6 @@ class Supervisor:
 
     def _trusted(self) -> bool:
         return not (self._silent or self.diagnosis.doubted)
-
-    def _fresh(self) -> dict[str, bool]:
-        trusted = self._trusted()
-        return {name: fresh and trusted for name, fresh in self._excitation.fresh.items()}
 
     def feed(self, samples: Samples, first: int, *, restart: bool = False) -> Array:
         """Take in consecutive samples.
@@ -263,5 +268,6 @@ class Supervisor:
     def _activate(self) -> None:
         """Let the recursion move what the data inform."""
         names, active = self.rpem.numbers.names, self.rpem.filter.active
-        for name, fresh in self._excitation.fresh.items():
+        self._fresh = dict(self._excitation.fresh)
+        for name, fresh in self._fresh.items():
             active[names.index(name)] = fresh
