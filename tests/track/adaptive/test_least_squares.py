@@ -236,3 +236,23 @@ def test_silence_winds_up_to_a_limit_without_a_prior_too() -> None:
     best = np.diag(rls.P).mean()
     rls.update(np.zeros((100_000, 4)), np.zeros(100_000))
     assert 1e10 * best < np.diag(rls.P).mean() < 1e13 * best
+
+
+def test_a_stuck_signal_makes_no_coefficient_surer_under_directional_forgetting() -> None:
+    rng = np.random.default_rng(0)
+    phi = np.column_stack([rng.normal(size=(12_000, 4)), np.ones(12_000)])
+    truth = np.array([1.0, -2.0, 0.5, 3.0, 2.0])
+    y = phi @ truth + 0.1 * rng.normal(size=12_000)
+    rls = RecursiveLeastSquares(5, forgetting="directional", memory=500)
+    rls.update(phi[:10_000], y[:10_000])
+    sd, noise = np.sqrt(np.diag(rls.covariance)), rls.noise_variance
+    stuck = np.tile(phi[10_000], (300_000, 1))
+    rls.update(stuck, stuck @ rls.estimate)
+    assert rls.noise_variance < 1e-6 * noise  # the calm itself is told as it is
+    assert (np.sqrt(np.diag(rls.covariance))[:4] > 0.7 * sd[:4]).all()
+    assert np.linalg.eigvalsh(rls.covariance)[0] > 0
+    rls.reset()
+    assert (np.diag(rls.covariance) > sd**2).all()
+    rls.update(phi[10_000:], y[10_000:])
+    assert rls.noise_variance > 0.2 * noise
+    assert (np.abs(rls.estimate - truth) < 5 * sd).all()

@@ -36,49 +36,41 @@ Array = NDArray[np.float64]
     SMALL,
     LIMITED,  # samples whose step was limited
     VAGUE,  # 1: no prior was given; the limit is counted from the best variances so far
-) = range(18)
+    SETTLED,  # weight of the noise variance from which it is the unit of the covariance; infinite where it is known
+    UNIT,  # variance in which C is counted; 0: that of the moment
+) = range(20)
 HEAD = 24
 
 LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
 
-_HUGE, _WORSE = 1e200, 1e9  # a sample that leads there is rejected; variance over the best one, in place of a prior
+# A sample that leads there is rejected; variance over the best one, in place of a prior; least noise over the unit.
+_HUGE, _WORSE, _SILENT = 1e200, 1e9, 1e-12
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _views(s: Array, p: int) -> tuple[Array, Array, Array, Array, Array]:
     """Return estimate, D, V (flat), E, W (flat)."""
     a, q = HEAD + p, p * p
-    return (
-        s[HEAD:a],
-        s[a : a + p],
-        s[a + p : a + p + q],
-        s[a + p + q : a + 2 * p + q],
-        s[a + 2 * p + q : a + 2 * (p + q)],
-    )
+    b = a + p + q
+    return s[HEAD:a], s[a : a + p], s[a + p : b], s[b : b + p], s[b + p : b + p + q]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _rest(s: Array, p: int) -> tuple[Array, Array, Array, Array, Array]:
     """Return variances of the walk, prior variances and three vectors to work with."""
-    a = HEAD + p + 4 * (p + p * p)
-    return (
-        s[a : a + p],
-        s[a + p : a + 2 * p],
-        s[a + 2 * p : a + 3 * p],
-        s[a + 3 * p : a + 4 * p],
-        s[a + 4 * p : a + 5 * p],
-    )
+    rest = s[HEAD + p + 4 * (p + p * p) :].reshape(5, p)
+    return rest[0], rest[1], rest[2], rest[3], rest[4]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _down(p: int, D: Array, V: Array, phi: Array, f: Array, k: Array) -> float:
-    """P - P φ φᵀ P / α, α = 1 + φᵀ P φ; leaves P φ in k and returns α (Bierman 1977, p. 100)."""
+def _down(p: int, D: Array, V: Array, phi: Array, f: Array, k: Array, r: float) -> float:
+    """P - P φ φᵀ P / α, α = r + φᵀ P φ; leaves P φ in k and returns α (Bierman 1977, p. 100)."""
     for j in range(p):
         x = phi[j]
         for i in range(j):
             x += V[j * p + i] * phi[i]
         f[j] = x
-    alpha = 1.0
+    alpha = r
     for j in range(p):
         before = alpha
         v = D[j] * f[j]
@@ -150,7 +142,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
         for j in range(p):
             D[j] *= grow
             E[j] *= shrink
-        alpha = _down(p, D, V, row, f, k)
+        alpha = _down(p, D, V, row, f, k, 1.0)
         gain = e / alpha
         for j in range(p):
             theta[j] += k[j] * gain
@@ -215,22 +207,17 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
         th0, th1, th2, th3 = th0 + k0 * gain, th1 + k1 * gain, th2 + k2 * gain, th3 + v3 * gain
         q = x3 / g3
         a3 = 1.0 + q * x3
-        r3 = 1.0 / a3
-        g3 *= a3
-        q *= r3
-        x0, x1, x2 = x0 - x3 * w30, x1 - x3 * w31, x2 - x3 * w32
+        r3, g3 = 1.0 / a3, g3 * a3
+        q, x0, x1, x2 = q * r3, x0 - x3 * w30, x1 - x3 * w31, x2 - x3 * w32
         w30, w31, w32 = w30 + q * x0, w31 + q * x1, w32 + q * x2
         q = x2 / g2
         a2 = a3 + q * x2
-        r2 = 1.0 / a2
-        g2 *= a2 * r3
-        q *= r2
-        x0, x1 = x0 - x2 * w20, x1 - x2 * w21
+        r2, g2 = 1.0 / a2, g2 * a2 * r3
+        q, x0, x1 = q * r2, x0 - x2 * w20, x1 - x2 * w21
         w20, w21 = w20 + q * x0, w21 + q * x1
         q = x1 / g1
         a1 = a2 + q * x1
-        r1 = 1.0 / a1
-        g1 *= a1 * r2
+        r1, g1 = 1.0 / a1, g1 * a1 * r2
         x0 -= x1 * w10
         w10 += q * r1 * x0
         g0 *= (a1 + x0 / g0 * x0) * r1
@@ -247,17 +234,23 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _joseph(p: int, E: Array, W: Array, K: Array, phi: Array, f: Array, k: Array) -> float:
-    """C becomes (I - K φᵀ) C (I - K φᵀ)ᵀ + K Kᵀ for any gain: the best gain's, and a square of what K differs from it.
+def _joseph(p: int, E: Array, W: Array, K: Array, phi: Array, f: Array, k: Array, r: float) -> float:
+    """C becomes (I - Kφᵀ) C (I - Kφᵀ)ᵀ + r K Kᵀ for any gain: the best gain's, and a square of what K differs from it.
 
     Returns φᵀCφ of before; K is used up.
     """
-    alpha = _down(p, E, W, phi, f, k)
+    alpha = _down(p, E, W, phi, f, k, r)
     root = np.sqrt(alpha)
     for j in range(p):
         K[j] = root * K[j] - k[j] / root
     _up(p, E, W, K)
-    return alpha - 1.0
+    return alpha - r
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _noise_of_now(s: Array) -> float:
+    """Return the noise variance over the unit of C: a calm later on makes old samples no better."""
+    return max(s[NOISE_SUM] / s[NOISE_WEIGHT] / s[UNIT], _SILENT) if s[UNIT] > 0 else 1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -283,12 +276,16 @@ def _filtered(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until:
                 a[:] = 0.0
                 a[i] = np.sqrt(walk[i])
                 _up(p, D, V, a)
-        alpha = _down(p, D, V, row, f, k)
+        alpha = _down(p, D, V, row, f, k, 1.0)
         for j in range(p):
             a[j] = k[j] / alpha
             theta[j] += a[j] * e
-        spread = _joseph(p, E, W, a, row, f, k) if directional else alpha - 1.0
+        spread = alpha - 1.0  # not less than what C says, but where the noise has just fallen
+        if directional:
+            spread = min(spread, _quadratic(p, E, W, row) / _noise_of_now(s))
         _add_noise(s, e, spread, alpha - 1.0)
+        if directional:
+            _joseph(p, E, W, a, row, f, k, _noise_of_now(s))
         s[USED] += 1.0
         out[t] = e
         t += 1
@@ -298,8 +295,7 @@ def _filtered(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _widen_along(p: int, D: Array, V: Array, phi: Array, grow: float, a: Array) -> None:
     """P + (1/λ - 1) φ φᵀ / (φᵀ P⁻¹ φ): only the part of the information that φ meets is forgotten (Cao-Schwartz)."""
-    for j in range(p):
-        a[j] = phi[j]
+    a[:] = phi
     met = 0.0
     for j in range(p - 1, -1, -1):
         met += a[j] / D[j] * a[j]
@@ -318,6 +314,9 @@ def _govern(s: Array, p: int) -> None:
     a, q = HEAD + p, 2 * (p + p * p)
     if s[RESET_EVERY] > 0 and s[USED] > 0 and s[USED] % s[RESET_EVERY] == 0:
         s[a : a + q] = s[a + q : a + 2 * q]
+        s[UNIT] *= max(1.0, _noise_of_now(s))
+    if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
+        s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
     _, D, V, _, _ = _views(s, p)
     _, prior, _, _, _ = _rest(s, p)
     size = 0.0
@@ -389,7 +388,7 @@ def gradient(s: Array, phi: Array, y: Array, out: Array) -> None:
         for j in range(p):
             a[j] = step * row[j]
             theta[j] += a[j] * e
-        spread = _joseph(p, E, W, a, row, f, k)
+        spread = _joseph(p, E, W, a, row, f, k, 1.0)
         leverage = step * power
         if leverage > 0.0:
             if s[TYPICAL] == 0.0:

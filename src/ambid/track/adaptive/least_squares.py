@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 Forgetting = Literal["none", "exponential", "directional"]
 
 _NOISE_MEMORIES = 10  # memory of the noise variance, in memories of the estimate
+_SETTLES = 0.25  # of the memory of the noise variance, after which it is good enough to be the unit of the covariance
 _LOOKS = 32  # most samples between two looks at the limit
 
 
@@ -42,7 +43,8 @@ class RecursiveLeastSquares(Factored):
       (wind-up) until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far
       that it stays there: coefficients that are still excited are tracked more slowly meanwhile.
     - ``"directional"``: only the part of the information that the present regressor meets is forgotten: without
-      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`.
+      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`. The covariance takes
+      every sample with the σ² of its own time, once σ² is known (after a memory): a calm makes nothing surer.
 
     The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
     regressors: σ²C with the error's own recursion C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ. With forgetting it is less than
@@ -127,9 +129,9 @@ class RecursiveLeastSquares(Factored):
         s[at.LIMIT], s[at.VAGUE] = positive("limit", limit), float(prior is None)
         s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
         s[at.TYPICAL] = 0.1 * p
-        s[at.NOISE_RATE] = 1.0 / (
-            _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)
-        )
+        settle = _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)
+        s[at.NOISE_RATE] = 1.0 / settle
+        s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], _SETTLES * settle)
         steps = numbers("walk", 0.0 if walk is None else walk, p)
         if (steps < 0).any():
             raise EstimationError(f"walk is {walk!r}; variances are not negative")
@@ -147,7 +149,7 @@ class RecursiveLeastSquares(Factored):
         """A copy of the covariance of the estimate's error, shape (p, p)."""
         s, at = self._s, self._at
         if s[at.KIND] == at.DIRECTIONAL:
-            return self.noise_variance * product(*self._factors(1))
+            return float(s[at.UNIT] or self.noise_variance) * product(*self._factors(1))
         if s[at.FACTOR] == 1.0:
             return self.noise_variance * self.P
         E, W = self._factors(1)
@@ -191,8 +193,10 @@ class RecursiveLeastSquares(Factored):
         return slice(first, first + 2 * (p + p * p))
 
     def _begin(self) -> None:
-        p, start = len(self._names), self._at_start()
-        self._s[self._at.HEAD + p : start.start] = self._s[start]
+        s, at, start = self._s, self._at, self._at_start()
+        s[at.HEAD + len(self._names) : start.start] = s[start]
+        if s[at.UNIT]:
+            s[at.UNIT] = max(s[at.UNIT], self.noise_variance)
 
 
 def _factor(forgetting: Forgetting | None, factor: float | None, memory: float | None) -> float:
