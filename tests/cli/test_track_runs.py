@@ -72,6 +72,7 @@ def test_the_track_of_a_change_obeys_the_contract(here, ambid):
     assert {"samples", "seconds_of_record", "computing_s", "updates", "rejected_samples", "changes"} <= summary.keys()
     assert (summary["samples"], summary["rejected_samples"]) == (24_000, 0)
     assert summary["seconds_of_record"] == pytest.approx(1.2)
+    assert summary["update_s"] > 0.0
     (in_summary,) = summary["changes"]
     assert (in_summary["parameter"], in_summary["t"]) == ("k_i", pytest.approx(change["t"]))
 

@@ -58,6 +58,7 @@ def test_nothing_is_told_where_nothing_changes(name):
     record, truth = scenario(name, 2.5)
     found = track(record)
     assert kinds(found) == []
+    assert found.summary.update_s == 0.0
     assert {line.state for line in found.lines} == {"tracking"}
     assert far(found, truth) == {}
 

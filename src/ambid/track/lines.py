@@ -157,6 +157,8 @@ class TrackSummary:
     latency : Latency or None
     complete : bool
         False where the run was stopped, or its file ends before the summary.
+    update_s : float
+        Computing time of the slowest search for a new value after a change, s; 0 where there was none.
     """
 
     samples: int
@@ -168,6 +170,7 @@ class TrackSummary:
     counts: Mapping[str, int]
     latency: Latency | None = None
     complete: bool = True
+    update_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -125,6 +125,7 @@ def summary_json(summary: TrackSummary) -> dict[str, Any]:
             if latency is None
             else {name: _number(getattr(latency, name)) for name in waits}
             | {"overruns": int(latency.overruns), "late": int(latency.late)},
+            "update_s": _number(summary.update_s),
             "complete": summary.complete,
         }
     }

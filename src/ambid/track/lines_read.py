@@ -156,6 +156,7 @@ def _summary(s: Mapping[str, Any]) -> TrackSummary:
         samples=int(s["samples"]),
         seconds_of_record=_float(s["seconds_of_record"]),
         computing_s=_float(s["computing_s"]),
+        update_s=_float(s.get("update_s", 0.0)),
         updates=int(s["updates"]),
         rejected_samples=int(s["rejected_samples"]),
         changes=tuple(_event({"kind": "change", "why": "", **e}) for e in s["changes"]),

@@ -198,6 +198,7 @@ class Reporter:
             counts=s.log.counts,
             latency=latency,
             complete=complete,
+            update_s=s.update_s,
         )
 
 
