@@ -225,6 +225,30 @@ def test_no_excitation_no_wind_up() -> None:
     assert np.all(np.abs(r.estimate - [-1.5, 0.7, 1.0, 0.5, 0.5, 0.3]) < 5 * r.sd)
 
 
+@pytest.mark.parametrize("forgetting", [0.995, 0.97, 0.8, Forgetting(final=0.99, first=0.7)])
+def test_a_short_memory_winds_up_to_the_limit_and_not_beyond(forgetting: Forgetting | float) -> None:
+    r = RecursivePolynomial.from_fit(fit_of("arx"), forgetting=forgetting)
+    r.update(*signals("arx")(2000, 2))
+    largest = 0.0
+    for _ in range(3000):  # the input stands still, so its coefficients are not seen
+        r.update(2.0, 20.0)
+        state = r._state
+        assert state is not None
+        U = np.triu(state.UD.T, 1) + np.eye(5)
+        variance = max(r.noise_variance, 0.09) * np.diag(U * np.diag(state.UD) @ U.T)
+        largest = max(largest, float(np.max(variance / state.limit)))
+    assert largest <= 1.0 + 1e-9
+    assert r.n_held > 0
+
+
+def test_a_memory_too_short_for_a_gradient_is_told() -> None:
+    short = RecursivePolynomial.from_fit(fit_of("bj"), forgetting=0.99)
+    assert any("short for 7 coefficients" in w and "160" in w for w in short.warnings)
+    assert any("short for" in w for w in RecursivePolynomial("bj", ORDERS["bj"], forgetting=0.99).warnings)
+    assert not any("short" in w for w in RecursivePolynomial.from_fit(fit_of("bj"), forgetting=0.994).warnings)
+    assert not any("short" in w for w in RecursivePolynomial.from_fit(fit_of("arx"), forgetting=0.9).warnings)
+
+
 @pytest.mark.slow
 def test_ten_million_updates_keep_the_covariance_positive_definite() -> None:
     r, (u, y) = RecursivePolynomial.from_fit(fit_of("armax"), forgetting=0.9995), signals("armax")(500_000, 6)

@@ -23,7 +23,7 @@ _FIRST = 2  # free coefficient
 _RADIUS = 0.99999  # roots of C and F stay inside
 _RUNG_OUT = 0.01  # of what was unknown at a new beginning: what is left then counts for nothing
 _LONGEST_RING = 5000  # a root at the border would never let it
-_EVERY = 64  # samples between looks at the growth of the covariance
+_EVERY = 64  # most samples between looks at the growth of the covariance; not more than half the memory
 
 
 @njit(cache=True, nogil=True)
@@ -195,11 +195,14 @@ def _learn(
     e = s[meta[_E], t]
     for j in range(theta.size):
         e -= psi[j] * (theta[j] - coef[_FIRST + j])
-    if count[_LEARNT] % _EVERY == 0 and real[_FINAL] < 1.0:
+    forget = keep = real[_FORGET]
+    lost = 1.0 - min(forget, real[_FINAL])
+    every = _EVERY if lost * _EVERY <= 0.5 else max(1, int(0.5 / lost))
+    if count[_LEARNT] % every == 0 and real[_FINAL] < 1.0:
         # not less than at the start: a signal that stands still has no noise, and its P would grow without end
         variance = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE])
-        count[_HOLD] = int(_grown(UD, limit, variance))
-    forget = keep = real[_FORGET]
+        # as large as it may be at the next look
+        count[_HOLD] = int(_grown(UD, limit, variance * (1.0 - lost) ** -every))
     if count[_HOLD]:
         forget = 1.0
         count[_HELD] += 1

@@ -58,7 +58,8 @@ class RecursivePolynomial:
     n_inputs : int or None, optional
         One, or none for a time series, unless said otherwise.
     forgetting : Forgetting or float, optional
-        A number is `Forgetting.final`.
+        A number is `Forgetting.final`. `warnings` tells of a memory below 20 samples for each coefficient where there
+        is C, D or F.
     burn_in : int or None, optional
         Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
         the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
@@ -228,7 +229,13 @@ class RecursivePolynomial:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return warnings_of(self._who, self._state, open_loop=self._open_loop, doubtful=self._doubtful)
+        return warnings_of(
+            self._who,
+            self._state,
+            open_loop=self._open_loop,
+            doubtful=self._doubtful,
+            memory=self._forgetting.memory,
+        )
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.

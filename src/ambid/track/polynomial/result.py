@@ -16,6 +16,7 @@ from ambid.track.polynomial.state import State, covariance_of, noise_variance_of
 Array = NDArray[np.float64]
 
 _WORSE = 1.5  # growth, or fall to one over it, of the innovations' standard deviation that is told
+_FEW = 20  # samples of memory for each coefficient, below which gradients of C, D and F mislead
 _INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
 
 
@@ -59,7 +60,9 @@ def offsets_of(model: PolynomialModel, state: State) -> Offsets:
     return Offsets(u=centre[1:], y=centre[:1])
 
 
-def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful: bool) -> tuple[str, ...]:
+def warnings_of(
+    who: Identity, state: State | None, *, open_loop: bool, doubtful: bool, memory: float
+) -> tuple[str, ...]:
     """Return what a reader of the estimate has to know.
 
     Parameters
@@ -71,6 +74,8 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful
         Whether the user says that no feedback is at work.
     doubtful : bool
         Whether the fit with which it began did not converge.
+    memory : float
+        Of the coefficients, samples.
 
     Returns
     -------
@@ -83,6 +88,13 @@ def warnings_of(who: Identity, state: State | None, *, open_loop: bool, doubtful
         found.append(
             f"{name}: the search for the first estimate did not converge: standard deviations are not to be trusted. "
             "Lower the orders, or begin with a fit that did"
+        )
+    x, least = who.layout, _FEW * (who.layout.free.size + 1)
+    if memory < least and (x.nc or x.nd or any(x.nf)):
+        found.append(
+            f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
+            "estimate may lock at the border after a standstill, and standard deviations are too small. Remember "
+            f"{least} samples or more, or use arx"
         )
     if structure(name).feedback == "biased" and not open_loop:
         found.append(
