@@ -115,14 +115,15 @@ def test_far_is_what_it_says():
 
 
 def likelihood(J, r, at, q, covariance, variance, noise):
-    """-2 log-likelihood of blocks r + J (q - at) ~ N(0, noise I), q a random walk: by the dense Kalman filter."""
+    """-2 log-likelihood of blocks r + J (q - at) ~ N(0, noise I), q a random walk, and what is known after the last."""
     total = 0.0
     for one, left, point in zip(J, r, at, strict=True):
         rho, V = left + one @ (q - point), noise * np.eye(q.size) + one @ covariance @ one.T
         K = covariance @ one.T @ np.linalg.inv(V)
         total += rho @ np.linalg.solve(V, rho) + np.linalg.slogdet(V)[1]
-        q, covariance = q - K @ rho, covariance - K @ one @ covariance + np.diag(variance)
-    return total
+        q, known = q - K @ rho, covariance - K @ one @ covariance
+        covariance = known + np.diag(variance)
+    return total, q, known
 
 
 @pytest.mark.parametrize("first", [0, 5])
@@ -133,7 +134,7 @@ def test_walk_score_is_the_slope_of_the_exact_likelihood(first):
     r, at = rng.normal(size=(count, p)), rng.normal(size=(count, p))
     q, covariance, variance = rng.normal(size=p), spd(rng, p), rng.uniform(0.05, 0.5, p)
     ring = np.roll(np.arange(count), -first)
-    squares, powers = kernels.walk_score(
+    squares, powers, end, known = kernels.walk_score(
         J,
         r,
         at,
@@ -149,6 +150,9 @@ def test_walk_score_is_the_slope_of_the_exact_likelihood(first):
     slope = np.empty(p)
     for j in range(p):
         h = 1e-5 * np.eye(p)[j]
-        up, down = (likelihood(J[ring], r[ring], at[ring], q, covariance, variance + s * h, noise) for s in (1, -1))
+        up, down = (likelihood(J[ring], r[ring], at[ring], q, covariance, variance + s * h, noise)[0] for s in (1, -1))
         slope[j] = (up - down) / 2e-5
     np.testing.assert_allclose(powers - squares, slope, rtol=1e-6, atol=1e-7)
+    _, q_end, covariance_end = likelihood(J[ring], r[ring], at[ring], q, covariance, variance, noise)
+    np.testing.assert_allclose(end, q_end, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(known, covariance_end, rtol=1e-8, atol=1e-10)

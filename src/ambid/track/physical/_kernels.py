@@ -323,8 +323,10 @@ def gather(R: Array, w: Array, J: Array, r: Array, at: Array, point: Array) -> N
 def walk_score(
     J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float,
     K: Array, errors: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return sums of lambda_j^2 and N_jj over a ring of `count` blocks: their difference is twice the score.
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Return sums of lambda_j^2 and N_jj over a ring of `count` blocks, and estimate and covariance after the last.
+
+    The difference of the sums is twice the score.
 
     Kalman filter forward over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from
     one block to the next; then the disturbance smoother backward (Koopman and Shephard 1992; Durbin and Koopman 2012,
@@ -353,8 +355,9 @@ def walk_score(
                 q[a] -= w * v
                 for c in range(p):
                     P[a, c] -= w * g[c]
-        for a in range(p):
-            P[a, a] += step[a] * step[a]
+        if b < count - 1:
+            for a in range(p):
+                P[a, a] += step[a] * step[a]
     lam, N, drop = np.zeros(p), np.zeros((p, p)), np.zeros(p)
     squares, powers = np.zeros(p), np.zeros(p)
     for b in range(count - 1, -1, -1):
@@ -387,4 +390,4 @@ def walk_score(
                 w = drop[a]
                 for c in range(i, p):
                     N[a, c] -= w * z[c]
-    return squares, powers
+    return squares, powers, q, P

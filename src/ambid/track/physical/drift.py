@@ -23,10 +23,12 @@ _WINDOW = 400  # chunks
 _FEWEST = 20  # chunks before the first adaptation
 _EVERY = 5  # chunks between looks at the recent past
 _SELDOM = 20  # chunks between looks at the whole window
-_SURE = 9.0  # ratio in the recent past that chance hardly makes: three standard deviations
+_SURE = 6.0  # ratio in the recent past that chance seldom makes; what follows from a false one is a wider interval
 _RECENT = (20, 60)  # chunks that alone may show that something has begun to drift
 _POWER = 0.5
 _SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a variance
+_ROUNDS = 5  # of raising a variance at one look
+_NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
 
 
 class DriftRates:
@@ -69,16 +71,14 @@ class DriftRates:
         self._parts = self._count = self._next = self._since = self._looks = 0
         self._score, self._gather = walk_score, gather
 
-    def add(self, evidence: Evidence, before: ParameterFilter, noise: float) -> None:
-        """Take in a block, and adapt the variances now and then.
+    def add(self, evidence: Evidence, before: ParameterFilter) -> None:
+        """Take in a block.
 
         Parameters
         ----------
         evidence : Evidence
         before : ParameterFilter
             The numbers as they were known before this block.
-        noise : float
-            Variance of the evidence's residual.
         """
         if not self.adapts:
             return
@@ -95,9 +95,20 @@ class DriftRates:
         self._next = (self._next + 1) % _WINDOW
         self._count = min(self._count + 1, _WINDOW)
         self._since += 1
-        if self._count >= _FEWEST and self._since >= _EVERY:
+
+    def adapt(self, known: ParameterFilter, noise: float) -> None:
+        """Look at the window where a look is due; where something walks faster than thought, filter its end anew.
+
+        Parameters
+        ----------
+        known : ParameterFilter
+            The numbers as they are known after the last block of `add`; may be set anew.
+        noise : float
+            Variance of the evidence's residual.
+        """
+        if self._parts == 0 and self._count >= _FEWEST and self._since >= _EVERY:
             self._since = 0
-            self._adapt(before.active, noise)
+            self._adapt(known, noise)
 
     def restart(self) -> None:
         """Forget the window: a jump in it would pass for drift."""
@@ -124,25 +135,44 @@ class DriftRates:
         self.__dict__.update(state)
         self._score, self._gather = walk_score, gather
 
-    def _adapt(self, active: NDArray[np.bool_], noise: float) -> None:
-        ratio = np.ones(self.variance.size)
+    def _adapt(self, known: ParameterFilter, noise: float) -> None:
+        active, before = known.active, self.variance
         if self._looks % (_SELDOM // _EVERY) == 0:
-            ratio = self._ratio(self._count, active, noise)
+            self._raise(self._ratio(self._count, active, noise))
         self._looks += 1
         for length in _RECENT:
-            if length < self._count:
-                recent = self._ratio(length, active, noise)
-                ratio = np.where(recent > _SURE, np.maximum(recent, ratio), ratio)
+            for _ in range(_ROUNDS):
+                recent = self._ratio(min(length, self._count), active, noise)
+                if not np.any(recent > _SURE):
+                    break
+                self._raise(np.where(recent > _SURE, recent, 1.0))
+        if np.any(self.variance > _NOTICED * before):
+            self._catch_up(known, noise)
+
+    def _raise(self, ratio: Array) -> None:
         factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
         self.variance = np.clip(self.variance * factor, self._floor, self._ceiling)
 
     def _ratio(self, count: int, active: NDArray[np.bool_], noise: float) -> Array:
         """Sum of lambda_j^2 over sum of N_jj in the last `count` chunks: above 1 where number j walks faster."""
+        squares, powers, _, _ = self._run(count, active, noise)
+        told = active & (powers > 0.0)
+        return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
+
+    def _catch_up(self, known: ParameterFilter, noise: float) -> None:
+        """Filter the recent past anew: with the rates as they were, what moved was taken for chance."""
+        _, _, q, P = self._run(min(max(_RECENT), self._count), known.active, noise)
+        held = ~known.active
+        if not (np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0)):
+            return
+        q[held] = known.q[held]
+        known.set(q, P)
+
+    def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
         first = (self._next - count) % _WINDOW
-        squares, powers = self._score(
+        found: tuple[Array, Array, Array, Array] = self._score(
             self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise,
             *self._scratch,
         )  # fmt: skip
-        told = active & (powers > 0.0)
-        return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
+        return found

@@ -32,7 +32,7 @@ UNBALANCE = ("unbalance_cos", "unbalance_sin")
 _WIDE = 0.15  # relative standard deviation above which a first-order step is too long
 _GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
 _OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
-_UNBALANCE_SD = 1e4  # likewise
+_UNBALANCE_SD = 10.0  # forces that would throw the rotor through the noise in one sample
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

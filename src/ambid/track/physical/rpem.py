@@ -29,7 +29,7 @@ Memory = float | Literal["auto", "all"]
 
 BLOCK_S = 0.005  # of one evidence
 _ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at least: the noise shows in what is left
-_START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 10.0, 60.0, 0.02  # memory where it is found from the data
+_START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 2.0, 60.0, 0.02  # memory where it is found from the data
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
 _APPROACH = (1.0, 0.5, 0.25, 0.125)  # parts of the way tried where there is no predictor at its end
@@ -170,8 +170,18 @@ class PhysicalRpem:
         evidence : Evidence
         """
         self.predict()
-        self.drift.add(evidence, self.filter, self.noise)
+        self.absorb(evidence)
+
+    def absorb(self, evidence: Evidence) -> None:
+        """Take in the evidence of a block over which the numbers have already walked.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        self.drift.add(evidence, self.filter)
         self.filter.absorb(evidence, self.noise_of(evidence))
+        self.drift.adapt(self.filter, self.noise)
         self.follow_noise(evidence)
         self.refresh()
 

@@ -211,7 +211,7 @@ class Supervisor:
         rpem = self.rpem
         gap_s = max(first - rpem.stream.sample, 0) / self._rate
         if gap_s > rpem.block_s:
-            rpem.filter.walk(np.sqrt(rpem.drift.variance * gap_s))
+            rpem.filter.walk(rpem.drift.variance, gap_s)
             if gap_s > LONGEST_S:  # whatever happened in it did not happen before it
                 rpem.drift.restart()
                 self.diagnosis.forget(first)
@@ -242,10 +242,7 @@ class Supervisor:
 
     def _absorb(self, evidence: Evidence, t: float) -> None:
         rpem = self.rpem
-        rpem.drift.add(evidence, rpem.filter, rpem.noise)
-        rpem.filter.absorb(evidence, rpem.noise_of(evidence))
-        rpem.follow_noise(evidence)
-        rpem.refresh()
+        rpem.absorb(evidence)
         before = self.publication.accepted
         confirmed = self.publication.judge(evidence, t)
         if confirmed or (self.diagnosis.settling and self.publication.accepted is not before):
