@@ -146,3 +146,33 @@ def test_header_and_summary_hold_what_the_contract_says(signals):
     assert summary.counts == {"rejected": 1}
     assert summary.updates == made.supervisor.updates > 0
     assert len({line.parameters["m"].value for line in lines}) <= summary.updates + 1
+
+
+def test_a_predictor_that_never_settles_is_not_said_to_track(signals):
+    made, lines = reporter()
+    settles = made.supervisor.rpem.stream.settling_samples
+    assert settles > 8
+    u, y = signals
+    for k in range(RATE, RATE + 8_000, settles):  # one sample is lost before each piece
+        made.consume(Samples(u=u[k + 1 : k + settles], y=y[k + 1 : k + settles]), k + 1, restart=True)
+    assert made.samples > 7_000
+    assert all(np.isnan(line.error) for line in lines)
+    late = 2 * RATE
+    made.consume(Samples(u=u[: settles - 1], y=y[: settles - 1]), late, restart=True)
+    made.reject(gap(200, late + settles - 1, "nan"))
+    assert lines[-1].state == "frozen"
+    assert all(v.stale for v in lines[-1].parameters.values())
+    made.consume(Samples(u=u[28_000:], y=y[28_000:]), 3 * RATE, restart=True)
+    assert lines[-1].state == "tracking"
+    assert np.isfinite(lines[-1].error)
+
+
+def test_the_error_is_not_known_while_the_predictor_settles_after_a_long_gap(signals):
+    made, lines = reporter()
+    give(made, signals, RATE, 24_000)
+    assert np.isfinite(lines[-1].error)
+    made.reject(gap(4_000, 24_000))
+    assert np.isnan(lines[-1].error)
+    assert lines[-1].state == "tracking"
+    give(made, signals, 28_000, 30_000, restart=True)
+    assert np.isfinite(lines[-1].error)

@@ -102,7 +102,8 @@ class TrackLine:
         Its end, s of record.
     parameters : Mapping[str, TrackedValue]
     error : float
-        Root mean square of the normalised innovations: 1 where the model predicts as well as when it was identified.
+        Root mean square of the normalised innovations: 1 where the model predicts as well as when it was identified,
+        NaN where no recent data say.
     state : {"tracking", "frozen", "changed", "hold"}
     events : tuple of Event
         In the order in which they happened; the most important first.

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.physical.signals import Samples
 from ambid.track.supervise.supervisor import Supervisor
@@ -67,7 +65,7 @@ class Reporter:
         self._count = int(first / (self.every_s * self._rate))
         self._next = 0
         self._pass_interval()
-        supervisor.diagnosis.restart(first)
+        supervisor.begin(first)
         self._flags = sorted(flags, key=lambda flag: flag[0])
         self._events: list[Event] = []
         self.lines = self.samples = self.rejected = 0
@@ -159,11 +157,10 @@ class Reporter:
         self._obey(self._next)
         s.wait(self._next)
         events, self._events = tuple(self._events), []
-        error = s.level.error
         line = TrackLine(
             t=self._t0 + self._count * self.every_s,
             parameters=s.parameters,
-            error=error if np.isfinite(error) else 1.0,
+            error=s.error,
             state=s.state,
             events=events,
             extra=s.extra,

@@ -28,7 +28,7 @@ from ambid.track.supervise.published import beside, published
 
 Array = NDArray[np.float64]
 
-SILENT_S = 1.0  # without a sample, after which the published numbers are stale
+SILENT_S = 1.0  # without evidence, after which the published numbers are stale
 _RELEASE = 0.8  # part of the limit under which the error has to fall to be acceptable again
 _LEVEL_S = 0.1  # over which the error is taken
 
@@ -84,7 +84,7 @@ class Supervisor:
         self.log = DecisionLog(listener=listener)
         self.publication = Publication(rpem, self.operator, self.log, t0)
         self.diagnosis = Diagnosis(rpem, self.publication, self.log, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
-        self._silent = False
+        self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
         self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
         self._parameters: dict[str, TrackedValue] = {}
@@ -134,6 +134,22 @@ class Supervisor:
         """Published numbers beside the parameters: gains of sensors once they are found to have changed, unbalance."""
         return beside(self.rpem.numbers, self.publication.accepted, self.rpem.filter.active, stale=not self._trusted())
 
+    @property
+    def error(self) -> float:
+        """Model error, 1 as at identification; NaN where no block says anything of the present."""
+        return self.level.error if self._deaf_s <= max(_LEVEL_S, 2.0 * self.rpem.block_s) else float("nan")
+
+    def begin(self, first: int) -> None:
+        """Say where the stream begins, before anything of it comes.
+
+        Parameters
+        ----------
+        first : int
+            Number of the first sample.
+        """
+        self._heard = first
+        self.diagnosis.restart(first)
+
     def _trusted(self) -> bool:
         return not (self._silent or self.diagnosis.doubted)
 
@@ -177,20 +193,25 @@ class Supervisor:
         return np.asarray(errors * self.rpem.numbers.problem.scales.output)
 
     def wait(self, sample: int) -> None:
-        """Let time pass without samples: they are missing, or were rejected.
+        """Let time pass: without samples, or with samples on which the predictor only settles.
 
         Parameters
         ----------
         sample : int
-            Number of the sample up to which nothing came.
+            Number of the sample up to which nothing more comes now.
         """
-        missing = sample - self.rpem.stream.sample
-        if missing <= 0:
+        missing = sample > self.rpem.stream.sample
+        self._deaf_s = (sample - self._heard) / self._rate
+        if not missing and self._deaf_s <= self.rpem.block_s:
             return
         t = self._t0 + sample / self._rate
-        if not self._silent and missing >= SILENT_S * self._rate:
+        if not self._silent and self._deaf_s >= SILENT_S:
             self._silent = True
-            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {SILENT_S:g} s"))
+            settling_s = self.rpem.stream.settling_samples / self._rate
+            why = (
+                f"the predictor has not settled for {SILENT_S:g} s: after each interruption it needs {settling_s:.3g} s"
+            )
+            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {SILENT_S:g} s" if missing else why))
         self._obey(t)
 
     def order(self, flag: str) -> None:
@@ -215,16 +236,16 @@ class Supervisor:
             if gap_s > LONGEST_S:  # whatever happened in it did not happen before it
                 rpem.drift.restart()
                 self.diagnosis.forget(first)
-        if self._silent:
-            self._silent = False
-            self.log.add(
-                Event(kind="thawed", t=self._t0 + first / self._rate, why=f"samples again after {gap_s:.3g} s")
-            )
         self.diagnosis.restart(first)
 
     def _take(self, evidence: Evidence) -> None:
         """Judge a block, use it, and judge what came of it."""
         rpem, t = self.rpem, self._t0 + evidence.last / self._rate
+        if self._silent:
+            self._silent = False
+            without_s = (evidence.first - self._heard) / self._rate
+            self.log.add(Event(kind="thawed", t=t, why=f"the data speak again after {without_s:.3g} s"))
+        self._heard, self._deaf_s = evidence.last, 0.0
         events = self._excitation.update(evidence, t)
         for event in events:
             self.log.add(event)
