@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -223,6 +225,36 @@ def test_no_excitation_no_wind_up() -> None:
     assert r.n_held > 100_000
     r.update(u, y)
     assert np.all(np.abs(r.estimate - [-1.5, 0.7, 1.0, 0.5, 0.5, 0.3]) < 5 * r.sd)
+
+
+def test_a_stalled_start_says_so_in_its_deviations_until_a_later_search_converges() -> None:
+    system = System(
+        structure="bj",
+        orders={"nb": 2, "nc": 1, "nd": 1, "nf": 2, "nk": 1},
+        B=(0, 1.0, 0.5),
+        C=(1, -0.995),  # a long memory: short windows do not show it
+        D=(1, -0.6),
+        F=(1, -1.5, 0.7),
+    )
+    truth, stalled = np.array([1.0, 0.5, -0.995, -0.6, -1.5, 0.7]), 0
+    for seed in (0, 7, 9, 14):
+        data = system.data(seed, 6000)
+        r = RecursivePolynomial("bj", system.orders, dt=1e-3, burn_in=150)
+        for k in range(0, 6000, 1000):
+            r.update(data.u[k : k + 1000], data.y[k : k + 1000, 0])
+            doubtful = any("did not converge" in w for w in r.warnings)
+            if r.started:
+                assert r.fit().status == ("stalled" if doubtful else "converged")
+                np.testing.assert_allclose(r.fit().sd[r.fit().sd > 0], r.sd)
+                assert np.all(np.abs(r.estimate - truth) < 4.5 * r.sd)
+            if r.started and doubtful:
+                assert np.all(r.sd > 0.5 * np.abs(truth))
+                stalled += 1
+        assert not doubtful
+        assert r.n_used == 6000
+    assert stalled > 0
+    doubted = RecursivePolynomial.from_fit(replace(fit_of("bj"), status="stalled"))
+    assert np.all(doubted.sd >= 0.99)
 
 
 @pytest.mark.parametrize("forgetting", [0.995, 0.97, 0.8, Forgetting(final=0.99, first=0.7)])

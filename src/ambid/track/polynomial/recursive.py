@@ -8,6 +8,7 @@ counts once.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -46,6 +47,9 @@ class RecursivePolynomial:
     A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
     learnt until the unknown states of the filters have died away (`n_waited`).
 
+    Where no search of the largest first window converged, `fit` says "stalled" and standard deviations are as large as
+    the coefficients, until one of a later window does.
+
     Parameters
     ----------
     structure : str
@@ -58,8 +62,7 @@ class RecursivePolynomial:
     n_inputs : int or None, optional
         One, or none for a time series, unless said otherwise.
     forgetting : Forgetting or float, optional
-        A number is `Forgetting.final`. `warnings` tells of a memory below 20 samples for each coefficient where there
-        is C, D or F.
+        A number is `Forgetting.final`. Below 20 samples for each coefficient `warnings` tells of C, D and F.
     burn_in : int or None, optional
         Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
         the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
@@ -158,10 +161,11 @@ class RecursivePolynomial:
         self._doubtful = False
         self._rejected_before = self._used_before = self._failed_starts = 0
 
-    def _begin(self, fit: BlackBoxFit, samples: int | None) -> None:
+    def _begin(self, fit: BlackBoxFit, samples: int | None) -> State:
         self._start, self._doubtful = fit.model.theta, fit.status != "converged"
         state = state_from_fit(fit, self._who.layout, self._forgetting, samples=samples)
         self._state, self._arrays = state, state.arrays()
+        return state
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -176,9 +180,10 @@ class RecursivePolynomial:
 
     @property
     def covariance(self) -> Array:
-        """Of the error of `estimate`, shape (p, p); huge until the first window is full."""
+        """Of the error of `estimate`, shape (p, p); huge until the first window is full, large where it stalled."""
         n = len(self._names)
-        return 1e12 * np.eye(n) if self._state is None else covariance_of(self._state)[:n, :n].copy()
+        state = self._state
+        return 1e12 * np.eye(n) if state is None else covariance_of(state, doubtful=self._doubtful)[:n, :n].copy()
 
     @property
     def sd(self) -> Array:
@@ -229,13 +234,7 @@ class RecursivePolynomial:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return warnings_of(
-            self._who,
-            self._state,
-            open_loop=self._open_loop,
-            doubtful=self._doubtful,
-            memory=self._forgetting.memory,
-        )
+        return warnings_of(self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -304,35 +303,35 @@ class RecursivePolynomial:
             if self._state is not None and n:
                 self._run(u[at : at + n], y[at : at + n], errors[at : at + n], True, *self._arrays)
             at += n
-            if gap and self._state is not None:
+            if gap and self._state is not None and not self._doubtful:
                 self._window = None  # the recursion goes on alone
             elif gap:
-                self._used_before += self._window.clear()
-                self._rejected_before += 1
+                n = self._window.clear()
+                if self._state is None:
+                    self._used_before, self._rejected_before = self._used_before + n, self._rejected_before + 1
+                else:
+                    self._run(u[at : at + 1], y[at : at + 1], errors[at : at + 1], True, *self._arrays)
                 at += 1
             elif self._window.filled == self._window.target:
                 self._fit_window(self._window)
         return at
 
     def _fit_window(self, window: Window) -> None:
-        fit = window.fit(self._who, None if self._state is None else self.model.theta)
+        lost, none = self._state is None or self._doubtful, self._state is None
+        fit = window.fit(self._who, None if lost else self.model.theta, stalled=none)
         if fit is not None:
             self._begin_anew(fit, window)
-        elif self._state is None:
-            self._failed_starts += 1
-        grown = window.grow()
-        if self._state is None and not grown:
-            self._used_before += window.drop_half()
-        elif self._state is not None and not (grown and window.target <= self._forgetting.memory):
+        self._failed_starts += fit is None and none
+        grown, none = window.grow(), self._state is None
+        if none or self._doubtful:  # a later window may do better
+            self._used_before += (0 if grown else window.drop_half()) * none
+        elif not (grown and window.target <= self._forgetting.memory):
             self._window = None  # later samples would count more than these
 
     def _begin_anew(self, fit: BlackBoxFit, window: Window) -> None:
         """Go on from an off-line fit of all samples so far."""
         before, n = self._state, window.filled
-        self._begin(fit, n)
-        now = self._state
-        if now is None:
-            return
+        now = self._begin(fit, n)
         self._run(window.u[:n], window.y[:n], np.empty(n), False, *self._arrays)
         now.go_on_counting(before, n)
 
@@ -370,7 +369,8 @@ class RecursivePolynomial:
             raise EstimationError(
                 f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
             )
-        return fit_of(self._who, self.model, self._state, samples=self.n_used, warnings=self.warnings)
+        found = fit_of(self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings)
+        return replace(found, status="stalled") if self._doubtful else found
 
     def __getstate__(self) -> dict[str, object]:
         return {k: v for k, v in self.__dict__.items() if k not in ("_run", "_arrays")}

@@ -11,7 +11,7 @@ from ambid.identify.blackbox.response import Offsets
 from ambid.identify.blackbox.structures import structure
 from ambid.identify.polynomial.orders import shown_orders
 from ambid.track.polynomial.start import Identity
-from ambid.track.polynomial.state import State, covariance_of, noise_variance_of
+from ambid.track.polynomial.state import Forgetting, State, noise_variance_of
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def offsets_of(model: PolynomialModel, state: State) -> Offsets:
 
 
 def warnings_of(
-    who: Identity, state: State | None, *, open_loop: bool, doubtful: bool, memory: float
+    who: Identity, state: State | None, forgetting: Forgetting, *, open_loop: bool, doubtful: bool
 ) -> tuple[str, ...]:
     """Return what a reader of the estimate has to know.
 
@@ -70,12 +70,11 @@ def warnings_of(
     who : Identity
     state : State or None
         None where there is no estimate yet.
+    forgetting : Forgetting
     open_loop : bool
         Whether the user says that no feedback is at work.
     doubtful : bool
         Whether the fit with which it began did not converge.
-    memory : float
-        Of the coefficients, samples.
 
     Returns
     -------
@@ -86,10 +85,12 @@ def warnings_of(
         found.append(f"{name}: the first window is not full: there is no estimate yet")
     if doubtful:
         found.append(
-            f"{name}: the search for the first estimate did not converge: standard deviations are not to be trusted. "
+            f"{name}: the search for the first estimate did not converge: coefficients may be wrong by as much as "
+            "they are large, and standard deviations say so. "
             "Lower the orders, or begin with a fit that did"
         )
     x, least = who.layout, _FEW * (who.layout.free.size + 1)
+    memory = forgetting.memory
     if memory < least and (x.nc or x.nd or any(x.nf)):
         found.append(
             f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
@@ -125,7 +126,13 @@ def warnings_of(
 
 
 def fit_of(
-    who: Identity, model: PolynomialModel, state: State, *, samples: int, warnings: tuple[str, ...]
+    who: Identity,
+    model: PolynomialModel,
+    state: State,
+    spread: Array,
+    *,
+    samples: int,
+    warnings: tuple[str, ...],
 ) -> BlackBoxFit:
     """Return the present estimate as a fit.
 
@@ -134,6 +141,8 @@ def fit_of(
     who : Identity
     model : PolynomialModel
     state : State
+    spread : ndarray, shape (n_free, n_free)
+        Covariance of the free coefficients.
     samples : int
         Taken in so far.
     warnings : tuple of str
@@ -143,7 +152,7 @@ def fit_of(
     BlackBoxFit
     """
     covariance, free = np.zeros((model.theta.size,) * 2), who.layout.free
-    covariance[np.ix_(free, free)] = covariance_of(state)[: free.size, : free.size]
+    covariance[np.ix_(free, free)] = spread
     return BlackBoxFit(
         structure=who.structure,
         orders=shown_orders(who.structure, who.layout),

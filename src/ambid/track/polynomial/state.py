@@ -248,17 +248,25 @@ def upper_root(P: Array) -> Array:
     return np.asarray(size[:, None] * G)
 
 
-def covariance_of(state: State) -> Array:
+def covariance_of(state: State, *, doubtful: bool = False) -> Array:
     """Return the covariance of the coefficients, symmetric and positive definite by construction.
 
     Parameters
     ----------
     state : State
+    doubtful : bool, optional
+        The recursion began where a search had stalled: no coefficient is known better than to its size.
 
     Returns
     -------
     ndarray, shape (n, n)
     """
+    P = _of_error(state)
+    return P + np.diag(np.where(np.isfinite(state.limit), state.limit, 0.0)) if doubtful else P
+
+
+def _of_error(state: State) -> Array:
+    """Return the covariance of the error of a recursion that began near enough to the truth."""
     UD = state.UD
     d = np.diag(UD)
     G = np.triu(UD.T, 1) + np.eye(d.size)

@@ -112,7 +112,7 @@ class Window:
         self.filled = keep
         return n
 
-    def fit(self, who: Identity, near: Array | None) -> BlackBoxFit | None:
+    def fit(self, who: Identity, near: Array | None, *, stalled: bool) -> BlackBoxFit | None:
         """Return the off-line fit of the window.
 
         Parameters
@@ -120,6 +120,8 @@ class Window:
         who : Identity
         near : ndarray, shape (n_theta,), or None
             Coefficients to begin with; None: the search finds its own start.
+        stalled : bool
+            Whether a search that did not converge will do, where the window is at its largest.
 
         Returns
         -------
@@ -142,7 +144,7 @@ class Window:
                 found = _fit_near(who, data, near)
         except EstimationError:
             return None
-        last_resort = near is None and self.filled == self.y.size
+        last_resort = stalled and self.filled == self.y.size
         usable = found.status == "converged" or last_resort
         return found if usable and float(found.noise_covariance[0, 0]) > 0.0 else None
 
