@@ -256,3 +256,9 @@ def test_a_stuck_signal_makes_no_coefficient_surer_under_directional_forgetting(
     rls.update(phi[10_000:], y[10_000:])
     assert rls.noise_variance > 0.2 * noise
     assert (np.abs(rls.estimate - truth) < 5 * sd).all()
+
+
+def test_the_limit_is_one_of_forgetting_and_a_walk_goes_on_unseen() -> None:
+    rls = RecursiveLeastSquares(2, prior=1.0, walk=[0.01, 0.0], limit=2.0, noise_sd=1.0)
+    rls.update(np.zeros((10_000, 2)), np.zeros(10_000))
+    np.testing.assert_allclose(np.diag(rls.covariance), [101.0, 1.0], rtol=1e-9)

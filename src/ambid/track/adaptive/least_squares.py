@@ -57,6 +57,7 @@ class RecursiveLeastSquares(Factored):
 
     Numbers: factors U and D > 0 are updated without subtraction of D, so that P stays positive definite whatever is
     rounded; forgetting divides D and damps old rounding errors; the limit bounds P from above, the data from below.
+    With `walk` nothing bounds P from above: unseen coefficients walk on, by n `walk` in n samples, and P says so.
 
     Parameters
     ----------
@@ -74,7 +75,8 @@ class RecursiveLeastSquares(Factored):
     memory : float, optional
         The same as a time constant in samples, 1 / (1 - factor).
     limit : float
-        Largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
+        Of forgetting: largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
+        Without effect where nothing is forgotten, so also with `walk`.
     reset_every : int, optional
         P and C are set back to the prior after so many samples, the estimate kept.
     walk : array_like, shape () or (p,), optional
