@@ -88,4 +88,27 @@ def test_a_track_of_strange_samples_is_json_without_nan(ambid, bench, start, rec
 
     lines = (bench / "track.jsonl").read_text(encoding="utf-8").splitlines()
     last = [json.loads(line, parse_constant=never) for line in lines][-1]
-    assert last["summary"]["rejected_samples"] == 100
+    assert last["summary"]["rejected_samples"] == 120
+
+
+def test_a_closed_output_ends_as_a_pipe_that_nobody_reads(bench, start, monkeypatch):
+    from ambid.cli import BROKEN_PIPE, run
+
+    monkeypatch.setattr("sys.stdout", None)
+    assert run(["track", "record.csv", *start, "--json", "track.jsonl"]) == BROKEN_PIPE
+    assert '"summary"' in (bench / "track.jsonl").read_text(encoding="utf-8").splitlines()[-1]
+    monkeypatch.setattr("sys.stdout", None)
+    assert run(["--version"]) == BROKEN_PIPE
+
+
+def test_an_edited_start_and_a_record_without_a_sound_row_are_refused(ambid, bench, start, record_text):
+    known = json.loads((bench / "start.json").read_text(encoding="utf-8"))
+    (bench / "e0.json").write_text(json.dumps({**known, "operating_point": None}), encoding="utf-8")
+    refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e0.json"), "operating_point")
+    known["parameters"]["m"]["value"] = 1e9
+    (bench / "e1.json").write_text(json.dumps(known), encoding="utf-8")
+    refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e1.json"), "to settle")
+    values = columns(record_text)
+    values[:, 1:] = np.nan
+    (bench / "nan.csv").write_text(with_columns(values), encoding="utf-8")
+    refused(ambid("track", "nan.csv", "--rig", "rig.toml"), "finite")

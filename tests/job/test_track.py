@@ -258,3 +258,62 @@ def test_a_change_is_followed_at_any_limit_and_interval():
         assert isinstance(record, Record)
         assert far(found, {**TRUE, "k_i": 0.85 * TRUE["k_i"]}) == {}
         assert found.header.every_s == every_s
+
+
+SETTINGS = [
+    {"every_s": float("nan")}, {"every_s": float("inf")}, {"every_s": 0.0}, {"every_s": -1.0},
+    {"limit": float("inf")}, {"limit": float("nan")}, {"limit": 0.0}, {"memory": "x"}, {"memory": float("nan")},
+    {"memory": 1e300}, {"memory": 0.0}, {"pace": "x"}, {"flags": [(float("nan"), "hold")]},
+    {"flags": [(0.1, "holt")]}, {"flags": [("x", "hold")]}, {"flags": "hold"}, {"start_s": 0.1}, {"rate_hz": 100.0},
+    {"rig": 3}, {"start": 3}, {"from_s": "x"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", SETTINGS, ids=str)
+def test_settings_that_make_no_sense_are_refused_on_one_line(steady, wrong):
+    with pytest.raises(AmbidError) as refused:
+        track(steady[0], **{"start": start(2), **wrong})
+    assert "\n" not in str(refused.value)
+    assert next(iter(wrong)).removesuffix("s") in str(refused.value)
+
+
+def ruled(role, value, sd=None, name="R"):
+    rig = default_rig()
+    said = tuple(replace(p, role=role, value=value, sd=sd) if p.name == name else p for p in rig.parameters)
+    return replace(rig, parameters=said)
+
+
+def test_a_rig_that_contradicts_the_start_is_refused_or_warned_of(steady):
+    record, known = steady[0], start(2)
+    brief = {"start": known, "to_s": 0.3}
+    with pytest.raises(AmbidError, match="the rig fixes R at"):
+        track(record, ruled("fixed", 3.0 * known.values["R"]), **brief)
+    with pytest.raises(AmbidError, match="prior of R"):
+        track(record, ruled("prior", 3.0 * known.values["R"], 0.01 * known.values["R"]), **brief)
+    rig = default_rig()
+    late = replace(rig, channels=tuple(replace(c, delay=7) if c.role == "voltage" else c for c in rig.channels))
+    with pytest.raises(AmbidError, match=r"voltage\.delay = 7"):
+        track(record, late, **brief)
+    mild = track(record, ruled("prior", known.values["R"], 0.1 * known.values["R"]), **brief)
+    assert any("R prior" in w for w in mild.header.warnings)
+    assert track(record, **brief).header.warnings == track(record, rig, **brief).header.warnings == known.warnings
+
+
+def test_what_the_start_failed_is_passed_on(steady):
+    coarse = [
+        replace(c, values=np.round(c.values / 4.0) * 4.0) if c.name == "voltage" else c for c in steady[0].channels
+    ]
+    found = track(replace(steady[0], channels=tuple(coarse)), to_s=2.0)
+    assert found.header.warnings
+
+
+def test_an_incredible_value_is_rejected_not_learned(steady):
+    wild = []
+    for c in steady[0].channels:
+        values = c.values.copy()
+        if c.name == "current":
+            values[6000:6020] = 1e10
+        wild.append(replace(c, values=values))
+    found = track(replace(steady[0], channels=tuple(wild)), start=start(2), to_s=0.6)
+    assert found.summary.rejected_samples == 20
+    assert kinds(found) == ["rejected"]

@@ -66,6 +66,7 @@ TROUBLES = {
     "error": (1.6, "tracking", (), ("1.6 at the end, beyond the limit 1.5",)),
     "unknown error": (math.nan, "tracking", (), ("not known",)),
     "open change": (1.0, "tracking", ("k_i", None), ("of k_i at 3 s was not answered", "the change at 3 s")),
+    "contradicted": (1.0, "changed", (), ("contradict",)),
     "held": (1.0, "hold", (), ()),
 }
 
@@ -87,3 +88,12 @@ def test_numbers_that_are_not_known_are_not_invented():
     assert change_words(TrackedValue(value=-1.1, sd=0.1), TrackedValue(value=-1.0, sd=0.1)) == "+10.00 %"
     assert speed_words(100, 1.0, math.nan) == ""
     assert speed_words(2_400_000, 120.0, 2.0) == "1.2 million samples/s, 60 times real time"
+
+
+def test_warnings_of_the_start_are_printed_and_are_a_trouble(track):
+    head = replace(track.header, warnings=("the residuals are not white", "two fits disagree"))
+    troubles = troubles_of(head, track.lines[-1], ())
+    assert any("2 warnings" in t for t in troubles)
+    text = track_text(head, track.lines[-1], track.summary, troubles=troubles)
+    assert "warning: the residuals are not white" in text
+    assert "warning: two fits disagree" in text

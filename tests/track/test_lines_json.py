@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -207,3 +208,13 @@ def test_the_header_names_units_and_start():
     found = header_json(header(names=("R",)))
     assert found["units"] == {"R": "ohm"}
     assert found["start"]["R"]["value"] == 1.6
+
+
+def test_warnings_of_the_start_come_back_and_a_header_without_them_is_read(tmp_path):
+    head = replace(track_of(seconds=1.0).header, warnings=("the residuals are not white",))
+    document = header_json(head)
+    (tmp_path / "t.jsonl").write_text(json.dumps(document) + "\n", encoding="utf-8")
+    assert read_track(tmp_path / "t.jsonl").header == head
+    del document["warnings"]
+    (tmp_path / "t.jsonl").write_text(json.dumps(document) + "\n", encoding="utf-8")
+    assert read_track(tmp_path / "t.jsonl").header.warnings == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 import warnings
@@ -47,6 +48,8 @@ def run(arguments: Sequence[str]) -> int:
     int
         The exit code.
     """
+    if sys.stdout is None:  # it was closed before the program began
+        sys.stdout = _Nobody()
     words, trace = [w for w in arguments if w != "--traceback"], "--traceback" in arguments
     try:
         from ambid.cli.app import run_verb
@@ -59,7 +62,8 @@ def run(arguments: Sequence[str]) -> int:
         return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
     except BrokenPipeError:
         # The interpreter flushes standard output once more when it ends: give it somewhere to go.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(sys.stdout, _Nobody):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Exception as error:
         from ambid.cli.app import refusal
@@ -78,6 +82,15 @@ def run(arguments: Sequence[str]) -> int:
         where = f"{type(error).__name__}: {' '.join(str(error).split())}"
         advice = "" if trace else ". Run with --traceback, and report it"
         return _refused(f"a defect of ambid: {where}{advice}", 1, trace=trace)
+
+
+class _Nobody(io.TextIOBase):
+    """A standard output that nobody reads, as a pipe whose reader has gone."""
+
+    def write(self, text: str) -> int:
+        if text:
+            raise BrokenPipeError
+        return 0
 
 
 def _refused(line: str, code: int, *, trace: bool) -> int:

@@ -78,6 +78,11 @@ class BenchRows:
         """
         numbers = self.replay.numbers
         sound = np.asarray(np.isfinite(self.replay.values).all(axis=1))
+        if not sound.any():
+            raise RecordError(
+                "no row of the record holds a finite value in every channel that is tracked; tracking has to start from"
+                " a clean part. Check the columns, or give an estimate"
+            )
         joined = np.concatenate([[False], sound[1:] & sound[:-1] & (np.diff(numbers) == 1)])
         begins = np.flatnonzero(sound & ~joined)
         ends = np.append(begins[1:], numbers.size)
@@ -99,7 +104,7 @@ class BenchRows:
 
 
 def rows_of(
-    record: Record | str | Path, rig: Rig, *, from_s: float | None, to_s: float | None, rate_hz: float | None
+    record: Record | str | Path, known: Rig | None, *, from_s: float | None, to_s: float | None, rate_hz: float | None
 ) -> BenchRows:
     """Read the rows of a record through a rig.
 
@@ -107,7 +112,8 @@ def rows_of(
     ----------
     record : Record, str or Path
         A file, or a record whose channels are named by role.
-    rig : Rig
+    known : Rig or None
+        None: columns named like the roles, those of a turning rotor with them.
     from_s, to_s : float or None
         Part to use, s of record; override the rig's.
     rate_hz : float or None
@@ -121,12 +127,13 @@ def rows_of(
     AmbidError
         If the file or its columns break a rule.
     """
+    rig = default_rig() if known is None else known
     if isinstance(record, Record) or not str(record).lower().endswith(_ROWS):
         bench, stamps = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz), None
     else:
         rows = read_rows(record, rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz)
         bench, stamps = _part(
-            bench_record(rows.record, _with_rotation(rig, rows.record)),
+            bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig),
             rows.time_s,
             rig.record.from_s if from_s is None else from_s,
             rig.record.to_s if to_s is None else to_s,
@@ -140,9 +147,7 @@ def rows_of(
 
 
 def _with_rotation(rig: Rig, record: Record) -> Rig:
-    """Where nothing is known of the bench, columns named speed and angle, in these units, are what they say."""
-    if rig != default_rig(rig.model):
-        return rig
+    """Columns named speed and angle, in these units, are what they say."""
     turning = tuple(
         RigChannel(role=role, column=role)
         for role in ("speed", "angle")

@@ -16,13 +16,12 @@ from ambid.identify.estimate import Estimate
 from ambid.identify.threads import one_thread
 from ambid.job._progress import Tick, silent
 from ambid.job.bench_rows import BenchRows, rows_of
-from ambid.job.estimates import read_estimate
-from ambid.job.physical import identify
+from ambid.job.track_settings import check_settings
+from ambid.job.track_start import check_settling, credible_limits, start_of
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig, default_rig, load_rig
 from ambid.track.lines import Track, TrackHeader, TrackLine
-from ambid.track.physical.numbers import tracked_numbers
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.physical.synchronous import Forcing
@@ -30,13 +29,12 @@ from ambid.track.reporter import Reporter, header
 from ambid.track.stream.engine import run
 from ambid.track.stream.guard import StreamGuard
 from ambid.track.stream.outcome import Stretch
+from ambid.track.stream.rows import ABSURD
 from ambid.track.supervise.supervisor import Supervisor
 from ambid.track.supervise.warm_up import warm_up
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Pace = Literal["fastest", "real-time"]
-
-_START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
 
 
 def track(
@@ -102,20 +100,26 @@ def track(
     ------
     AmbidError
         If record, rig or start break a rule.
+    EstimationError
+        If a setting makes no sense, or the start cannot be tracked from.
     """
+    check_settings(
+        record, start=start, start_s=start_s, every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags,
+        rate_hz=rate_hz, from_s=from_s, to_s=to_s,
+    )  # fmt: skip
     say = tick or silent
-    bench_rig = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
-    source = rows_of(record, bench_rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz)
+    if not (rig is None or isinstance(rig, (Rig, str, Path))):
+        raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
+    told = rig if rig is None or isinstance(rig, Rig) else load_rig(rig)
+    bench_rig = told or default_rig()
+    source = rows_of(record, told, from_s=from_s, to_s=to_s, rate_hz=rate_hz)
     say("start")
-    estimate, first = _start(source, bench_rig, start, start_s)
+    begin = start_of(source, bench_rig, given=start, start_s=start_s, rig_speaks=told is not None)
     say("track")
-    forcing = source.forcing
-    numbers = tracked_numbers(
-        estimate, synchronous=forcing is not None, top_speed=1.0 if forcing is None else forcing.top_speed
-    )
-    supervisor = Supervisor(
-        PhysicalRpem(numbers, memory=memory), limit=limit, t0=source.t0, listener=lambda event: reporter.note(event)
-    )
+    numbers, first, forcing = begin.numbers, begin.first, source.forcing
+    rpem = PhysicalRpem(numbers, memory=memory)
+    check_settling(rpem, source, first)
+    supervisor = Supervisor(rpem, limit=limit, t0=source.t0, listener=lambda event: reporter.note(event))
     lines: list[TrackLine] = []
 
     def emit(line: TrackLine) -> Sequence[Flag] | None:
@@ -128,6 +132,7 @@ def track(
     top = header(
         supervisor, limit=limit, every_s=reporter.every_s, method=f"rpem, memory {memory}",
         record={**source.origin, "samples": int(np.count_nonzero(source.replay.numbers >= first))},
+        warnings=begin.warnings,
     )  # fmt: skip
     if on_header is not None:
         on_header(top)
@@ -137,7 +142,7 @@ def track(
             source.replay.since(first),
             lambda stretch: reporter.consume(_samples(stretch, n_u, forcing), stretch.first, restart=stretch.restart),
             reporter.reject,
-            guard=_guard(source, n_u),
+            guard=_guard(source, begin.estimate),
             pace=pace,
             producer="process" if pace == "real-time" else "none",
             block_samples=source.replay.block_samples,
@@ -147,11 +152,17 @@ def track(
     return Track(header=top, lines=tuple(lines), summary=summary)
 
 
-def _guard(source: BenchRows, n_u: int) -> StreamGuard:
+def _guard(source: BenchRows, estimate: Estimate) -> StreamGuard:
     """A guard that watches outputs for freezing, but no input and no forcing: these may rest."""
-    n, n_f = source.replay.values.shape[1], 0 if source.forcing is None else 2
-    outputs: list[int | Literal["auto"] | None] = ["auto" for _ in range(n - n_u - n_f)]
-    return StreamGuard(source.replay.rate_hz, n, stuck=[*[None] * n_u, *outputs, *[None] * n_f])
+    plant, n_f = model(estimate.model), 0 if source.forcing is None else 2
+    n_u, n_y = len(plant.inputs), len(plant.outputs)
+    outputs: list[int | Literal["auto"] | None] = ["auto"] * n_y
+    return StreamGuard(
+        source.replay.rate_hz,
+        n_u + n_y + n_f,
+        limits=credible_limits(source, estimate) + [ABSURD] * n_f,
+        stuck=[*[None] * n_u, *outputs, *[None] * n_f],
+    )
 
 
 def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:
@@ -163,38 +174,3 @@ def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:
         y=np.ascontiguousarray(y),
         forcing=None if forcing is None else np.ascontiguousarray(extra),
     )
-
-
-def _start(
-    source: BenchRows, rig: Rig, start: Estimate | str | Path | None, start_s: float | None
-) -> tuple[Estimate, int]:
-    """The estimate to begin with, and the number of the first sample that is tracked."""
-    rate = source.replay.rate_hz
-    if start is not None:
-        estimate = start if isinstance(start, Estimate) else _read_start(start)
-        known = float(str(estimate.record["rate_hz"]))
-        if estimate.model != rig.model or abs(known / rate - 1.0) > 1e-6:
-            raise EstimationError(
-                f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at"
-                f" {rate:g} Hz; they have to agree. Identify a start from this bench at this rate"
-            )
-        return estimate, 0
-    length = source.duration_s
-    wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if start_s is None else start_s
-    n = round(wanted * rate)
-    if not 0 < n < length * rate:
-        raise EstimationError(
-            f"a start of {wanted:g} s leaves nothing of {length:g} s to track. Give a shorter one, or an estimate"
-        )
-    part, first = source.clean_part(n, begin_anywhere=start_s is None)
-    return identify(part, rig), first
-
-
-def _read_start(path: str | Path) -> Estimate:
-    found = read_estimate(path)
-    if not isinstance(found, Estimate):
-        raise EstimationError(
-            f"{path} holds a black-box fit; tracking starts from physical parameters. Give what 'ambid identify --json'"
-            " wrote"
-        )
-    return found

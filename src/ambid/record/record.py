@@ -56,6 +56,11 @@ class Channel:
     source_unit: str = ""
 
     def __post_init__(self) -> None:
+        if np.iscomplexobj(self.values):
+            raise RecordError(
+                f"channel {self.name!r} holds complex numbers; a measured channel is real. Pass real part and imaginary"
+                " part as two channels"
+            )
         values = np.ascontiguousarray(self.values, dtype=np.float64)
         if values.ndim != 1:
             raise RecordError(

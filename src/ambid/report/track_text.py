@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 
 from ambid.report.numbers import quantity, sized
-from ambid.report.text import WIDTH, Paint, columns, plain
+from ambid.report.text import WIDTH, Paint, columns, plain, warning_lines
 from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.lines_json import NORMAL_95
 
@@ -54,6 +54,7 @@ def track_text(
         state_lines(header, last, troubles, width=width, paint=paint),
         event_lines(told, width=width, paint=paint),
         closing_lines(summary, paint),
+        warning_lines(header.warnings, width=width, paint=paint),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
@@ -191,10 +192,15 @@ def troubles_of(header: TrackHeader, last: TrackLine, open_changes: Sequence[Eve
         found.append(f"the change {who}at {e.t:.4g} s was not answered by new values that passed their validation")
     if last.state == "frozen":
         found.append("the record ends without information: parameters are frozen, and older than its end")
+    if last.state == "changed" and not open_changes:
+        found.append("the record ends while the data contradict the published values")
     if last.error > header.limit:
         found.append(f"the model error is {last.error:.3g} at the end, beyond the limit {header.limit:g}")
     elif math.isnan(last.error):
         found.append("the model error at the end is not known")
+    if header.warnings:
+        n = _counted(len(header.warnings), "warning")
+        found.append(f"the start is to be mistrusted: {n}, see below")
     return tuple(found)
 
 

@@ -80,6 +80,8 @@ class TrackHeader:
         Parameters with which tracking began.
     record : Mapping[str, object]
         ``file``, ``sha256``, ``samples``.
+    warnings : tuple of str
+        What to mistrust of the start, one line each: checks that failed, parameters hardly known.
     """
 
     rate_hz: float
@@ -90,6 +92,7 @@ class TrackHeader:
     every_s: float
     start: Mapping[str, TrackedValue]
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -46,6 +46,7 @@ def header_json(header: TrackHeader) -> dict[str, Any]:
         "units": dict(header.units),
         "start": {name: _value(v) for name, v in header.start.items()},
         "record": dict(header.record),
+        "warnings": list(header.warnings),
     }
 
 

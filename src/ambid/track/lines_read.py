@@ -128,6 +128,7 @@ def _header(document: Mapping[str, Any]) -> TrackHeader:
         every_s=_float(document["every_s"]),
         start=start,
         record=dict(document.get("record", {})),
+        warnings=tuple(str(w) for w in document.get("warnings", ())),
     )
 
 

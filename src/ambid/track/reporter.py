@@ -200,7 +200,13 @@ class Reporter:
 
 
 def header(
-    supervisor: Supervisor, *, limit: float, every_s: float, method: str, record: Mapping[str, object]
+    supervisor: Supervisor,
+    *,
+    limit: float,
+    every_s: float,
+    method: str,
+    record: Mapping[str, object],
+    warnings: Sequence[str] = (),
 ) -> TrackHeader:
     """Return the first line of a track.
 
@@ -212,6 +218,8 @@ def header(
     every_s : float
     method : str
     record : Mapping[str, object]
+    warnings : sequence of str
+        What to mistrust of the start.
 
     Returns
     -------
@@ -230,4 +238,5 @@ def header(
         every_s=every_s,
         start=start,
         record=record,
+        warnings=tuple(warnings),
     )

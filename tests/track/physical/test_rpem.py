@@ -10,6 +10,7 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.job.physical import identify
 from ambid.physics.presets import preset
+from ambid.record import Channel, Record
 from ambid.rig import default_rig
 from ambid.simulate import simulate_scenario
 from ambid.track.physical.numbers import tracked_numbers
@@ -150,3 +151,22 @@ def test_unbalance_is_found_through_a_spin_up():
     assert sd < 0.02 * amplitude
     values = np.array([preset(BEARING).parameters[k] for k in r.names])
     assert np.all(np.abs(r.estimate - values) < 4.0 * np.sqrt(np.diag(r.covariance)))
+
+
+def turning(speed_unit=1.0, angle_sign=1.0, lost=()):
+    t = np.arange(20_000) / 10_000.0
+    speed, angle = 300.0 * t, 150.0 * t**2
+    columns = {"speed": speed * speed_unit, "angle": np.mod(angle_sign * np.round(angle / 0.1) * 0.1, 2.0 * np.pi)}
+    kept = np.setdiff1d(np.arange(t.size), lost)
+    channels = tuple(
+        Channel(name=n, unit={"speed": "rad/s", "angle": "rad"}[n], values=v[kept]) for n, v in columns.items()
+    )
+    return Record(channels=channels, rate_hz=10_000.0)
+
+
+def test_a_speed_that_is_not_the_derivative_of_its_angle_is_refused():
+    assert forcing_of(turning()).top_speed == pytest.approx(600.0, rel=1e-3)
+    assert forcing_of(turning(lost=np.arange(4_000, 4_300))) is not None
+    for wrong in (turning(speed_unit=2.0 * np.pi / 60.0), turning(speed_unit=9.55), turning(angle_sign=-1.0)):
+        with pytest.raises(EstimationError, match="times the speed"):
+            forcing_of(wrong)

@@ -17,6 +17,9 @@ from ambid.record import Record
 
 Array = NDArray[np.float64]
 
+_PARTS, _PART_RAD = 25, 10.0  # parts of a record in which speed and angle are compared, each at least so long
+_AGREE = 0.05  # relative difference of speed and turning that sensors make
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Forcing:
@@ -51,7 +54,7 @@ def forcing_of(record: Record) -> Forcing | None:
     Raises
     ------
     EstimationError
-        If the speed passes half the sampling rate, where an angle says nothing of it.
+        If the speed passes half the sampling rate, where an angle says nothing of it, or contradicts the angle.
     """
     if "angle" not in record.names and "speed" not in record.names:
         return None
@@ -70,6 +73,8 @@ def forcing_of(record: Record) -> Forcing | None:
             f"the speed reaches {top:.4g} rad/s, more than half a turn a sample at {record.rate_hz:g} Hz."
             " Check its unit"
         )
+    if "speed" in record.names and "angle" in record.names:
+        _check_agreement(speed, angle, period)
     middle = angle + 0.5 * period * speed
     size = (speed / top) ** 2
     return Forcing(columns=np.column_stack([size * np.cos(middle), size * np.sin(middle)]), top_speed=top)
@@ -79,6 +84,27 @@ def _integrated(speed: Array, period: float) -> Array:
     """Angle from the speed by the trapezium rule, 0 at the first sample."""
     known = np.nan_to_num(speed)  # after a gap the phase is lost; the recursion finds it anew
     return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * period)])
+
+
+def _check_agreement(speed: Array, angle: Array, period: float) -> None:
+    """Refuse a speed that is not the derivative of the angle; a unit that is wrong is off by a factor."""
+    expected = 0.5 * (speed[1:] + speed[:-1]) * period
+    turned = np.mod(np.diff(angle) + np.pi, 2.0 * np.pi) - np.pi  # an angle may be wrapped
+    known = np.isfinite(expected) & np.isfinite(turned)
+    expected, turned = expected[known], turned[known]
+    way = np.cumsum(np.abs(expected))
+    parts = 0 if way.size == 0 else min(_PARTS, int(way[-1] / _PART_RAD))
+    if parts == 0:
+        return
+    ends = np.searchsorted(way, way[-1] * np.arange(1, parts) / parts)
+    begins = np.concatenate([[0], ends])
+    along = np.add.reduceat(turned * np.sign(expected), begins)
+    ratio = float(np.median(along / np.add.reduceat(np.abs(expected), begins)))  # gaps spoil few of the parts
+    if abs(ratio - 1.0) > _AGREE:
+        raise EstimationError(
+            f"the angle turns at {ratio:.4g} times the speed; they have to agree within {_AGREE:.0%}. Check the units"
+            " of both (rpm or rad/s, deg or rad) and their signs, or leave one of them out"
+        )
 
 
 def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, float, float, float]:

@@ -1,0 +1,258 @@
+"""Where tracking begins: an estimate that was given, or one identified from the beginning of the record."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Estimate
+from ambid.job.bench_rows import BenchRows
+from ambid.job.estimates import read_estimate
+from ambid.job.physical import identify
+from ambid.physics.models import model
+from ambid.physics.parameters import Parameter
+from ambid.rig import Rig
+from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.physical.rpem import PhysicalRpem
+from ambid.track.stream.rows import ABSURD
+
+_START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
+_SETTLED_S, _SETTLED_PART = 5.0, 1 / 3  # longest time, and part of the record, until a predictor has settled
+_CREDIBLE, _SPREADS = 1e3, 4.0  # times an output's range at identification; standard deviations in that range
+_INPUT_CREDIBLE, _MOST_OF = 1e6, 0.99  # times what most of an input stays under
+_LEAST = 1e-9  # part of an output that is not predicted
+_SAME = 1e-6  # relative difference of values that were written and read
+_FAR = 4.0  # standard deviations between a prior and a start that contradicts it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Start:
+    """Where tracking begins.
+
+    Attributes
+    ----------
+    estimate : Estimate
+    numbers : TrackedNumbers
+    first : int
+        Number of the first sample that is tracked.
+    warnings : tuple of str
+        What to mistrust, one line each.
+    """
+
+    estimate: Estimate
+    numbers: TrackedNumbers
+    first: int
+    warnings: tuple[str, ...]
+
+
+def start_of(
+    source: BenchRows,
+    rig: Rig,
+    *,
+    given: Estimate | str | Path | None,
+    start_s: float | None,
+    rig_speaks: bool,
+) -> Start:
+    """Take the estimate to begin with, or make one.
+
+    Parameters
+    ----------
+    source : BenchRows
+    rig : Rig
+    given : Estimate, str, Path or None
+        An estimate or its file; None: identify the beginning of the record.
+    start_s : float or None
+        Length of that beginning, s.
+    rig_speaks : bool
+        Whether the rig was given too: what it says of parameters and delay is compared with the estimate.
+
+    Returns
+    -------
+    Start
+
+    Raises
+    ------
+    AmbidError
+        If nothing can be identified from the beginning of the record.
+    EstimationError
+        If the estimate does not fit record or rig, or cannot be tracked from.
+    """
+    warnings: list[str] = []
+    if given is None:
+        estimate, first = _identified(source, rig, start_s)
+        numbers = _numbers(estimate, source)
+    else:
+        estimate, first = given if isinstance(given, Estimate) else _read(given), 0
+        try:
+            _check_fit(estimate, source, rig)
+            if rig_speaks:
+                warnings += _compared(estimate, rig)
+            numbers = _numbers(estimate, source)
+        except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise EstimationError(
+                f"the start estimate is not whole ({type(error).__name__}: {error}). Write it again with"
+                " 'ambid identify --json'"
+            ) from error
+    failed = [c.detail for c in estimate.checks.values() if not c.passed and c.detail not in estimate.warnings]
+    return Start(
+        estimate=estimate,
+        numbers=numbers,
+        first=first,
+        warnings=(*warnings, *estimate.warnings, *failed, *numbers.warnings),
+    )
+
+
+def check_settling(rpem: PhysicalRpem, source: BenchRows, first: int) -> None:
+    """Refuse a start whose predictor would never say anything of the record.
+
+    Parameters
+    ----------
+    rpem : PhysicalRpem
+    source : BenchRows
+    first : int
+        Number of the first sample that is tracked.
+
+    Raises
+    ------
+    EstimationError
+        If settling takes too long.
+    """
+    rate = rpem.numbers.rate_hz
+    settling_s, left_s = rpem.stream.settling_samples / rate, source.duration_s - first / rate
+    most_s = min(_SETTLED_S, _SETTLED_PART * source.duration_s)
+    if settling_s > most_s:
+        raise EstimationError(
+            f"the predictor of the start needs {settling_s:.3g} s to settle, of {left_s:.3g} s to track; at most"
+            f" {most_s:.3g} s make sense. Check the values of the start, or take a longer record"
+        )
+
+
+def credible_limits(source: BenchRows, estimate: Estimate) -> list[float]:
+    """Say from which magnitude on a value is no measurement any more.
+
+    An output is judged by its spread at identification, an input, of which an estimate keeps no spread, by the record.
+
+    Parameters
+    ----------
+    source : BenchRows
+    estimate : Estimate
+
+    Returns
+    -------
+    list of float
+        For each input, then each output, SI.
+    """
+    plant, point = model(estimate.model), estimate.operating_point
+    found = []
+    for role in plant.inputs:
+        known = np.abs(source.record[role])
+        known = known[np.isfinite(known)]
+        size = float(np.quantile(known, _MOST_OF)) if known.size else 0.0
+        found.append(_INPUT_CREDIBLE * max(size, abs(point[role])) or ABSURD)
+    for role in plant.outputs:
+        fit = estimate.fit[role]
+        spread = fit.innovation_sd / max(1.0 - fit.one_step, _LEAST)
+        found.append(_CREDIBLE * (abs(point[role]) + _SPREADS * spread))
+    return [min(x, ABSURD) if math.isfinite(x) and x > 0.0 else ABSURD for x in found]
+
+
+def _numbers(estimate: Estimate, source: BenchRows) -> TrackedNumbers:
+    forcing = source.forcing
+    return tracked_numbers(
+        estimate, synchronous=forcing is not None, top_speed=1.0 if forcing is None else forcing.top_speed
+    )
+
+
+def _identified(source: BenchRows, rig: Rig, start_s: float | None) -> tuple[Estimate, int]:
+    length, rate = source.duration_s, source.replay.rate_hz
+    wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if start_s is None else start_s
+    n = round(wanted * rate)
+    if not 0 < n < length * rate:
+        raise EstimationError(
+            f"a start of {wanted:g} s leaves nothing of {length:g} s to track. Give a shorter one, or an estimate"
+        )
+    part, first = source.clean_part(n, begin_anywhere=start_s is None)
+    return identify(part, rig), first
+
+
+def _read(path: object) -> Estimate:
+    if not isinstance(path, (str, Path)):
+        raise EstimationError(f"start is a {type(path).__name__}; it must be an Estimate or the path of one. Give one")
+    found = read_estimate(path)
+    if not isinstance(found, Estimate):
+        raise EstimationError(
+            f"{path} holds a black-box fit; tracking starts from physical parameters. Give what 'ambid identify --json'"
+            " wrote"
+        )
+    return found
+
+
+def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
+    """Refuse an estimate of another model or rate, or one without an operating point."""
+    known, rate = float(str(estimate.record["rate_hz"])), source.replay.rate_hz
+    if estimate.model != rig.model or abs(known / rate - 1.0) > 1e-6:
+        raise EstimationError(
+            f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at"
+            f" {rate:g} Hz; they have to agree. Identify a start from this bench at this rate"
+        )
+    plant, point = model(estimate.model), estimate.operating_point
+    for role in (*plant.inputs, *plant.outputs):
+        x = point.get(role) if isinstance(point, Mapping) else None
+        if isinstance(x, bool) or not isinstance(x, (int, float)) or not math.isfinite(x):
+            raise EstimationError(
+                f"the start estimate's operating_point.{role} is {x!r}; it must be a number. Write the estimate again"
+                " with 'ambid identify --json'"
+            )
+
+
+def _compared(estimate: Estimate, rig: Rig) -> list[str]:
+    """Refuse a rig that contradicts the estimate; warn where what it says is not used."""
+    found = [said for p in rig.parameters if (said := _parameter(p, estimate))]
+    for role in model(rig.model).inputs:
+        wanted, known = rig.channel(role).delay, estimate.delay[role]
+        if wanted != "auto" and abs(known.samples + known.fraction - wanted) > _SAME:
+            raise EstimationError(
+                f"the rig gives channels.{role}.delay = {wanted}, the start estimate has"
+                f" {known.samples + known.fraction:.4g} samples; tracking keeps the start's. Identify a start with this"
+                " rig, or leave the delay out of it"
+            )
+        if wanted == "auto" and known.how == "given":
+            found.append(
+                f"the start estimate was made with a given delay of {role}, {known.samples} samples; the rig leaves it"
+                " open, and tracking keeps it. Identify a start with this rig"
+            )
+    return found
+
+
+def _parameter(p: Parameter, estimate: Estimate) -> str | None:
+    """What a rig says of one parameter beside what the estimate knows: refused, warned of, or no contradiction."""
+    e = estimate.parameter(p.name)
+    remedy = "Identify a start with this rig, or let both say the same"
+    if p.role == "fixed" and p.value is not None:
+        if e.role != "fixed" or not np.isclose(e.value, p.value, rtol=_SAME, atol=0.0):
+            raise EstimationError(
+                f"the rig fixes {p.name} at {p.value:g} {p.unit}, the start estimate has it {e.role} at {e.value:.6g}"
+                f" {e.unit}; tracking would follow the start. {remedy}"
+            )
+        return None
+    if e.role == "fixed":
+        return (
+            f"the start estimate holds {p.name} fixed at {e.value:g} {e.unit}, the rig has it {p.role}: it is not"
+            f" tracked. {remedy}"
+        )
+    if p.role == "prior" and p.value is not None and p.sd is not None:
+        apart = abs(e.value - p.value) / math.hypot(p.sd, e.sd)
+        if apart > _FAR:
+            raise EstimationError(
+                f"the rig's prior of {p.name} is {p.value:g} +- {p.sd:g} {p.unit}, the start estimate has"
+                f" {e.value:.6g} +- {e.sd:.2g}, {apart:.3g} standard deviations apart; at most {_FAR:g} are chance."
+                f" {remedy}"
+            )
+    if p.role != e.role:
+        return f"the rig has {p.name} {p.role}, the start estimate {e.role}: tracking follows the start. {remedy}"
+    return None
