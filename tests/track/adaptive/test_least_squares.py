@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.track.adaptive.least_squares import RecursiveLeastSquares
+from ambid.track.adaptive.least_squares import Forgetting, RecursiveLeastSquares
 
 N = 300
 
@@ -238,23 +238,25 @@ def test_silence_winds_up_to_a_limit_without_a_prior_too() -> None:
     assert 1e10 * best < np.diag(rls.P).mean() < 1e13 * best
 
 
-def test_a_stuck_signal_makes_no_coefficient_surer_under_directional_forgetting() -> None:
+@pytest.mark.parametrize("n", [4, 5])  # four have a loop of their own
+@pytest.mark.parametrize("forgetting", ["exponential", "directional"])
+def test_a_stuck_signal_makes_no_coefficient_surer(forgetting: Forgetting, n: int) -> None:
     rng = np.random.default_rng(0)
-    phi = np.column_stack([rng.normal(size=(12_000, 4)), np.ones(12_000)])
-    truth = np.array([1.0, -2.0, 0.5, 3.0, 2.0])
+    phi = np.column_stack([rng.normal(size=(12_000, n - 1)), np.ones(12_000)])
+    truth = np.array([1.0, -2.0, 0.5, 3.0, 2.0])[:n]
     y = phi @ truth + 0.1 * rng.normal(size=12_000)
-    rls = RecursiveLeastSquares(5, forgetting="directional", memory=500)
+    rls = RecursiveLeastSquares(n, forgetting=forgetting, memory=500)
     rls.update(phi[:10_000], y[:10_000])
     sd, noise = np.sqrt(np.diag(rls.covariance)), rls.noise_variance
     stuck = np.tile(phi[10_000], (300_000, 1))
     rls.update(stuck, stuck @ rls.estimate)
-    assert rls.noise_variance < 1e-6 * noise  # the calm itself is told as it is
-    assert (np.sqrt(np.diag(rls.covariance))[:4] > 0.7 * sd[:4]).all()
+    assert rls.noise_variance < 0.1 * noise  # the calm itself is told as it is
+    assert (np.sqrt(np.diag(rls.covariance))[:-1] > 0.65 * sd[:-1]).all()
     assert np.linalg.eigvalsh(rls.covariance)[0] > 0
     rls.reset()
     assert (np.diag(rls.covariance) > sd**2).all()
     rls.update(phi[10_000:], y[10_000:])
-    assert rls.noise_variance > 0.2 * noise
+    assert rls.noise_variance > 0.1 * noise
     assert (np.abs(rls.estimate - truth) < 5 * sd).all()
 
 

@@ -124,16 +124,22 @@ def _add_noise(s: Array, e: float, spread: float, leverage: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _noise_of_now(s: Array) -> float:
+    """Return the noise variance over the unit of C: a calm later on makes old samples no better."""
+    return max(s[NOISE_SUM] / s[NOISE_WEIGHT] / s[UNIT], _SILENT) if s[UNIT] > 0 else 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: float) -> int:
     """Least squares on samples t, ... until so many have been used: P and the information of squared weights."""
     theta, D, V, E, W = _views(s, p)
     _, _, f, k, a = _rest(s, p)
-    grow, shrink = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW]
+    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], _noise_of_now(s)
     while t < y.size and s[USED] < until:
         row, e = phi[t], y[t]
         for j in range(p):
             e -= row[j] * theta[j]
-            a[j] = row[j]
+            a[j] = np.sqrt(now) * row[j]
         if not (_quadratic(p, D, V, row) + e * e < _HUGE):
             out[t] = np.nan
             s[REJECTED] += 1.0
@@ -143,10 +149,9 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
             D[j] *= grow
             E[j] *= shrink
         alpha = _down(p, D, V, row, f, k, 1.0)
-        gain = e / alpha
         for j in range(p):
-            theta[j] += k[j] * gain
-        _add_noise(s, e, _quadratic(p, E, W, k), alpha - 1.0)
+            theta[j] += k[j] * (e / alpha)
+        _add_noise(s, e, min(_quadratic(p, E, W, k) / now, alpha - 1.0), alpha - 1.0)
         _up(p, E, W, a)
         s[USED] += 1.0
         out[t] = e
@@ -164,8 +169,8 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
     g0, g1, g2, g3 = E[0], E[1], E[2], E[3]
     w10, w20, w21, w30, w31, w32 = W[4], W[8], W[9], W[12], W[13], W[14]
     noise, weight, rate, typical = s[NOISE_SUM], s[NOISE_WEIGHT], s[NOISE_RATE], s[TYPICAL]
-    grow, shrink = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW]
-    used, rejected = s[USED], s[REJECTED]
+    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0 / _noise_of_now(s)
+    used, rejected, root = s[USED], s[REJECTED], 1.0 / np.sqrt(now)
     while t < y.size and used < until:
         x0, x1, x2, x3 = phi[t, 0], phi[t, 1], phi[t, 2], phi[t, 3]
         e = y[t] - (x0 * th0 + x1 * th1) - (x2 * th2 + x3 * th3)
@@ -198,13 +203,15 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
         h1 = k1 + w10 * k0
         h2 = k2 + (w20 * k0 + w21 * k1)
         h3 = v3 + w30 * k0 + (w31 * k1 + w32 * k2)
-        c = 1.0 / (1.0 + (g0 * k0 * k0 + g1 * h1 * h1) + (g2 * h2 * h2 + g3 * h3 * h3))
+        c = now * ((g0 * k0 * k0 + g1 * h1 * h1) + (g2 * h2 * h2 + g3 * h3 * h3))
+        c = 1.0 / (1.0 + min(c, a3 - 1.0))
         share = (a3 - 1.0) / (a3 - 1.0 + typical)
         keep = 1.0 - rate * share
         noise = keep * noise + share * (c * e) * (c * e)
         weight = keep * weight + share * c
         gain = e * r3
         th0, th1, th2, th3 = th0 + k0 * gain, th1 + k1 * gain, th2 + k2 * gain, th3 + v3 * gain
+        x0, x1, x2, x3 = root * x0, root * x1, root * x2, root * x3
         q = x3 / g3
         a3 = 1.0 + q * x3
         r3, g3 = 1.0 / a3, g3 * a3
@@ -245,12 +252,6 @@ def _joseph(p: int, E: Array, W: Array, K: Array, phi: Array, f: Array, k: Array
         K[j] = root * K[j] - k[j] / root
     _up(p, E, W, K)
     return alpha - r
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _noise_of_now(s: Array) -> float:
-    """Return the noise variance over the unit of C: a calm later on makes old samples no better."""
-    return max(s[NOISE_SUM] / s[NOISE_WEIGHT] / s[UNIT], _SILENT) if s[UNIT] > 0 else 1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

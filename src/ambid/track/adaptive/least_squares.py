@@ -43,13 +43,15 @@ class RecursiveLeastSquares(Factored):
       (wind-up) until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far
       that it stays there: coefficients that are still excited are tracked more slowly meanwhile.
     - ``"directional"``: only the part of the information that the present regressor meets is forgotten: without
-      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`. The covariance takes
-      every sample with the σ² of its own time, once σ² is known (after a memory): a calm makes nothing surer.
+      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`.
 
     The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
     regressors: σ²C with the error's own recursion C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ. With forgetting it is less than
     σ²P, by 1 + factor in the stationary state. The lag behind moving coefficients is not in it, except with `walk`,
     where C = P.
+
+    Where something is forgotten, every sample counts with the σ² of its own time, once σ² is known (after a memory): a
+    calm makes no coefficient surer.
 
     σ² is tracked on errors e over 1 + φᵀCφ, each with the weight of what it says of the estimate: silence does not
     lower it. Biased like all least squares where e is coloured and correlated with the regressor, as under feedback
@@ -150,13 +152,14 @@ class RecursiveLeastSquares(Factored):
     def covariance(self) -> Array:
         """A copy of the covariance of the estimate's error, shape (p, p)."""
         s, at = self._s, self._at
+        unit = float(s[at.UNIT] or self.noise_variance)
         if s[at.KIND] == at.DIRECTIONAL:
-            return float(s[at.UNIT] or self.noise_variance) * product(*self._factors(1))
+            return unit * product(*self._factors(1))
         if s[at.FACTOR] == 1.0:
             return self.noise_variance * self.P
         E, W = self._factors(1)
         half = (np.sqrt(E)[:, None] * W) @ self.P
-        return np.asarray(self.noise_variance * (half.T @ half))
+        return np.asarray(unit * (half.T @ half))
 
     def reset(self, prior: ArrayLike | None = None) -> None:
         """Say that the coefficients may have moved: P and C become the prior, the estimate stays.
