@@ -16,7 +16,7 @@ from ambid.physics.sensor_gain import SensorGains
 
 Array = NDArray[np.float64]
 
-MEMORY_S = 0.1  # longest memory of the predictor: what happened before cannot disturb the tracking of changes
+MEMORY_S = 0.02  # longest memory of the predictor: it is deaf for ten of them after a gap, and slow to show a change
 _LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
 _LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
 _GAIN_SD = 0.1  # relative, of an entry of the predictor gain
