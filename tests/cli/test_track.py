@@ -71,6 +71,7 @@ def test_options_reach_the_job(bench, ambid, job):
     assert {name: job[name] for name in expected} == expected
     assert ambid("track", "record.csv").code == 0
     assert (job["memory"], job["every_s"], job["limit"], job["pace"]) == ("auto", 0.01, 1.5, "fastest")
+    assert job["rig"] is None
 
 
 REFUSED = {

@@ -102,6 +102,7 @@ def command(
     """
     from ambid.cli.live import Follower
     from ambid.job.track import track
+    from ambid.rig import load_rig
     from ambid.track.lines_json import TrackWriter
 
     _check(every, limit, start, start_seconds)
@@ -110,6 +111,7 @@ def command(
         path = json_path(json)
         outputs.claim(path, "--json")
         outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+        bench = None if rig is None else load_rig(rig)
         writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None
         same = json == "-" and sys.stdout.isatty()
         live = not quiet and sys.stderr.isatty() and not same
@@ -122,7 +124,7 @@ def command(
         summary = follower.run(
             lambda: track(
                 record,
-                rig,
+                bench,
                 start=start,
                 start_s=start_seconds,
                 every_s=every,

@@ -306,11 +306,16 @@ def _groups(
 
 def _poorly_known(estimate: Estimate) -> tuple[str, ...]:
     """Parameters so wide that evidence linearised at the start is worth less than it claims."""
-    return tuple(
-        f"the start knows {name} to {sd / abs(value):.0%} only: what is tracked of it may claim too narrow an interval."
-        " Start from a longer or better excited record"
+    wide = [
+        f"{name} to {sd / abs(value):.0%}"
         for name, sd in zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True)
         if sd > _WIDE * abs(value := estimate.values[name])
+    ]
+    if not wide:
+        return ()
+    return (
+        f"the start knows {', '.join(wide)} only: what is tracked of them may claim too narrow an interval. Start from"
+        " a longer or better excited record",
     )
 
 
