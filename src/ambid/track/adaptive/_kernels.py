@@ -38,7 +38,8 @@ Array = NDArray[np.float64]
     VAGUE,  # 1: no prior was given; the limit is counted from the best variances so far
     SETTLED,  # weight of the noise variance from which it is the unit of the covariance; infinite where it is known
     UNIT,  # variance in which C is counted; 0: that of the moment
-) = range(20)
+    NOW,  # noise variance of the last look over the unit
+) = range(21)
 HEAD = 24
 
 LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
@@ -124,7 +125,7 @@ def _add_noise(s: Array, e: float, spread: float, leverage: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _noise_of_now(s: Array) -> float:
+def noise_of_now(s: Array) -> float:
     """Return the noise variance over the unit of C: a calm later on makes old samples no better."""
     return max(s[NOISE_SUM] / s[NOISE_WEIGHT] / s[UNIT], _SILENT) if s[UNIT] > 0 else 1.0
 
@@ -134,7 +135,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
     """Least squares on samples t, ... until so many have been used: P and the information of squared weights."""
     theta, D, V, E, W = _views(s, p)
     _, _, f, k, a = _rest(s, p)
-    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], _noise_of_now(s)
+    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], s[NOW]
     while t < y.size and s[USED] < until:
         row, e = phi[t], y[t]
         for j in range(p):
@@ -169,7 +170,7 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
     g0, g1, g2, g3 = E[0], E[1], E[2], E[3]
     w10, w20, w21, w30, w31, w32 = W[4], W[8], W[9], W[12], W[13], W[14]
     noise, weight, rate, typical = s[NOISE_SUM], s[NOISE_WEIGHT], s[NOISE_RATE], s[TYPICAL]
-    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0 / _noise_of_now(s)
+    grow, shrink, now = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0 / s[NOW]
     used, rejected, root = s[USED], s[REJECTED], 1.0 / np.sqrt(now)
     while t < y.size and used < until:
         x0, x1, x2, x3 = phi[t, 0], phi[t, 1], phi[t, 2], phi[t, 3]
@@ -283,10 +284,10 @@ def _filtered(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until:
             theta[j] += a[j] * e
         spread = alpha - 1.0  # not less than what C says, but where the noise has just fallen
         if directional:
-            spread = min(spread, _quadratic(p, E, W, row) / _noise_of_now(s))
+            spread = min(spread, _quadratic(p, E, W, row) / noise_of_now(s))
         _add_noise(s, e, spread, alpha - 1.0)
         if directional:
-            _joseph(p, E, W, a, row, f, k, _noise_of_now(s))
+            _joseph(p, E, W, a, row, f, k, noise_of_now(s))
         s[USED] += 1.0
         out[t] = e
         t += 1
@@ -315,9 +316,10 @@ def _govern(s: Array, p: int) -> None:
     a, q = HEAD + p, 2 * (p + p * p)
     if s[RESET_EVERY] > 0 and s[USED] > 0 and s[USED] % s[RESET_EVERY] == 0:
         s[a : a + q] = s[a + q : a + 2 * q]
-        s[UNIT] *= max(1.0, _noise_of_now(s))
+        s[UNIT] *= max(1.0, noise_of_now(s))
     if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
         s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
+    s[NOW] = noise_of_now(s)
     _, D, V, _, _ = _views(s, p)
     _, prior, _, _, _ = _rest(s, p)
     size = 0.0
@@ -328,9 +330,7 @@ def _govern(s: Array, p: int) -> None:
         if s[VAGUE] > 0:
             prior[i] = min(prior[i], _WORSE * variance)
         size += variance / (prior[i] * p * s[LIMIT])
-    s[FACTOR_NOW] = s[FACTOR]
-    if size > s[FACTOR] ** s[EVERY]:
-        s[FACTOR_NOW] = min(1.0, size ** (1.0 / s[EVERY]))
+    s[FACTOR_NOW] = min(1.0, size ** (1.0 / s[EVERY])) if size > s[FACTOR] ** s[EVERY] else s[FACTOR]
     s[TYPICAL] = 0.1 * p / min(s[USED] + 1.0, s[MEMORY])
 
 

@@ -132,7 +132,7 @@ class RecursiveLeastSquares(Factored):
         s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
         s[at.LIMIT], s[at.VAGUE] = positive("limit", limit), float(prior is None)
         s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
-        s[at.TYPICAL] = 0.1 * p
+        s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
         settle = _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)
         s[at.NOISE_RATE] = 1.0 / settle
         s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], _SETTLES * settle)
@@ -202,6 +202,7 @@ class RecursiveLeastSquares(Factored):
         s[at.HEAD + len(self._names) : start.start] = s[start]
         if s[at.UNIT]:
             s[at.UNIT] = max(s[at.UNIT], self.noise_variance)
+            s[at.NOW] = at.noise_of_now(s)
 
 
 def _factor(forgetting: Forgetting | None, factor: float | None, memory: float | None) -> float:
