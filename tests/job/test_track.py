@@ -317,3 +317,9 @@ def test_an_incredible_value_is_rejected_not_learned(steady):
     found = track(replace(steady[0], channels=tuple(wild)), start=start(2), to_s=0.6)
     assert found.summary.rejected_samples == 20
     assert kinds(found) == ["rejected"]
+
+
+def test_complex_samples_are_refused(steady):
+    channel = steady[0].channels[0]
+    with pytest.raises(AmbidError, match="complex"):
+        replace(channel, values=channel.values + 1j)

@@ -28,7 +28,7 @@ from ambid.track.supervise.published import beside, published
 
 Array = NDArray[np.float64]
 
-SILENT_S = 1.0  # without evidence, after which the published numbers are stale
+SILENT_S = 1.0  # without evidence, after which the published numbers are stale; sooner if there never was any
 _RELEASE = 0.8  # part of the limit under which the error has to fall to be acceptable again
 _LEVEL_S = 0.1  # over which the error is taken
 
@@ -85,6 +85,7 @@ class Supervisor:
         self.publication = Publication(rpem, self.operator, self.log, t0)
         self.diagnosis = Diagnosis(rpem, self.publication, self.log, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
         self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
+        self._spoken = False  # whether there has been any
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
         self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
         self._parameters: dict[str, TrackedValue] = {}
@@ -205,13 +206,14 @@ class Supervisor:
         if not missing and self._deaf_s <= self.rpem.block_s:
             return
         t = self._t0 + sample / self._rate
-        if not self._silent and self._deaf_s >= SILENT_S:
+        settling_s = self.rpem.stream.settling_samples / self._rate
+        most_s = SILENT_S if self._spoken else min(SILENT_S, max(_LEVEL_S, 2.0 * settling_s))
+        if not self._silent and self._deaf_s >= most_s:
             self._silent = True
-            settling_s = self.rpem.stream.settling_samples / self._rate
             why = (
-                f"the predictor has not settled for {SILENT_S:g} s: after each interruption it needs {settling_s:.3g} s"
+                f"the predictor has not settled for {most_s:.3g} s: after each interruption it needs {settling_s:.3g} s"
             )
-            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {SILENT_S:g} s" if missing else why))
+            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {most_s:.3g} s" if missing else why))
         self._obey(t)
 
     def order(self, flag: str) -> None:
@@ -245,7 +247,7 @@ class Supervisor:
             self._silent = False
             without_s = (evidence.first - self._heard) / self._rate
             self.log.add(Event(kind="thawed", t=t, why=f"the data speak again after {without_s:.3g} s"))
-        self._heard, self._deaf_s = evidence.last, 0.0
+        self._heard, self._deaf_s, self._spoken = evidence.last, 0.0, True
         events = self._excitation.update(evidence, t)
         for event in events:
             self.log.add(event)
