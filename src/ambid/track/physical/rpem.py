@@ -29,7 +29,8 @@ Memory = float | Literal["auto", "all"]
 
 BLOCK_S = 0.005  # of one evidence
 _ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at least: the noise shows in what is left
-_START_MEMORY_S, _LONGEST_S, _SHORTEST_S = 2.0, 60.0, 0.02  # memory where it is found from the data
+_START_MEMORY = 2.0  # times the length of the start's record: memory at the beginning, where it is found from the data
+_LONGEST_S, _SHORTEST_S = 60.0, 0.02
 # square of a move, over the standard deviation, at which second-order terms matter
 _CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
 _APPROACH = (1.0, 0.5, 0.25, 0.125)  # parts of the way tried where there is no predictor at its end
@@ -270,9 +271,15 @@ class PhysicalRpem:
 
 
 def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRates:
-    """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory."""
-    rate = np.diag(numbers.covariance) * numbers.information_s
-    one_second = np.where(np.isin(numbers.kinds, ("offset", "unbalance")), _OFFSET_RATE, rate)
+    """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory.
+
+    The information is that on a number if the others are known. Where only ratios of the parameters are known well, a
+    walk as wide as each alone is known would loosen the ratios.
+    """
+    size = np.sqrt(np.diag(numbers.covariance))
+    known = 1.0 / np.diag(np.linalg.inv(numbers.covariance / np.outer(size, size))) * size**2
+    one_second = known * numbers.information_s
+    one_second[numbers.places("offset", "unbalance")] = _OFFSET_RATE
     one_second[numbers.places("gain")] = 0.0
     if memory == "all":
         return DriftRates(np.zeros_like(one_second), np.zeros_like(one_second), np.zeros_like(one_second), block_s)
@@ -281,7 +288,8 @@ def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRate
             raise EstimationError(f"the memory is {memory} s; it must be positive. Give seconds, 'auto' or 'all'")
         held = one_second / memory**2
         return DriftRates(held, held, held, block_s)
-    begin, slowest, fastest = (one_second / s**2 for s in (_START_MEMORY_S, _LONGEST_S, _SHORTEST_S))
+    first = min(max(_START_MEMORY * numbers.information_s, _SHORTEST_S), _LONGEST_S)
+    begin, slowest, fastest = (one_second / s**2 for s in (first, _LONGEST_S, _SHORTEST_S))
     if numbers.problem.noise == "gain":
         # entries of a gain that follow every transient leave the region of good predictors
         own = numbers.places("noise")
