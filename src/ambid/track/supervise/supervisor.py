@@ -137,8 +137,10 @@ class Supervisor:
 
     @property
     def error(self) -> float:
-        """Model error, 1 as at identification; NaN where no block says anything of the present."""
-        return self.level.error if self._deaf_s <= max(_LEVEL_S, 2.0 * self.rpem.block_s) else float("nan")
+        """Model error, 1 as at identification, and so before the first block; NaN where none tells of the present."""
+        if self._deaf_s > max(_LEVEL_S, 2.0 * self.rpem.block_s):
+            return float("nan")
+        return self.level.error if self._spoken else 1.0
 
     def begin(self, first: int) -> None:
         """Say where the stream begins, before anything of it comes.
