@@ -37,6 +37,18 @@ def test_the_end_of_a_stationary_record_is_the_off_line_estimate_of_it(make, n, 
     np.testing.assert_allclose(np.sqrt(np.diag(r.covariance)), sd, rtol=0.1)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_walks_do_not_loosen_ratios_that_are_known_well(seed):
+    """Only ratios of m, k_x and k_i are known well: walks as wide as each alone is known moved all three by 1 sd."""
+    record = ball(40_000, seed)
+    whole, r = identify(record), PhysicalRpem(identify(record, to_s=5.0))
+    r.update(*columns(record, 10_000))
+    for name, found in zip(r.names, r.estimate, strict=True):
+        if name in ("m", "k_x", "k_i"):
+            known = whole.parameter(name)
+            assert abs(found - known.value) < 0.6 * known.sd, name
+
+
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Independent starts and records, memory "all"; the coverage is that of all parameters together."""
     runs, n = 40, 4000
