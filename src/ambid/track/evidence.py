@@ -7,7 +7,6 @@ unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,33 +83,3 @@ class Evidence:
         """
         left = self.residual(q)
         return float(self.rest + left @ left)
-
-
-def merge(parts: Sequence[Evidence]) -> Evidence:
-    """Return the evidence of several blocks as one, at the linearisation point of the last.
-
-    Parameters
-    ----------
-    parts : sequence of Evidence
-        Of the same numbers, in the order of time; at least one.
-
-    Returns
-    -------
-    Evidence
-    """
-    end = parts[-1]
-    p = end.r.size
-    rows = np.vstack([np.column_stack([part.J, part.residual(end.at)]) for part in parts])
-    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-    beyond = float(triangle[p, p] ** 2) if triangle.shape[0] > p else 0.0
-    return Evidence(
-        names=end.names,
-        at=end.at,
-        J=triangle[:p, :p],
-        r=triangle[:p, p],
-        rest=beyond + sum(part.rest for part in parts),
-        n_samples=sum(part.n_samples for part in parts),
-        n_outputs=end.n_outputs,
-        first=parts[0].first,
-        last=end.last,
-    )

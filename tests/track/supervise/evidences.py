@@ -134,3 +134,23 @@ def bearing(what: str, factor: float, *, at: int, n: int, seed: int) -> list[Evi
             )
         )  # fmt: skip
     return found
+
+
+def merge(parts):
+    """The evidence of several blocks as one, at the linearisation point of the last: by dense QR."""
+    end = parts[-1]
+    p = end.r.size
+    rows = np.vstack([np.column_stack([part.J, part.residual(end.at)]) for part in parts])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    beyond = float(triangle[p, p] ** 2) if triangle.shape[0] > p else 0.0
+    return Evidence(
+        names=end.names,
+        at=end.at,
+        J=triangle[:p, :p],
+        r=triangle[:p, p],
+        rest=beyond + sum(part.rest for part in parts),
+        n_samples=sum(part.n_samples for part in parts),
+        n_outputs=end.n_outputs,
+        first=parts[0].first,
+        last=end.last,
+    )

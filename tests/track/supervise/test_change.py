@@ -5,7 +5,6 @@ import pytest
 from scipy import stats
 
 from ambid.errors import EstimationError
-from ambid.track.evidence import merge
 from ambid.track.supervise.change import ChangeDetector
 from tests.track.supervise.evidences import (
     BLOCK,
@@ -17,6 +16,7 @@ from tests.track.supervise.evidences import (
     Filter,
     bearing,
     evidence,
+    merge,
     triangle,
 )
 
