@@ -39,6 +39,10 @@ class EstimationError(AmbidError):
     """The data cannot be turned into an estimate at all (as opposed to a poor one, which is given with its flags)."""
 
 
+class DeviceError(AmbidError):
+    """A controller, its port or its line: not there, not understood, refusing, or in its safe state."""
+
+
 def nearest(word: str, known: Sequence[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known word closest to `word`, or an empty string.
 

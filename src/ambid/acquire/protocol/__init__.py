@@ -1,0 +1,1 @@
+"""The wire protocol: declared once in ``messages.toml``, framed with COBS and a CRC."""
