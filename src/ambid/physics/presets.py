@@ -170,7 +170,57 @@ def _levitated_ball() -> Preset:
     )
 
 
-_MAKERS = {"thesis": _thesis, "unstable-bearing": _unstable_bearing, "rmit": _rmit, "levitated-ball": _levitated_ball}
+def _prototype() -> Preset:
+    magnet = DifferentialPair(turns=600, area=400e-6, bias=1.0, gap=3e-3, half_angle=0.0, leakage=20e-3)
+    plant = NonlinearPlant(magnet=magnet, m=0.3, R=6.0)
+    parameters = plant.linearise(0.0)
+    rate_hz, volts, counts = 2000.0, 24.0, 800
+    position_step, current_step = 2.5e-3 / 1024, 2.5 / 1024
+    return Preset(
+        name="prototype",
+        summary="table-top bearing on an Arduino Uno: 12 V bridge, 10-bit converter, 2 kHz; k_i 20.1 N/A, k_x -6702 N/m",
+        parameters=MappingProxyType(parameters),
+        plant=plant,
+        loop=placed_loop(parameters, (-320, -80 + 80j, -80 - 80j, -16), derivative_cutoff_hz=300.0, delay=0.3),
+        usually_closed=True,
+        noise=Noise(
+            position=2e-6,
+            current=2e-3,
+            force=0.01,
+            position_resolution=position_step,
+            current_resolution=current_step,
+            voltage_resolution=volts / counts,
+        ),
+        limits=Limits(voltage=(-11.4, 11.4), current=(-1.0, 1.0), position=(-1e-3, 1e-3)),
+        rate_hz=rate_hz,
+        sources=MappingProxyType(
+            {
+                "supply": "12 V battery, thesis ch. 5; a full bridge is chosen, so that the coil sees both signs",
+                "position_resolution, current_resolution": "10 bits over 2.5 mm and 2.5 A, chosen",
+                "voltage_resolution": "800 counts of pulse width over +-12 V",
+                "turns, area, bias, gap, leakage, m, R": "chosen",
+                "limits.voltage": "pulse width of 5 to 95 %",
+                "limits.current": "the bias: neither coil reverses",
+                "loop, noise, limits.position, rate_hz": "chosen",
+            }
+        ),
+        instruments=MappingProxyType(
+            {
+                "position_sensor": (5.0 / 2.5e-3, "V/m"),
+                "current_sensor": (5.0 / 2.5, "V/A"),
+                "pulse_width": (volts / counts, "V"),
+            }
+        ),
+    )
+
+
+_MAKERS = {
+    "thesis": _thesis,
+    "unstable-bearing": _unstable_bearing,
+    "rmit": _rmit,
+    "levitated-ball": _levitated_ball,
+    "prototype": _prototype,
+}
 
 
 def preset_names() -> tuple[str, ...]:
