@@ -1,1 +1,1 @@
-"""The wire protocol: declared once in ``messages.toml``, framed with COBS and a CRC."""
+"""The wire protocol between host and controller: both sides follow from one table, ``messages.toml``."""

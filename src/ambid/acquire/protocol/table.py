@@ -1,0 +1,277 @@
+"""The table of the wire protocol: ``messages.toml``, read and checked.
+
+Everything that knows a message on either side (codec, C header, reference page) is made from this table.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from types import MappingProxyType
+from typing import Any
+
+CRC_BYTES = 2
+_FORMATS = {"u8": "B", "u16": "H", "u32": "I", "i8": "b", "i16": "h", "i32": "i"}
+_SIDES = ("host", "controller")
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A named number: an entry of an enum, or a bit of a mask.
+
+    Attributes
+    ----------
+    name : str
+    value : int
+        Of the enum; of a mask the number of the bit.
+    about : str
+        What it means, one line.
+    """
+
+    name: str
+    value: int
+    about: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldType:
+    """One field of a message.
+
+    Attributes
+    ----------
+    name : str
+    kind : {"u8", "u16", "u32", "i8", "i16", "i32"}
+        An integer, little endian.
+    many : bool
+        True for a last field that is the rest of the frame: any number of elements, none included.
+    about : str
+        Meaning and unit, one line.
+    """
+
+    name: str
+    kind: str
+    many: bool
+    about: str
+
+    @property
+    def width(self) -> int:
+        """Bytes of one element."""
+        return int(self.kind[1:]) // 8
+
+    @property
+    def format(self) -> str:
+        """Letter of `struct` for one element."""
+        return _FORMATS[self.kind]
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """Least and largest value."""
+        bits = 8 * self.width
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.kind[0] == "i" else (0, (1 << bits) - 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MessageType:
+    """One message.
+
+    Attributes
+    ----------
+    name : str
+    code : int
+        First byte of its frames.
+    to : {"host", "controller"}
+        Who receives it.
+    about : str
+        One line.
+    fields : tuple of FieldType
+        In their order on the wire.
+    """
+
+    name: str
+    code: int
+    to: str
+    about: str
+    fields: tuple[FieldType, ...]
+
+    @property
+    def fixed(self) -> tuple[FieldType, ...]:
+        """The fields of one element each."""
+        return tuple(f for f in self.fields if not f.many)
+
+    @property
+    def tail(self) -> FieldType | None:
+        """The last field, where it is the rest of the frame."""
+        return self.fields[-1] if self.fields and self.fields[-1].many else None
+
+    @property
+    def length(self) -> int:
+        """Bytes of code and fields, without CRC; the least, where the last field is the rest of the frame."""
+        return 1 + sum(f.width for f in self.fixed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamColumn:
+    """What a sample may carry.
+
+    Attributes
+    ----------
+    name : str
+    bit : int
+        Of the stream mask.
+    kind : {"u16", "i16"}
+        How its two bytes are read.
+    about : str
+        Meaning and unit, one line.
+    """
+
+    name: str
+    bit: int
+    kind: str
+    about: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """The whole protocol.
+
+    Attributes
+    ----------
+    version : int
+        Controllers of another version are refused.
+    baud : int
+        Of the serial line, bits in one second.
+    largest : int
+        Bytes of a frame before COBS: code, fields and CRC.
+    enums, bits : Mapping of str to tuple of Entry
+        Named numbers by group; in a group of `bits` the values are numbers of bits.
+    stream : tuple of StreamColumn
+        In the order of their bits, which is their order in a sample.
+    messages : Mapping of str to MessageType
+        By name.
+    """
+
+    version: int
+    baud: int
+    largest: int
+    enums: Mapping[str, tuple[Entry, ...]]
+    bits: Mapping[str, tuple[Entry, ...]]
+    stream: tuple[StreamColumn, ...]
+    messages: Mapping[str, MessageType]
+
+    def by_code(self, to: str) -> dict[int, MessageType]:
+        """Return the messages that side `to` receives, by their code."""
+        return {m.code: m for m in self.messages.values() if m.to == to}
+
+    def value(self, group: str, name: str) -> int:
+        """Return the number of entry `name` of enum `group`."""
+        return next(e.value for e in self.enums[group] if e.name == name)
+
+    def name(self, group: str, value: int) -> str:
+        """Return the name of `value` in enum `group`, or its digits where it has none."""
+        return next((e.name for e in self.enums[group] if e.value == value), str(value))
+
+    def names_of_bits(self, group: str, mask: int) -> tuple[str, ...]:
+        """Return the names of the bits of `group` that are set in `mask`."""
+        return tuple(e.name for e in self.bits[group] if mask >> e.value & 1)
+
+
+@functools.cache
+def table() -> Table:
+    """Return the protocol that this version of `ambid` speaks.
+
+    Returns
+    -------
+    Table
+    """
+    text = resources.files(__package__).joinpath("messages.toml").read_text(encoding="utf-8")
+    return read_table(text)
+
+
+def read_table(text: str) -> Table:
+    """Read a protocol from its text and check it.
+
+    Parameters
+    ----------
+    text : str
+        As in ``messages.toml``.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    ValueError
+        If the table breaks a rule of its own: all of them are named.
+    """
+    raw = tomllib.loads(text)
+    made = Table(
+        version=raw["version"],
+        baud=raw["baud"],
+        largest=raw["largest"],
+        enums=MappingProxyType({g: _entries(es) for g, es in raw["enums"].items()}),
+        bits=MappingProxyType({g: _entries(es) for g, es in raw["bits"].items()}),
+        stream=tuple(StreamColumn(name=n, bit=v[0], kind=v[1], about=v[2]) for n, v in raw["stream"].items()),
+        messages=MappingProxyType({n: _message(n, v) for n, v in raw["messages"].items()}),
+    )
+    if complaints := list(_complaints(made)):
+        raise ValueError("; ".join(complaints))
+    return made
+
+
+def _entries(raw: Mapping[str, Any]) -> tuple[Entry, ...]:
+    return tuple(Entry(name=name, value=value[0], about=value[1]) for name, value in raw.items())
+
+
+def _message(name: str, raw: Mapping[str, Any]) -> MessageType:
+    fields = tuple(
+        FieldType(name=n, kind=kind.removesuffix("[]"), many=kind.endswith("[]"), about=about)
+        for n, kind, about in raw["fields"]
+    )
+    return MessageType(name=name, code=raw["code"], to=raw["to"], about=raw["about"], fields=fields)
+
+
+def _complaints(made: Table) -> Iterator[str]:
+    if not 0 < made.version < 256:
+        yield f"version {made.version} does not fit a byte"
+    if not 0 < made.largest <= 254:
+        yield f"largest = {made.largest}: a frame of COBS with one block per zero byte has at most 254 bytes"
+    for group, entries in [*made.enums.items(), *made.bits.items()]:
+        yield from _twice(f"group {group}", [e.value for e in entries])
+        most = 16 if group in made.bits else 256
+        yield from (f"{group}.{e.name}: {e.value} is out of range" for e in entries if not 0 <= e.value < most)
+    if [c.bit for c in made.stream] != list(range(len(made.stream))) or len(made.stream) > 8:
+        yield "stream: bits are to be 0, 1, ... in order, 8 at most"
+    yield from (f"stream.{c.name}: {c.kind} has not two bytes" for c in made.stream if c.kind not in ("u16", "i16"))
+    for side in _SIDES:
+        yield from _twice(f"codes to the {side}", [m.code for m in made.messages.values() if m.to == side])
+    for message in made.messages.values():
+        yield from _complaints_of_message(message, made.largest)
+    names = [*made.enums, *made.bits, *(c.name for c in made.stream), *made.messages]
+    names += [f.name for m in made.messages.values() for f in m.fields]
+    yield from (f"{name!r} is no name in both languages" for name in names if not _NAME.fullmatch(name))
+
+
+def _complaints_of_message(message: MessageType, largest: int) -> Iterator[str]:
+    where = f"message {message.name}"
+    if message.to not in _SIDES:
+        yield f"{where}: to = {message.to!r}; it is one of {', '.join(_SIDES)}"
+    if not 0 < message.code < 256:
+        yield f"{where}: code {message.code} is not within 1 to 255"
+    yield from _twice(where, [f.name for f in message.fields])
+    for field in message.fields:
+        if field.kind not in _FORMATS:
+            yield f"{where}: {field.name} has type {field.kind!r}; known are {', '.join(_FORMATS)}"
+        elif field.many and field is not message.fields[-1]:
+            yield f"{where}: {field.name} is the rest of the frame, but others follow"
+    if all(f.kind in _FORMATS for f in message.fields) and message.length + CRC_BYTES > largest:
+        yield f"{where}: {message.length + CRC_BYTES} bytes; the largest frame has {largest}"
+
+
+def _twice(where: str, values: list[Any]) -> Iterator[str]:
+    yield from (f"{where}: {value!r} stands twice" for value in sorted({v for v in values if values.count(v) > 1}))
