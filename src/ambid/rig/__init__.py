@@ -3,10 +3,11 @@
 from ambid.rig.bench import bench_record, mat_variables, read_bench
 from ambid.rig.draft import draft_rig
 from ambid.rig.load import default_rig, load_rig, rig_from_text
-from ambid.rig.rig import RecordSettings, Rig, RigChannel
+from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel
 from ambid.rig.write import rig_text, write_rig
 
 __all__ = [
+    "Daq",
     "RecordSettings",
     "Rig",
     "RigChannel",

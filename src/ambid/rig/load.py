@@ -14,6 +14,7 @@ from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter, ParameterSpec
 from ambid.record.calibration import Calibration, read_calibration_table
+from ambid.rig._daq import daq_of
 from ambid.rig.rig import RecordSettings, Rig, RigChannel
 from ambid.units import Unit, parse_unit
 
@@ -126,14 +127,16 @@ def _build(file: RigFile, path: Path) -> Rig:
     record = file.record
     if record.from_ is not None and record.to is not None and record.to <= record.from_:
         raise RigError(f"{where}: record.to is {record.to} s, not after record.from = {record.from_} s. Correct one")
+    channels = _channels(file.channels, plant, path) if file.channels else _default_channels(plant)
+    limits = _limits(file.loop.limits, where) if file.loop and file.loop.limits else None
     return Rig(
         name=file.name,
         model=file.model,
-        channels=_channels(file.channels, plant, path) if file.channels else _default_channels(plant),
+        channels=channels,
         parameters=_parameters(file.parameters, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop) if file.loop else None,
-        limits=_limits(file.loop.limits, where) if file.loop and file.loop.limits else None,
+        limits=limits,
         noise=_noise(file.noise) if file.noise else None,
         record=RecordSettings(
             rate_hz=record.rate_hz,
@@ -142,6 +145,9 @@ def _build(file: RigFile, path: Path) -> Rig:
             to_s=record.to,
             time=(record.time.variable, record.time.unit) if record.time else None,
         ),
+        daq=daq_of(file.daq, channels=channels, plant=plant, limits=limits, record_rate_hz=record.rate_hz, where=where)
+        if file.daq
+        else None,
         open_loop=file.open_loop,
         source=path,
     )

@@ -9,10 +9,13 @@ from types import MappingProxyType
 from typing import Literal
 
 from ambid.errors import RigError, nearest
-from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.parameters import Parameter
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
+
+TRIP_SHARE = 0.9
+"""Share of ``loop.limits.position`` in which the controller holds the rotor, unless ``[daq.trip]`` says otherwise."""
 
 _EMPTY: Mapping[str, float] = MappingProxyType({})
 
@@ -70,6 +73,41 @@ class RecordSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Daq:
+    """How the controller of a bench samples, drives and protects.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Ticks of the control loop in one second, each with one sample.
+    baud : int
+        Of the serial line, bit/s.
+    duty : (int, int) or None
+        Least and largest pulse width, counts; None: what keeps the voltage inside ``loop.limits.voltage``.
+    duty_off : int or None
+        Pulse width of the safe state, counts; None: the count nearest to 0 V.
+    host_ms : int
+        Longest silence of the host while the output is on, ms.
+    lift_ms : int
+        Time after the start of levitation in which the rotor may still lie outside its gap, ms.
+    third : str or None
+        Column of the third analog input; None: it is not sampled.
+    position_trip, current_trip : (float, float) or None
+        Where the controller goes to its safe state, m and A; None: see :meth:`Rig.trip`.
+    """
+
+    rate_hz: float = 2000.0
+    baud: int = 1_000_000
+    duty: tuple[int, int] | None = None
+    duty_off: int | None = None
+    host_ms: int = 250
+    lift_ms: int = 300
+    third: str | None = None
+    position_trip: Interval | None = None
+    current_trip: Interval | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
     """A bench: model, channels and their calibration, parameters, loop, noise. All numbers SI.
 
@@ -94,6 +132,8 @@ class Rig:
         Process and sensor noise, for simulation.
     record : RecordSettings
         How records are read.
+    daq : Daq or None
+        How its controller samples, drives and protects.
     open_loop : bool
         The user declares that records are taken without feedback.
     source : Path or None
@@ -109,6 +149,7 @@ class Rig:
     limits: Limits | None = None
     noise: Noise | None = None
     record: RecordSettings = field(default_factory=RecordSettings)
+    daq: Daq | None = None
     open_loop: bool = False
     source: Path | None = None
 
@@ -135,6 +176,29 @@ class Rig:
                 return c
         roles = [c.role for c in self.channels]
         raise RigError(f"the rig has no channel {role!r}; it has {', '.join(roles)}.{nearest(role, roles)}")
+
+    def trip(self, role: Literal["position", "current"]) -> Interval:
+        """Return the interval outside which the controller goes to its safe state.
+
+        Parameters
+        ----------
+        role : {"position", "current"}
+            Of which quantity.
+
+        Returns
+        -------
+        (float, float)
+            In m or A: as ``[daq.trip]`` gives it, else the middle 90 % of ``loop.limits.position`` or all of
+            ``loop.limits.current``; infinite where the rig says nothing.
+        """
+        given = (self.daq.position_trip if role == "position" else self.daq.current_trip) if self.daq else None
+        if given is not None:
+            return given
+        low, high = UNLIMITED if self.limits is None else getattr(self.limits, role)
+        if role == "current" or (low, high) == UNLIMITED:
+            return low, high
+        middle, half = (low + high) / 2.0, TRIP_SHARE * (high - low) / 2.0
+        return middle - half, middle + half
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter called `name`.

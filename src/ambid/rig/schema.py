@@ -21,6 +21,7 @@ Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, strict=True, ge=0)]
 Samples = Annotated[int, Field(strict=True, ge=0)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
 
 
@@ -118,6 +119,26 @@ class RecordEntry(_Entry):
     time: TimeEntry | None = None
 
 
+class TripEntry(_Entry):
+    """``daq.trip``: SI, a positive number for ± that, or [low, high]."""
+
+    position: Interval | None = None
+    current: Interval | None = None
+
+
+class DaqEntry(_Entry):
+    """``[daq]``: how the controller of this bench samples, drives and protects; see :class:`ambid.rig.rig.Daq`."""
+
+    rate_hz: Positive | None = None
+    baud: Annotated[int, Field(strict=True, gt=0)] = 1_000_000
+    duty: tuple[Whole, Whole] | None = None
+    duty_off: Whole | None = None
+    host_ms: Whole = 250
+    lift_ms: Whole = 300
+    third: Text | None = None
+    trip: TripEntry = Field(default_factory=TripEntry)
+
+
 class RigFile(_Entry):
     """The whole file."""
 
@@ -130,6 +151,7 @@ class RigFile(_Entry):
     loop: LoopEntry | None = None
     noise: NoiseEntry | None = None
     record: RecordEntry = Field(default_factory=RecordEntry)
+    daq: DaqEntry | None = None
     open_loop: Annotated[bool, Field(strict=True)] = False
 
 
@@ -144,6 +166,8 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("noise", "resolutions"): ResolutionsEntry,
     ("record",): RecordEntry,
     ("record", "time"): TimeEntry,
+    ("daq",): DaqEntry,
+    ("daq", "trip"): TripEntry,
 }
 
 
@@ -243,8 +267,10 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
         return f"{place} is missing. Add it"
     got = error["input"]
     shown = "a table" if isinstance(got, dict) else f"{got!r}"
-    if keys[:2] == ["loop", "limits"]:
+    if keys[:2] in (["loop", "limits"], ["daq", "trip"]):
         rule = "it must be a positive number, or [low, high]"
+    elif keys[:2] == ["daq", "duty"]:
+        rule = "it must be [low, high] in whole counts of pulse width"
     elif kind == "finite_number":
         rule = "it must be finite"
     elif kind in ("literal_error", "enum"):
@@ -263,7 +289,8 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     elif kind == "bool_type":
         rule = "it must be true or false"
     elif kind.startswith("int"):
-        rule = "it must be a whole number of samples" + (', or "auto"' if keys[0] == "channels" else "")
+        of = "" if keys[0] == "daq" else " of samples"
+        rule = f"it must be a whole number{of}" + (', or "auto"' if keys[0] == "channels" else "")
     else:
         rule = "it must be a number, without quotes"
     return f"{place} is {shown}; {rule}{'' if rule.endswith('?') else '.'} Correct it"

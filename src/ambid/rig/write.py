@@ -14,7 +14,7 @@ from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from ambid.record.calibration import Calibration
 from ambid.rig.load import role_units
-from ambid.rig.rig import RecordSettings, Rig, RigChannel
+from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
@@ -76,6 +76,8 @@ def rig_text(rig: Rig, folder: Path) -> str:
         lines += ["", *_noise_lines(rig.noise)]
     if rig.record != RecordSettings():
         lines += ["", *_record_lines(rig.record)]
+    if rig.daq:
+        lines += ["", *_daq_lines(rig.daq)]
     return "\n".join(lines) + "\n"
 
 
@@ -158,3 +160,14 @@ def _record_lines(record: RecordSettings) -> list[str]:
     if record.time is not None:
         lines.append(f"time = {{ variable = {toml_text(record.time[0])}, unit = {toml_text(record.time[1])} }}")
     return lines
+
+
+def _daq_lines(daq: Daq) -> list[str]:
+    lines = ["[daq]", f"rate_hz = {daq.rate_hz!r}", f"baud = {daq.baud}"]
+    lines += [f"duty = [{daq.duty[0]}, {daq.duty[1]}]"] if daq.duty else []
+    lines += [f"duty_off = {daq.duty_off}"] if daq.duty_off is not None else []
+    lines += [f"host_ms = {daq.host_ms}", f"lift_ms = {daq.lift_ms}"]
+    lines += [f"third = {toml_text(daq.third)}"] if daq.third else []
+    trips = {"position": daq.position_trip, "current": daq.current_trip}
+    inside = ", ".join(f"{role} = [{x[0]!r}, {x[1]!r}]" for role, x in trips.items() if x is not None)
+    return [*lines, f"trip = {{ {inside} }}"] if inside else lines
