@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ambid.job import identify
-from ambid.job.track import rows_of
+from ambid.job.bench_rows import rows_of
 from ambid.rig import load_rig
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples

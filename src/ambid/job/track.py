@@ -9,32 +9,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from ambid.errors import EstimationError
 from ambid.identify.estimate import Estimate
-from ambid.identify.threads import one_thread
 from ambid.job._progress import Tick, silent
-from ambid.job.bench_rows import BenchRows, rows_of
+from ambid.job.bench_rows import rows_of
+from ambid.job.follow import Flag, Pace, follow
 from ambid.job.track_settings import check_settings
-from ambid.job.track_start import check_settling, credible_limits, start_of
-from ambid.physics.models import model
+from ambid.job.track_start import start_of
 from ambid.record import Record
 from ambid.rig import Rig, default_rig, load_rig
 from ambid.track.lines import Track, TrackHeader, TrackLine
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.physical.signals import Samples
-from ambid.track.physical.synchronous import Forcing
-from ambid.track.reporter import Reporter, header
-from ambid.track.stream.engine import run
-from ambid.track.stream.guard import StreamGuard
-from ambid.track.stream.outcome import Stretch
-from ambid.track.stream.rows import ABSURD
-from ambid.track.supervise.supervisor import Supervisor
-from ambid.track.supervise.warm_up import warm_up
-
-Flag = Literal["track", "hold", "accept", "revert"]
-Pace = Literal["fastest", "real-time"]
 
 
 def track(
@@ -116,61 +100,7 @@ def track(
     say("start")
     begin = start_of(source, bench_rig, given=start, start_s=start_s, rig_speaks=told is not None)
     say("track")
-    numbers, first, forcing = begin.numbers, begin.first, source.forcing
-    rpem = PhysicalRpem(numbers, memory=memory)
-    check_settling(rpem, source, first)
-    supervisor = Supervisor(rpem, limit=limit, t0=source.t0, listener=lambda event: reporter.note(event))
-    lines: list[TrackLine] = []
-
-    def emit(line: TrackLine) -> Sequence[Flag] | None:
-        if keep:
-            lines.append(line)
-        return None if on_line is None else on_line(line)
-
-    warm_up(numbers, memory)
-    reporter = Reporter(supervisor, every_s=every_s, on_line=emit, flags=flags, t0=source.t0, first=first)
-    top = header(
-        supervisor, limit=limit, every_s=reporter.every_s, method=f"rpem, memory {memory}",
-        record={**source.origin, "samples": int(np.count_nonzero(source.replay.numbers >= first))},
-        warnings=begin.warnings,
+    return follow(
+        source.replay.since(begin.first), source, begin, bench_rig, every_s=every_s, limit=limit, memory=memory,
+        pace=pace, flags=flags, on_header=on_header, on_line=on_line, keep=keep,
     )  # fmt: skip
-    if on_header is not None:
-        on_header(top)
-    n_u = len(model(bench_rig.model).inputs)
-    with one_thread():
-        report = run(
-            source.replay.since(first),
-            lambda stretch: reporter.consume(_samples(stretch, n_u, forcing), stretch.first, restart=stretch.restart),
-            reporter.reject,
-            guard=_guard(source, begin.estimate),
-            pace=pace,
-            producer="process" if pace == "real-time" else "none",
-            block_samples=source.replay.block_samples,
-        )
-    reporter.finish()
-    summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)
-    return Track(header=top, lines=tuple(lines), summary=summary)
-
-
-def _guard(source: BenchRows, estimate: Estimate) -> StreamGuard:
-    """A guard that watches outputs for freezing, but no input and no forcing: these may rest."""
-    plant, n_f = model(estimate.model), 0 if source.forcing is None else 2
-    n_u, n_y = len(plant.inputs), len(plant.outputs)
-    outputs: list[int | Literal["auto"] | None] = ["auto"] * n_y
-    return StreamGuard(
-        source.replay.rate_hz,
-        n_u + n_y + n_f,
-        limits=credible_limits(source, estimate) + [ABSURD] * n_f,
-        stuck=[*[None] * n_u, *outputs, *[None] * n_f],
-    )
-
-
-def _samples(stretch: Stretch, n_u: int, forcing: Forcing | None) -> Samples:
-    """Take the columns of a stretch apart."""
-    n = stretch.values.shape[1] - (0 if forcing is None else 2)
-    u, y, extra = np.split(stretch.values, [n_u, n], axis=1)
-    return Samples(
-        u=np.ascontiguousarray(u),
-        y=np.ascontiguousarray(y),
-        forcing=None if forcing is None else np.ascontiguousarray(extra),
-    )

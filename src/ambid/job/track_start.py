@@ -107,13 +107,14 @@ def start_of(
     )
 
 
-def check_settling(rpem: PhysicalRpem, source: BenchRows, first: int) -> None:
+def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:
     """Refuse a start whose predictor would never say anything of the record.
 
     Parameters
     ----------
     rpem : PhysicalRpem
-    source : BenchRows
+    duration_s : float
+        Of the whole record, s; infinite for a live stream.
     first : int
         Number of the first sample that is tracked.
 
@@ -123,8 +124,8 @@ def check_settling(rpem: PhysicalRpem, source: BenchRows, first: int) -> None:
         If settling takes too long.
     """
     rate = rpem.numbers.rate_hz
-    settling_s, left_s = rpem.stream.settling_samples / rate, source.duration_s - first / rate
-    most_s = min(_SETTLED_S, _SETTLED_PART * source.duration_s)
+    settling_s, left_s = rpem.stream.settling_samples / rate, duration_s - first / rate
+    most_s = min(_SETTLED_S, _SETTLED_PART * duration_s)
     if settling_s > most_s:
         raise EstimationError(
             f"the predictor of the start needs {settling_s:.3g} s to settle, of {left_s:.3g} s to track; at most"
