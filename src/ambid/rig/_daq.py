@@ -105,7 +105,7 @@ def _trip(
     least, most = UNLIMITED if limits is None else getattr(limits, role)
     if low < least or high > most:
         raise RigError(
-            f"{place}.trip.{role} is [{low}, {high}], outside loop.limits.{role} = [{least}, {most}]: the bench would be at"
-            " its limit before the controller trips. Narrow the trip, or correct the limit"
+            f"{place}.trip.{role} is [{low}, {high}], outside loop.limits.{role} = [{least}, {most}]; the controller"
+            " must trip before the bench is at its limit. Narrow the trip, or correct the limit"
         )
     return low, high
