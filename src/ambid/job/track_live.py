@@ -1,0 +1,240 @@
+"""Live tracking: a device runs in a thread of its own and fills a ring; the tracker follows what comes out of it.
+
+Nothing on the way of the data waits for the tracker. The beginning of the stream is what an identification starts from,
+or what a given start is checked with; it is then tracked like the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+from pathlib import Path
+from threading import Event as Signal
+from threading import Thread
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from ambid.acquire.device import Device, DeviceEvent
+from ambid.acquire.session import Course, RunReport, Tap, run
+from ambid.acquire.view import BenchView
+from ambid.errors import DeviceError
+from ambid.identify.estimate import Estimate
+from ambid.job.bench_rows import BenchRows
+from ambid.job.follow import Flag, follow
+from ambid.job.track_start import start_of
+from ambid.physics.models import model
+from ambid.record import Channel, Record
+from ambid.rig import Rig
+from ambid.track.lines import Track, TrackHeader, TrackLine
+from ambid.track.stream.block import Block, Frame
+from ambid.track.stream.replay import Replay
+from ambid.track.stream.ring import BlockRing
+
+_BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
+_QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy
+_LOOK_S = 0.1
+_CHECKED_S = 0.5  # of the stream that a given start is checked with
+_IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is to be identified
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveTrack:
+    """What came of live tracking.
+
+    Attributes
+    ----------
+    track : Track
+        Header, lines where they were kept, summary.
+    run : RunReport
+        Of the device.
+    overruns : int
+        Blocks that found the ring full: they are gaps in the track, and counted there too.
+    """
+
+    track: Track
+    run: RunReport
+    overruns: int
+
+
+def track_live(
+    device: Device,
+    rig: Rig,
+    course: Course,
+    *,
+    start: Estimate | str | Path | None = None,
+    start_s: float | None = None,
+    every_s: float = 0.01,
+    limit: float = 1.5,
+    memory: float | Literal["auto", "all"] = "auto",
+    flags: Sequence[tuple[float, Flag]] = (),
+    taps: Sequence[Tap] = (),
+    on_event: Callable[[DeviceEvent], object] | None = None,
+    on_header: Callable[[TrackHeader], None] | None = None,
+    on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
+    keep: bool = True,
+) -> LiveTrack:
+    """Let a device do a course, and follow the physical parameters of its bench meanwhile.
+
+    Parameters
+    ----------
+    device : Device
+        Opened, idle.
+    rig : Rig
+        Its bench.
+    course : Course
+        What the device is to do; tracking begins when it has settled.
+    start : Estimate, str or Path, optional
+        Where tracking begins; default: an identification of the first part of the stream.
+    start_s : float, optional
+        Length of that part, s.
+    every_s, limit, memory, flags, on_header, on_line, keep
+        As `ambid.job.track.track`; times count from the first sample that is tracked.
+    taps : sequence of Tap
+        Others who listen to the run, such as a recorder.
+    on_event : callable, optional
+        Told of the device's events, in the thread of the run.
+
+    Returns
+    -------
+    LiveTrack
+        The track up to the end of the course, a fault, or an interrupt.
+
+    Raises
+    ------
+    AmbidError
+        If the device, the rig or the start break a rule.
+    """
+    plant = model(rig.model)
+    view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
+    slots = max(64, ceil(4.0 * _QUEUE_S * view.rate_hz / _BLOCK_SAMPLES))
+    with BlockRing.create(
+        rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
+    ) as ring:
+        runner = _Runner(device, course, [_RingTap(ring, view), *taps], on_event, ring)
+        with runner:
+            wanted_s = _wanted_s(start, start_s, view.rate_hz)
+            lead = _Lead(ring, runner, wanted_s, view, device.info.port)
+            begin = start_of(
+                lead.source, rig, given=start, start_s=None if start is not None else wanted_s, rig_speaks=True
+            )
+            track = follow(
+                lead.blocks(begin.first), lead.source, begin, rig, every_s=every_s, limit=limit, memory=memory,
+                flags=flags, on_header=on_header, on_line=on_line, keep=keep, live=True,
+            )  # fmt: skip
+        return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
+
+
+def _wanted_s(start: object, start_s: float | None, rate_hz: float) -> float:
+    if start is not None:
+        return _CHECKED_S
+    return max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / rate_hz) if start_s is None else start_s
+
+
+class _RingTap:
+    """Puts what a device samples into the ring, seen through the rig, numbered from its first sample."""
+
+    def __init__(self, ring: BlockRing, view: BenchView) -> None:
+        self._ring, self._view = ring, view
+        self._origin: int | None = None
+
+    def take(self, frame: Frame) -> None:
+        block = self._view.block(frame.block)
+        if self._origin is None:
+            self._origin = block.first
+        self._ring.put(replace(block, first=block.first - self._origin), frame.arrived_s)
+
+
+class _Runner:
+    """The run of the device, in a thread of its own; leaving the context ends it."""
+
+    def __init__(
+        self,
+        device: Device,
+        course: Course,
+        taps: Sequence[Tap],
+        on_event: Callable[[DeviceEvent], object] | None,
+        ring: BlockRing,
+    ) -> None:
+        self._job = (device, course, taps, on_event)
+        self._ring, self._stop = ring, Signal()
+        self._report: RunReport | None = None
+        self._failure: BaseException | None = None
+        self._thread = Thread(target=self._run, name="acquisition", daemon=True)
+
+    def __enter__(self) -> _Runner:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def report(self) -> RunReport:
+        """Return what came of the run; raise what ended it."""
+        if self._failure is not None:
+            raise self._failure
+        assert self._report is not None
+        return self._report
+
+    def _run(self) -> None:
+        device, course, taps, on_event = self._job
+        try:
+            self._report = run(device, course, taps=taps, on_event=on_event, stopped=self._stop.is_set)
+        except BaseException as failure:
+            self._failure = failure
+        finally:
+            self._ring.end()
+
+
+class _Lead:
+    """The beginning of the stream: read before tracking begins, and tracked with the rest."""
+
+    def __init__(self, ring: BlockRing, runner: _Runner, wanted_s: float, view: BenchView, port: str) -> None:
+        self._ring, self._read = ring, list[Block]()
+        wanted = round(wanted_s * view.rate_hz) + 1
+        while not self._read or self._end() < wanted:
+            frame = ring.read(_LOOK_S)
+            if frame is not None:
+                self._read.append(frame.block)
+            elif ring.ended and not ring.filled:
+                self._too_short(runner, wanted_s, view.rate_hz)
+        values = np.concatenate([b.values for b in self._read])
+        numbers = np.concatenate([b.first + np.arange(len(b.values)) for b in self._read])
+        stamps = np.concatenate([b.time_s + np.arange(len(b.values)) / view.rate_hz for b in self._read])
+        channels = tuple(
+            Channel(name=role, unit=unit, values=values[:, k]) for k, (role, unit) in enumerate(view.units.items())
+        )
+        provenance = MappingProxyType({"file": port})
+        self.source = BenchRows(
+            record=Record(channels=channels, rate_hz=view.rate_hz, provenance=provenance),
+            replay=Replay(
+                values=values, numbers=numbers, time_s=stamps, rate_hz=view.rate_hz, block_samples=_BLOCK_SAMPLES
+            ),
+            forcing=None,
+            t0=0.0,
+        )
+
+    def blocks(self, first: int) -> Iterator[Block]:
+        """Yield what was read, from a number on, and then what comes."""
+        yield from self.source.replay.since(first)
+        while True:
+            frame = self._ring.read(_LOOK_S)
+            if frame is not None:
+                yield frame.block
+            elif self._ring.ended and not self._ring.filled:
+                return
+
+    def _end(self) -> int:
+        return self._read[-1].first + len(self._read[-1].values)
+
+    def _too_short(self, runner: _Runner, wanted_s: float, rate_hz: float) -> None:
+        runner.__exit__(None, None, None)
+        report = runner.report()
+        why = "" if report.fault is None else f" ({report.fault.what})"
+        raise DeviceError(
+            f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin"
+            " with. Run longer, or see to what ended it"
+        )
