@@ -1,0 +1,293 @@
+"""Many frames of samples to arrays at once, with the 16-bit numbers of their ticks unwrapped and every gap counted.
+
+A number that jumps is believed once the next sample goes on from it: a damaged frame whose CRC is right by chance
+(one in 65536) would else look like a gap, and the return from it like one of 65 thousand samples.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.acquire.protocol.table import StreamColumn, table
+from ambid.errors import DeviceError
+
+_WRAP = 1 << 16  # ticks in a sample
+_STATUS_WRAP = 1 << 32  # ticks in a status
+_LEAK = 0.02  # how much slower than said the controller's clock may be, with much to spare
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Samples:
+    """Samples in the order of their ticks.
+
+    Attributes
+    ----------
+    ticks : ndarray of int64, shape (n_samples,)
+        Numbers of the ticks since start, strictly increasing.
+    states : ndarray of uint8, shape (n_samples,)
+        Values of enum ``state``.
+    causes : ndarray of uint8, shape (n_samples,)
+        Values of enum ``cause``.
+    values : ndarray of float64, shape (n_samples, n_columns), counts
+        In the order of the stream mask's bits.
+    gaps : tuple of (int, int)
+        For each gap that ends in these samples: the number of the first sample that is missing, and how many are.
+    """
+
+    ticks: NDArray[np.int64]
+    states: NDArray[np.uint8]
+    causes: NDArray[np.uint8]
+    values: NDArray[np.float64]
+    gaps: tuple[tuple[int, int], ...]
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    def runs(self) -> list[slice]:
+        """Return the longest pieces without a gap, in their order."""
+        if not len(self.ticks):
+            return []
+        cuts = (np.flatnonzero(np.diff(self.ticks) != 1) + 1).tolist()
+        return [slice(a, b) for a, b in zip([0, *cuts], [*cuts, len(self.ticks)], strict=True)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleCounters:
+    """What became of the frames of samples, since the decoder was made.
+
+    Attributes
+    ----------
+    samples : int
+        Given out.
+    lost : int
+        Ticks of which no sample was given out, between the first expected and the last given out.
+    gaps : int
+        Runs of such ticks.
+    damaged : int
+        Frames of samples whose length is not that of the stream, or whose state or cause does not exist.
+    misnumbered : int
+        Frames whose number jumped and the next one did not go on from it: dropped.
+    repeated : int
+        Frames with the number of the one before: dropped.
+    """
+
+    samples: int = 0
+    lost: int = 0
+    gaps: int = 0
+    damaged: int = 0
+    misnumbered: int = 0
+    repeated: int = 0
+
+
+def columns_of(mask: int) -> tuple[StreamColumn, ...]:
+    """Return what a sample carries for a stream mask.
+
+    Parameters
+    ----------
+    mask : int
+        Field ``stream`` of ``configure``.
+
+    Returns
+    -------
+    tuple of StreamColumn
+        In the order of a sample's values.
+
+    Raises
+    ------
+    DeviceError
+        If the mask has a bit that the table does not have.
+    """
+    known = table().stream
+    if mask < 0 or mask >> len(known):
+        raise DeviceError(f"stream mask {mask:#x} has unknown bits. Give bits 0 to {len(known) - 1} only")
+    return tuple(c for c in known if mask >> c.bit & 1)
+
+
+class SampleDecoder:
+    """Turns frames of samples into arrays.
+
+    Parameters
+    ----------
+    mask : int
+        Stream mask that was configured.
+    rate_hz : float or None
+        Samples in one second. With it and with times of arrival, gaps of more than 65535 ticks are counted right, up to
+        ten minutes; without, such a gap is counted short by a multiple of 65536.
+    """
+
+    def __init__(self, mask: int, *, rate_hz: float | None = None) -> None:
+        self._columns = columns_of(mask)
+        self._layout = np.dtype(
+            [("code", "u1"), ("tick", "<u2"), ("state", "u1"), ("values", "<u2", (len(self._columns),))]
+        )
+        self._code = table().messages["sample"].code
+        self._signed = [j for j, column in enumerate(self._columns) if column.kind == "i16"]
+        self._known = np.zeros(256, dtype=bool)
+        for state in table().enums["state"]:
+            for cause in table().enums["cause"]:
+                self._known[state.value | cause.value << 4] = True
+        self._rate = rate_hz or math.nan
+        self._given = self._lost = self._gaps = self._damaged = self._misnumbered = self._repeated = 0
+        self.restart()
+
+    @property
+    def counters(self) -> SampleCounters:
+        """What was counted so far."""
+        return SampleCounters(
+            samples=self._given,
+            lost=self._lost,
+            gaps=self._gaps,
+            damaged=self._damaged,
+            misnumbered=self._misnumbered,
+            repeated=self._repeated,
+        )
+
+    @property
+    def next_tick(self) -> int | None:
+        """Number of the sample that is expected next; None before the first one of a stream joined on its way."""
+        return None if self._last is None else self._last + 1
+
+    def restart(self, first: int | None = 0) -> None:
+        """Expect a new stream; what was counted stays.
+
+        Parameters
+        ----------
+        first : int or None
+            Number of its first sample; None: any, of a stream joined on its way.
+        """
+        self._last = None if first is None else first - 1
+        self._held: bytes = b""  # one sample whose number jumped, until the next one speaks for it
+        self._zero_s = math.inf  # earliest time, by the host's clock, that tick 0 can have had
+        self._zero_at = 0.0
+
+    def decode(self, payloads: Iterable[bytes], arrived_s: float | None = None) -> Samples:
+        """Take the next frames of samples.
+
+        Parameters
+        ----------
+        payloads : iterable of bytes
+            Code and fields of sound frames of message ``sample``, in their order.
+        arrived_s : float or None
+            When they arrived, by any steady clock of the host, s. None where the controller's time does not run with
+            the host's.
+
+        Returns
+        -------
+        Samples
+            May be empty. A last sample whose number jumped comes with the next call, or with `finish`.
+        """
+        return self._take(payloads, arrived_s, final=False)
+
+    def finish(self, ticks: int | None = None) -> Samples:
+        """Give out what was held back, at the end of a stream.
+
+        Parameters
+        ----------
+        ticks : int or None
+            Number of ticks since start, as the controller's status says; those that never came count as lost.
+
+        Returns
+        -------
+        Samples
+            One or none.
+        """
+        rest = self._take((), None, final=True)
+        if ticks is None or self._last is None:
+            return rest
+        missing = (ticks - 1 - self._last) % _STATUS_WRAP
+        if not 0 < missing < _STATUS_WRAP // 2:
+            return rest
+        gap = (self._last + 1, missing)
+        self._lost += missing
+        self._gaps += 1
+        self._last += missing
+        return replace(rest, gaps=(*rest.gaps, gap))
+
+    def _take(self, payloads: Iterable[bytes], arrived_s: float | None, *, final: bool) -> Samples:
+        raw = self._stack(payloads)
+        if len(raw):
+            raw = raw[self._sound(raw)]
+        if self._held:
+            raw = np.concatenate([np.frombuffer(self._held, dtype=self._layout), raw])
+            self._held = b""
+        numbers, gaps = self._number(raw, arrived_s, final=final)
+        keep = numbers >= 0
+        if not keep.all():
+            raw, numbers = raw[keep], numbers[keep]
+        self._given += len(raw)
+        if len(raw):
+            self._note_time(arrived_s)
+        values = raw["values"].astype(np.float64)
+        for j in self._signed:
+            values[:, j] = raw["values"][:, j].astype(np.int16)
+        states = raw["state"]
+        return Samples(ticks=numbers, states=states & 15, causes=states >> 4, values=values, gaps=tuple(gaps))
+
+    def _stack(self, payloads: Iterable[bytes]) -> NDArray[np.void]:
+        size = self._layout.itemsize
+        frames = list(payloads)
+        sound = [p for p in frames if len(p) == size and p[0] == self._code]
+        self._damaged += len(frames) - len(sound)
+        return np.frombuffer(b"".join(sound), dtype=self._layout)
+
+    def _sound(self, raw: NDArray[np.void]) -> NDArray[np.bool_]:
+        sound = self._known[raw["state"]]
+        self._damaged += len(raw) - int(np.count_nonzero(sound))
+        return sound
+
+    def _number(
+        self, raw: NDArray[np.void], arrived_s: float | None, *, final: bool
+    ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+        """Return the number of each sample, -1 for those that are dropped or held, and the gaps."""
+        ticks = raw["tick"].astype(np.int64)
+        numbers = np.full(len(ticks), -1, dtype=np.int64)
+        gaps: list[tuple[int, int]] = []
+        if not len(ticks):
+            return numbers, gaps
+        cuts = [0, *(np.flatnonzero(np.diff(ticks) % _WRAP != 1) + 1).tolist(), len(ticks)]
+        for begin, end in pairwise(cuts):  # of each piece the ticks follow one another
+            tick = int(ticks[begin])
+            last = tick - 1 if self._last is None else self._last
+            short = (tick - last) % _WRAP
+            step = short if short == 1 else short + _WRAP * self._wraps(last + short, arrived_s)
+            if step == 0:
+                self._repeated += 1
+                begin, step = begin + 1, 1
+            elif step > 1 and end - begin == 1 and not (final and end == len(ticks)):
+                if end == len(ticks):
+                    self._held = raw[begin:].tobytes()
+                    continue
+                if 0 < (int(ticks[end]) - last) % _WRAP < short:
+                    self._misnumbered += 1
+                    continue
+            if step > 1:
+                gaps.append((last + 1, step - 1))
+                self._lost += step - 1
+                self._gaps += 1
+            numbers[begin:end] = last + step + np.arange(end - begin)
+            self._last = last + step + end - begin - 1
+        return numbers, gaps
+
+    def _wraps(self, at_least: int, arrived_s: float | None) -> int:
+        """Return how often 65536 ticks went by unseen, if the time says so.
+
+        A sample can arrive late by any time but never early; so time counts from the earliest start that all samples so
+        far allow, and a host that slept and finds its buffer full does not take the buffer for a gap.
+        """
+        if arrived_s is None or not math.isfinite(self._zero_s + self._rate):
+            return 0
+        newest = (arrived_s - self._zero_s) * self._rate
+        return max(0, round((newest - at_least) / _WRAP))
+
+    def _note_time(self, arrived_s: float | None) -> None:
+        if arrived_s is None or self._last is None or not math.isfinite(self._rate):
+            return
+        zero = arrived_s - self._last / self._rate
+        self._zero_s = min(zero, self._zero_s + _LEAK * (arrived_s - self._zero_at))
+        self._zero_at = arrived_s
