@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, Literal
 from ambid.errors import RigError
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import UNLIMITED, Interval, Limits
-from ambid.rig.rig import Daq, RigChannel
+from ambid.rig.rig import DAQ_RATE_HZ, Daq, RigChannel
 
 if TYPE_CHECKING:
     from ambid.rig.schema import DaqEntry
-
-RATE_HZ = 2000.0
-"""Rate of the controller where neither ``[daq]`` nor ``[record]`` gives one, Hz."""
 
 _HOST_MS = (20, 2000)
 _LIFT_MS = (0, 2000)
@@ -65,13 +62,14 @@ def daq_of(
             raise RigError(f"{place}.{name} is {value}; the controller takes {low} to {high} ms. Correct it")
     _check_third(entry.third, channels, plant, place)
     return Daq(
-        rate_hz=entry.rate_hz or record_rate_hz or RATE_HZ,
+        rate_hz=entry.rate_hz or record_rate_hz or DAQ_RATE_HZ,
         baud=entry.baud,
         duty=entry.duty,
         duty_off=entry.duty_off,
         host_ms=entry.host_ms,
         lift_ms=entry.lift_ms,
         third=entry.third,
+        bench=entry.bench,
         position_trip=_trip("position", entry.trip.position, limits, plant, place),
         current_trip=_trip("current", entry.trip.current, limits, plant, place),
     )

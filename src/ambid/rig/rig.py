@@ -17,6 +17,9 @@ from ambid.record.sampling import GapPolicy
 TRIP_SHARE = 0.9
 """Share of ``loop.limits.position`` in which the controller holds the rotor, unless ``[daq.trip]`` says otherwise."""
 
+DAQ_RATE_HZ = 2000.0
+"""Rate of a controller where neither ``[daq]`` nor ``[record]`` gives one, Hz."""
+
 _EMPTY: Mapping[str, float] = MappingProxyType({})
 
 
@@ -92,17 +95,21 @@ class Daq:
         Time after the start of levitation in which the rotor may still lie outside its gap, ms.
     third : str or None
         Column of the third analog input; None: it is not sampled.
+    bench : str or None
+        Plant that an emulated or simulated controller stands before: a preset, or a rig file (path relative to this
+        one); None: the rig's own parameters.
     position_trip, current_trip : (float, float) or None
         Where the controller goes to its safe state, m and A; None: see :meth:`Rig.trip`.
     """
 
-    rate_hz: float = 2000.0
+    rate_hz: float = DAQ_RATE_HZ
     baud: int = 1_000_000
     duty: tuple[int, int] | None = None
     duty_off: int | None = None
     host_ms: int = 250
     lift_ms: int = 300
     third: str | None = None
+    bench: str | None = None
     position_trip: Interval | None = None
     current_trip: Interval | None = None
 

@@ -136,6 +136,7 @@ class DaqEntry(_Entry):
     host_ms: Whole = 250
     lift_ms: Whole = 300
     third: Text | None = None
+    bench: Text | None = None
     trip: TripEntry = Field(default_factory=TripEntry)
 
 

@@ -168,6 +168,7 @@ def _daq_lines(daq: Daq) -> list[str]:
     lines += [f"duty_off = {daq.duty_off}"] if daq.duty_off is not None else []
     lines += [f"host_ms = {daq.host_ms}", f"lift_ms = {daq.lift_ms}"]
     lines += [f"third = {toml_text(daq.third)}"] if daq.third else []
+    lines += [f"bench = {toml_text(daq.bench)}"] if daq.bench else []
     trips = {"position": daq.position_trip, "current": daq.current_trip}
     inside = ", ".join(f"{role} = [{x[0]!r}, {x[1]!r}]" for role, x in trips.items() if x is not None)
     return [*lines, f"trip = {{ {inside} }}"] if inside else lines
