@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from ambid.acquire.protocol.c_header import c_header
+from ambid.acquire.protocol.page import protocol_page
 from ambid.acquire.protocol.table import table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -19,7 +20,10 @@ def made() -> dict[Path, str]:
     dict of Path to str
         Each file and its text.
     """
-    return {ROOT / "firmware" / "amb_daq" / "protocol.h": c_header(table())}
+    return {
+        ROOT / "firmware" / "amb_daq" / "protocol.h": c_header(table()),
+        ROOT / "docs" / "protocol.md": protocol_page(table()),
+    }
 
 
 def main(arguments: list[str]) -> int:

@@ -99,7 +99,8 @@ class FrameDecoder:
 
     def __init__(self, to: str = "host") -> None:
         self._kinds = table().by_code(to)
-        self._fixed = {code: kind.length for code, kind in self._kinds.items() if kind.tail is None}
+        most = table().largest - CRC_BYTES
+        self._lengths = {code: {n for n in range(most + 1) if fits(kind, n)} for code, kind in self._kinds.items()}
         self._longest = table().largest + 1  # on the line, without its 0x00
         self._tail = b""
         self._inside_overlong = False
@@ -191,19 +192,18 @@ class FrameDecoder:
         if crc_hqx(payload, 0) != body[-2] | body[-1] << 8:
             self._damage["crc"] += 1
             return None
-        if self._fixed.get(payload[0]) != len(payload) and not self._allowed(payload):
+        if len(payload) not in self._lengths.get(payload[0], ()) and not self._allowed(payload):
             return None
         return payload
 
     def _allowed(self, payload: bytes) -> bool:
-        """Judge a frame with sound CRC that has not the one length of its code."""
+        """Judge a frame with sound CRC that has not a length of its code."""
         kind = self._kinds.get(payload[0])
         if kind is None:
             self._damage["code"] += 1
             return False
         # Another version's identity may be longer or shorter; it must get through, so that its version can be named.
         other_version = kind.name == "identity" and len(payload) > 2 and payload[2] != table().version
-        if fits(kind, len(payload)) or other_version:
-            return True
-        self._damage["length"] += 1
-        return False
+        if not other_version:
+            self._damage["length"] += 1
+        return other_version

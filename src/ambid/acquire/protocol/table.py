@@ -255,6 +255,10 @@ def _complaints(made: Table) -> Iterator[str]:
     names = [*made.enums, *made.bits, *(c.name for c in made.stream), *made.messages]
     names += [f.name for m in made.messages.values() for f in m.fields]
     yield from (f"{name!r} is no name in both languages" for name in names if not _NAME.fullmatch(name))
+    texts = [e.about for entries in [*made.enums.values(), *made.bits.values()] for e in entries]
+    texts += [c.about for c in made.stream] + [m.about for m in made.messages.values()]
+    texts += [f.about for m in made.messages.values() for f in m.fields]
+    yield from (f"{text!r} would end a comment or a row" for text in texts if re.search(r"\*/|/\*|[|\n\\]", text))
 
 
 def _complaints_of_message(message: MessageType, largest: int) -> Iterator[str]:
