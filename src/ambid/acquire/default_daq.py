@@ -1,0 +1,108 @@
+"""Instruments for a rig that has none: an emulated or simulated bench samples in counts, whatever its rig says.
+
+Sensors are made up so that the limits of the loop fill four fifths of the converter, the power stage so that the limits
+of the voltage are its ends. A rig for hardware has to say all this itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from ambid.acquire.board import ADC_TOP, PWM_TOP, nearest_rate, period_of
+from ambid.acquire.scales import who
+from ambid.errors import DeviceError, RigError
+from ambid.physics.loop import UNLIMITED, Interval
+from ambid.physics.models import model
+from ambid.record.calibration import Calibration
+from ambid.rig.rig import DAQ_RATE_HZ, Daq, Rig, RigChannel
+
+SPAN = 1.25
+"""Full scale of a sensor that is made up, over the limits of the loop."""
+
+_UNITS = {"position": "m", "current": "A", "voltage": "V"}
+
+
+def with_default_daq(rig: Rig) -> Rig:
+    """Return a rig with ``[daq]`` and calibrations from counts; what it has already stays.
+
+    Parameters
+    ----------
+    rig : Rig
+        With limits of voltage, current and position where it has no calibrations.
+
+    Returns
+    -------
+    Rig
+        For `controller_settings`, as an emulated or simulated bench uses it; `default_daq_notes` says what was made up.
+
+    Raises
+    ------
+    RigError
+        If there are no limits to make an instrument from.
+    """
+    return _filled(rig)[0]
+
+
+def default_daq_notes(rig: Rig) -> tuple[str, ...]:
+    """Return what `with_default_daq` makes up for a rig, one line each.
+
+    Parameters
+    ----------
+    rig : Rig
+        As for `with_default_daq`.
+
+    Returns
+    -------
+    tuple of str
+        Empty where the rig is complete.
+
+    Raises
+    ------
+    RigError
+        As `with_default_daq`.
+    """
+    return _filled(rig)[1]
+
+
+def _filled(rig: Rig) -> tuple[Rig, tuple[str, ...]]:
+    notes: list[str] = []
+    plant = model(rig.model)
+    channels = []
+    for c in rig.channels:
+        wanted = c.role in _UNITS and c.role in (*plant.inputs, *plant.outputs)
+        channels.append(_calibrated(rig, c, notes) if wanted and c.calibration is None else c)
+    return replace(rig, channels=tuple(channels), daq=rig.daq or _daq(rig, notes)), tuple(notes)
+
+
+def _calibrated(rig: Rig, c: RigChannel, notes: list[str]) -> RigChannel:
+    """Give a channel a straight line from counts; its column is then in counts, whatever unit it was read in."""
+    low, high = _full_scale(rig, c.role)
+    top = PWM_TOP if c.role == "voltage" else ADC_TOP
+    of = Calibration(unit_in="1", unit_out=_UNITS[c.role], gain=(high - low) / top, offset=low)
+    notes.append(f"{c.role}: 0 to {top} counts made up as {low:.4g} to {high:.4g} {_UNITS[c.role]}")
+    return replace(c, calibration=of, unit=None)
+
+
+def _full_scale(rig: Rig, role: str) -> Interval:
+    low, high = UNLIMITED if rig.limits is None else getattr(rig.limits, role)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise RigError(
+            f"{who(rig)}: channels.{role} has no calibration, and there is no loop.limits.{role} to make one from. Give"
+            " one of them"
+        )
+    if role == "voltage":
+        return low, high
+    middle, half = (low + high) / 2.0, SPAN * (high - low) / 2.0
+    return middle - half, middle + half
+
+
+def _daq(rig: Rig, notes: list[str]) -> Daq:
+    wanted = rig.record.rate_hz or DAQ_RATE_HZ
+    try:
+        period_of(wanted)
+    except DeviceError:
+        rate = nearest_rate(wanted)
+        notes.append(f"rate: {rate:.6g} Hz, the nearest to {wanted:g} Hz that the controller can do")
+        return Daq(rate_hz=rate)
+    return Daq(rate_hz=wanted)

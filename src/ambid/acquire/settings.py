@@ -1,0 +1,300 @@
+"""From a rig in SI to the whole numbers that its controller is given, and back.
+
+Gains, set point, limits and trips go through the calibrations of the channels; a bent calibration is taken by its slope
+at rest. What a controller cannot hold, or could not protect, is refused; what it holds only roughly is told by
+`ambid.acquire.review`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ambid.acquire._limits import count_inside, duty_off, duty_range, trip_counts
+from ambid.acquire.board import ADC_TOP, LAG_S, PWM_HZ, period_of
+from ambid.acquire.default_daq import default_daq_notes, with_default_daq
+from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
+from ambid.acquire.scales import scale_of, who
+from ambid.errors import RigError
+from ambid.physics.loop import Loop
+from ambid.physics.models import model
+from ambid.rig.rig import Daq, Rig
+
+__all__ = [
+    "STREAM",
+    "ControllerSettings",
+    "columns",
+    "controller_settings",
+    "default_daq_notes",
+    "in_si",
+    "realised",
+    "rest_of",
+    "with_default_daq",
+]
+
+GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
+"""Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
+
+_LARGEST_GAIN = 2**31 - 1
+_FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
+_FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state, CRC, COBS, end
+_LINE_SHARE = 0.95
+_CONFIGURE = ("period", "stream")
+_LIMITS = ("position_low", "position_high", "current_low", "current_high", "duty_low", "duty_high", "duty_off")
+_GAINS = ("kp", "ki", "kd", "pole", "kc", "setpoint", "current_rest", "duty_bias")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerSettings:
+    """What the messages ``configure``, ``limits`` and ``gains`` want, under the names of their fields.
+
+    Attributes
+    ----------
+    period, stream : int
+        Tick in periods of the pulse width modulation; mask of what a sample carries.
+    position_low, position_high, current_low, current_high : int
+        Trips, counts.
+    duty_low, duty_high, duty_off : int
+        Pulse widths, counts.
+    host_ms, lift_ms : int
+        Silence of the host, time to lift, ms.
+    kp, ki, kd, pole, kc : int
+        Gains in the fixed point of the message ``gains``.
+    setpoint, current_rest, duty_bias : int
+        Rest, counts.
+    """
+
+    period: int
+    stream: int
+    position_low: int
+    position_high: int
+    current_low: int
+    current_high: int
+    duty_low: int
+    duty_high: int
+    duty_off: int
+    host_ms: int
+    lift_ms: int
+    kp: int = 0
+    ki: int = 0
+    kd: int = 0
+    pole: int = 0
+    kc: int = 0
+    setpoint: int = 0
+    current_rest: int = 0
+    duty_bias: int = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks in one second, exactly as the controller makes them, Hz."""
+        return PWM_HZ / self.period
+
+    @property
+    def closed(self) -> bool:
+        """True where any gain acts: without one there is nothing to levitate with."""
+        return any((self.kp, self.ki, self.kd, self.kc))
+
+    def configure(self) -> dict[str, int]:
+        """Return the fields of the message ``configure``, without its number."""
+        return {name: getattr(self, name) for name in _CONFIGURE}
+
+    def limits(self) -> dict[str, int]:
+        """Return the fields of the message ``limits``, without its number."""
+        return {name: getattr(self, name) for name in (*_LIMITS, "host_ms", "lift_ms")}
+
+    def gains(self) -> dict[str, int]:
+        """Return the fields of the message ``gains``, without its number."""
+        return {name: getattr(self, name) for name in _GAINS}
+
+
+def controller_settings(rig: Rig) -> ControllerSettings:
+    """Turn a rig into what its controller is told.
+
+    Parameters
+    ----------
+    rig : Rig
+        With ``[daq]`` and calibrations from counts; `ambid.acquire.default_daq.with_default_daq` makes them up.
+
+    Returns
+    -------
+    ControllerSettings
+        Each within what the controller takes. Trips are rounded inwards, all else to the nearest.
+
+    Raises
+    ------
+    RigError
+        If the rig does not say enough, or something that the controller cannot represent or protect.
+    DeviceError
+        If the controller has no exact tick of that rate.
+    """
+    daq = _daq(rig)
+    voltage, current = scale_of(rig, "voltage"), scale_of(rig, "current")
+    position = scale_of(rig, "position") if has_position(rig) else None
+    rest = rest_of(rig)
+    duty_low, duty_high = duty_range(rig, daq, voltage)
+    current_low, current_high = trip_counts(rig, current)
+    position_low, position_high = trip_counts(rig, position) if position else (0, ADC_TOP)
+    bias = count_inside(rig, voltage, rest["voltage"], duty_low, duty_high, "pulse widths allowed (daq.duty)")
+    current_rest = count_inside(rig, current, rest["current"], current_low, current_high, "trips")
+    setpoint = (
+        0 if position is None else count_inside(rig, position, rest["position"], position_low, position_high, "trips")
+    )
+    settings = ControllerSettings(
+        period=period_of(daq.rate_hz),
+        stream=stream_of(rig, daq),
+        position_low=position_low,
+        position_high=position_high,
+        current_low=current_low,
+        current_high=current_high,
+        duty_low=duty_low,
+        duty_high=duty_high,
+        duty_off=duty_off(rig, daq, voltage),
+        host_ms=daq.host_ms,
+        lift_ms=daq.lift_ms,
+        setpoint=setpoint,
+        current_rest=current_rest,
+        duty_bias=bias,
+        **_gains(rig, (bias, current_rest, setpoint)),
+    )
+    _check_line(rig, daq, settings)
+    return settings
+
+
+def realised(settings: ControllerSettings, rig: Rig) -> Loop:
+    """Return the loop that the controller really closes, after rounding, in SI.
+
+    Parameters
+    ----------
+    settings : ControllerSettings
+        What it is told.
+    rig : Rig
+        The rig that they were made from, for its calibrations.
+
+    Returns
+    -------
+    Loop
+        In SI, by the slopes of the calibrations at rest; its delay is that of the controller itself.
+    """
+    voltage = scale_of(rig, "voltage").slope(settings.duty_bias)
+    current = scale_of(rig, "current").slope(settings.current_rest)
+    position = scale_of(rig, "position").slope(settings.setpoint) if has_position(rig) else math.inf
+    period, pole = 1.0 / settings.rate_hz, settings.pole / 2.0**POLE_BITS
+    tau = period * pole / (1.0 - pole)
+    per_count = voltage / position / 2.0**GAIN_BITS
+    return Loop(
+        kp=settings.kp * per_count,
+        ki=settings.ki * voltage / position / 2.0**INTEGRAL_BITS / period,
+        kd=settings.kd * per_count * (tau + period),
+        kc=settings.kc * voltage / current / 2.0**GAIN_BITS,
+        derivative_cutoff_hz=1.0 / (2.0 * math.pi * tau) if tau else math.inf,
+        delay=LAG_S * settings.rate_hz,
+    )
+
+
+def rest_of(rig: Rig) -> dict[str, float]:
+    """Return the point about which the controller works.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its operating point; what that does not give is 0, for the voltage R times the current.
+
+    Returns
+    -------
+    dict of str to float
+        ``position`` (m), ``current`` (A), ``voltage`` (V).
+    """
+    given = rig.operating_point
+    current = given.get("current", 0.0)
+    resistance = next((p.value for p in rig.parameters if p.name == "R"), None) or 0.0
+    return {
+        "position": given.get("position", 0.0),
+        "current": current,
+        "voltage": given.get("voltage", resistance * current),
+    }
+
+
+def _daq(rig: Rig) -> Daq:
+    plant = model(rig.model)
+    if plant.inputs != ("voltage",) or "current" not in plant.outputs:
+        raise RigError(
+            f"{who(rig)}: model {rig.model!r} is not a coil driven by a voltage; the controller drives one and"
+            " samples its current. Use model one-axis or coil"
+        )
+    if rig.daq is None:
+        raise RigError(
+            f"{who(rig)} has no section [daq]; the controller has to be told its rate, pulse widths and trips."
+            " Add [daq] (docs/rig.md)"
+        )
+    return rig.daq
+
+
+def exact_gains(rig: Rig, rest: tuple[int, int, int]) -> dict[str, float]:
+    """Return the loop's gains in steps of the controller, not rounded, by the slopes of the calibrations at rest.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a loop, ``[daq]`` and calibrations.
+    rest : (int, int, int)
+        Counts at rest: pulse width, current, position.
+
+    Returns
+    -------
+    dict of str to float
+        ``kp``, ``ki``, ``kd``, ``kc`` in the units of the message ``gains``.
+    """
+    assert rig.loop is not None
+    assert rig.daq is not None
+    loop, period = rig.loop, 1.0 / rig.daq.rate_hz
+    volts = scale_of(rig, "voltage").slope(rest[0])
+    amperes = scale_of(rig, "current").slope(rest[1]) / volts
+    metres = scale_of(rig, "position").slope(rest[2]) / volts
+    return {
+        "kp": loop.kp * metres * 2.0**GAIN_BITS,
+        "ki": loop.ki * period * metres * 2.0**INTEGRAL_BITS,
+        "kd": loop.kd * metres / (loop.filter_s + period) * 2.0**GAIN_BITS,
+        "kc": loop.kc * amperes * 2.0**GAIN_BITS,
+    }
+
+
+def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
+    """Return the loop's gains in fixed point."""
+    loop = rig.loop
+    if loop is None or not loop.closed or not has_position(rig):
+        return {}
+    assert rig.daq is not None
+    rounded = {name: _gain(rig, name, value) for name, value in exact_gains(rig, rest).items()}
+    period, tau = 1.0 / rig.daq.rate_hz, loop.filter_s
+    pole = round(tau / (tau + period) * 2**POLE_BITS)
+    if pole >= 2**POLE_BITS:
+        raise RigError(
+            f"{who(rig)}: loop.derivative_cutoff_hz is {loop.derivative_cutoff_hz:.4g} Hz, too low for a tick of"
+            f" {period:.4g} s. Give at least {rig.daq.rate_hz / (2 * math.pi * 2**POLE_BITS):.4g} Hz"
+        )
+    return {**rounded, "pole": pole if loop.kd else 0}
+
+
+def _gain(rig: Rig, name: str, value: float) -> int:
+    if abs(value) > _LARGEST_GAIN:
+        raise RigError(
+            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {_LARGEST_GAIN} at"
+            f" most. Lower loop.{name}, or correct the calibrations of the channels"
+        )
+    steps = round(value)
+    if value != 0.0 and abs(steps) < _FEWEST_STEPS:
+        raise RigError(
+            f"{who(rig)}: loop.{name} is {value:.2g} steps of the controller, fewer than {_FEWEST_STEPS}: too"
+            f" small to be held. Raise loop.{name}, set it to 0, or use a sensor with fewer counts"
+        )
+    return steps
+
+
+def _check_line(rig: Rig, daq: Daq, settings: ControllerSettings) -> None:
+    bits = 10.0 * (_FRAME_BYTES + 2 * len(carried(settings)))
+    if bits * settings.rate_hz > _LINE_SHARE * daq.baud:
+        raise RigError(
+            f"{who(rig)}: {settings.rate_hz:g} samples of {bits:g} bits a second do not fit into daq.baud ="
+            f" {daq.baud} bit/s. At most {_LINE_SHARE * daq.baud / bits:.0f} Hz do; lower daq.rate_hz"
+        )
