@@ -1,0 +1,107 @@
+"""A record played back as a device: the blocks that were once sampled, with their gaps, in real time or faster.
+
+What was is over: it can be listened to (mode ``sample``), but neither driven, nor levitated, nor excited.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from ambid.acquire.device import Column, DeviceInfo, Mode, Program, SelfTest
+from ambid.acquire.devices.played import Pace, PlayedDevice
+from ambid.errors import DeviceError, RecordError
+from ambid.record import read_rows
+from ambid.rig.rig import Rig
+from ambid.track.stream.block import Block
+from ambid.track.stream.replay import Replay, blocks_of
+
+
+class ReplayDevice(PlayedDevice):
+    """A record file as a device.
+
+    Each start out of idle plays it from its first row on; numbers count on. ``Block.time_s`` is what the record says,
+    counted from the first row.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.csv``, ``.csv.gz``, ``.h5``.
+    rig : Rig
+        Whose columns are played.
+    pace : {"real", "fastest"}
+    block_samples : int, optional
+        Samples of a block at most; default those of 10 ms.
+
+    Raises
+    ------
+    DeviceError
+        If the record has not the rig's columns, or its rows cannot be numbered.
+    """
+
+    def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real", block_samples: int | None = None) -> None:
+        rows = read_rows(path, rate_hz=rig.record.rate_hz)
+        record = rows.record
+        missing = [c.column for c in rig.channels if c.column not in record.names]
+        if missing:
+            raise DeviceError(
+                f"record {path} has no column {missing[0]!r}, which the rig wants; it has {', '.join(record.names)}."
+                " Correct the rig, or take another record"
+            )
+        super().__init__(record.rate_hz, pace, block_samples)
+        names = tuple(c.column for c in rig.channels)
+        try:
+            self._replay: Replay = blocks_of(record, self._size, channels=names, time_s=rows.time_s)
+        except RecordError as failure:
+            raise DeviceError(str(failure)) from None
+        columns = tuple(Column(name=c.column, role=c.role, unit=record.channel(c.column).unit) for c in rig.channels)
+        self._info = DeviceInfo(kind="replay", port=str(path), rate_hz=record.rate_hz, columns=columns)
+        self._row = self._base = 0
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Who is there."""
+        return self._info
+
+    def _opened(self) -> None:
+        self._row = 0
+
+    def _begin(self, mode: Mode) -> None:
+        if mode != "sample":
+            self._refuse_playing(f"mode {mode!r}")
+        self._row, self._base = 0, self._next
+
+    def _play(self, program: Program | None) -> None:
+        if program is not None:
+            self._refuse_playing("an excitation")
+
+    def _tested(self) -> SelfTest:
+        bad = int(np.isnan(self._replay.values).any(axis=1).sum())
+        failed = (f"{bad} of {len(self._replay.values)} rows have holes",) if bad else ()
+        return SelfTest(failed=failed, numbers={"rows": float(len(self._replay.values)), "rows_with_holes": float(bad)})
+
+    def _made(self, room: int) -> Block | None:
+        played = self._replay
+        start, total = self._row, played.numbers.size
+        if start >= total:
+            return None
+        stop = min(start + room, total)
+        # A block ends where the numbers do not follow on each other.
+        steps = np.diff(played.numbers[start:stop])
+        jumps = np.flatnonzero(steps != 1)
+        if jumps.size:
+            stop = start + int(jumps[0]) + 1
+        self._row = stop
+        return Block(
+            first=self._base + int(played.numbers[start] - played.numbers[0]),
+            time_s=self._base / self._rate + float(played.time_s[start] - played.time_s[0]),
+            values=played.values[start:stop],
+        )
+
+    def _refuse_playing(self, what: str) -> NoReturn:
+        raise DeviceError(
+            f"{self._where} refuses {what}; a record can be listened to, not acted on. Use mode 'sample', or a"
+            " simulated device"
+        )

@@ -1,0 +1,284 @@
+"""The controller as the host talks to it: commands that are answered or told why not, and a sign of life from the host.
+
+A command has a number. Without an answer in time it is sent again with the same number, which the controller answers
+again without carrying it out twice. Pings go out from a thread of their own, whatever the rest of the program does.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ambid.acquire.link.listener import Hearing, Listener
+from ambid.acquire.link.port import Port
+from ambid.acquire.link.refusals import refusal
+from ambid.acquire.protocol.codec import Message, message
+from ambid.acquire.protocol.framing import FrameCounters, encode
+from ambid.errors import DeviceError
+
+_ANSWERS = {"identify": "identity", "ask_status": "status", "self_test": "self_test_result"}
+_SLOW = {"self_test": 10.0}  # times as long as another command's answer: the program memory is summed up
+_PING_S = 0.05  # of the host's clock, or
+_PING_SAMPLES_S = 0.025  # of samples received, whichever comes first
+_LOST = "the controller goes to its safe state by itself"
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """A command under way."""
+
+    name: str
+    answer: Message | None = None
+
+
+class Controller:
+    """Commands, answers and the sign of life. Its methods may be called from any thread, except from `heard`.
+
+    Parameters
+    ----------
+    port : Port
+        Open; nobody else may use it. It is closed with the controller.
+    samples : callable
+        Given frames of samples and their time of arrival, from the listener's thread.
+    told : callable
+        Given messages that nobody asked for, and statuses, from the listener's thread.
+    lost : callable
+        Given the error, once, when the line is lost, from whichever thread sees it.
+    answer_s : float
+        How long to wait for an answer before a command is sent again, s.
+    tries : int
+        How often a command is sent.
+
+    Attributes
+    ----------
+    resent : int
+        Commands sent again.
+    odd : int
+        Sound frames that are no message.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        *,
+        samples: Callable[[list[bytes], float], None],
+        told: Callable[[Message], None],
+        lost: Callable[[DeviceError], None],
+        answer_s: float = 0.3,
+        tries: int = 5,
+    ) -> None:
+        self._port, self._samples, self._told, self._lost = port, samples, told, lost
+        self._answer_s, self._tries = answer_s, tries
+        self._id = 0
+        self.resent = self.odd = 0
+        self._failure: DeviceError | None = None
+        self._other: DeviceError | None = None
+        self._waiting: dict[int, _Waiting] = {}
+        self._news = threading.Condition()
+        self._asking = threading.Lock()
+        self._writing = threading.Lock()
+        self._due = threading.Condition()
+        self._unpinged, self._per_ping = 0, 0
+        self._closing = False
+        hearing = Hearing(samples=self._heard_samples, message=self._heard, odd=self._odd, lost=self._line_lost)
+        self._listener = Listener(port, hearing)
+        self._pinger = threading.Thread(target=self._keep_alive, name=f"ping {port.name}", daemon=True)
+        self._pinger.start()
+
+    @property
+    def counters(self) -> FrameCounters:
+        """What came over the line."""
+        return self._listener.counters
+
+    @property
+    def overrun_bytes(self) -> int:
+        """Bytes that the host had no room for."""
+        return self._listener.overrun_bytes
+
+    @property
+    def failure(self) -> DeviceError | None:
+        """Why the line is lost, once it is."""
+        return self._failure
+
+    def identify(self) -> Message:
+        """Ask who is there.
+
+        Returns
+        -------
+        Message
+            ``identity``.
+
+        Raises
+        ------
+        DeviceError
+            If nobody answers, something else than the firmware is there, or it speaks another version.
+        """
+        try:
+            return self.ask("identify")
+        except DeviceError:
+            if self._other is not None:
+                raise self._other from None
+            if self._failure is not None:
+                raise
+            raise DeviceError(self._nobody()) from None
+
+    def ask(self, name: str, *, values: tuple[int, ...] = (), **fields: int) -> Message:
+        """Send a command and wait for its answer.
+
+        Parameters
+        ----------
+        name : str
+            Of the message.
+        values : tuple of int
+            Elements of its last field, where that is an array.
+        **fields : int
+            Its fields but ``id``.
+
+        Returns
+        -------
+        Message
+            The answer: ``ack``, or the command's own.
+
+        Raises
+        ------
+        DeviceError
+            If the controller refuses, does not answer, or the line is lost.
+        """
+        with self._asking:
+            number = self._next_id()
+            asked = message(name, values=values, id=number, **fields)
+            data, waiting = encode(asked), _Waiting(name)
+            self._waiting[number] = waiting
+            try:
+                answer = self._answered(data, waiting)
+            finally:
+                del self._waiting[number]
+        if answer is None:
+            if self._failure is not None:
+                raise DeviceError(str(self._failure))
+            raise DeviceError(
+                f"{self._port.name}: the controller did not answer {name!r}, sent {self._tries} times; each command is"
+                f" answered. Look at cable and supply, and open the port again; {_LOST}"
+            )
+        if answer.name == "ack" and answer["code"]:
+            raise DeviceError(f"{self._port.name}: {refusal(asked, answer)}")
+        return answer
+
+    def pace(self, rate_hz: float) -> None:
+        """Count samples as the time between pings.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Samples in a second.
+        """
+        with self._due:
+            self._per_ping = max(1, int(_PING_SAMPLES_S * rate_hz))
+
+    def close(self) -> None:
+        """End all threads and let the port go; again is harmless."""
+        with self._due:
+            self._closing = True
+            self._due.notify_all()
+        if self._pinger is not threading.current_thread():
+            self._pinger.join(10.0)
+        self._listener.close()
+        self._port.close()
+
+    def _next_id(self) -> int:
+        with self._news:
+            self._id = self._id % 255 + 1
+            return self._id
+
+    def _answered(self, data: bytes, waiting: _Waiting) -> Message | None:
+        limit = self._answer_s * _SLOW.get(waiting.name, 1.0)
+        for attempt in range(self._tries):
+            if attempt:
+                self.resent += 1
+            self._send(data)
+            with self._news:
+                self._news.wait_for(lambda: waiting.answer or self._over(waiting), limit)
+                if waiting.answer or self._over(waiting):
+                    return waiting.answer
+        return None
+
+    def _over(self, waiting: _Waiting) -> bool:
+        """Whether no answer will come: the line is lost, or what was to be identified is something else."""
+        return self._failure is not None or (waiting.name == "identify" and self._other is not None)
+
+    def _send(self, data: bytes) -> None:
+        if self._failure is not None:
+            return
+        try:
+            with self._writing:
+                self._port.write(data)
+        except OSError as failure:
+            self._line_lost(failure)
+
+    def _keep_alive(self) -> None:
+        due = time.monotonic() + _PING_S
+        while True:
+            with self._due:
+                enough = lambda: self._closing or (self._per_ping and self._unpinged >= self._per_ping)  # noqa: E731
+                self._due.wait_for(enough, max(0.0, due - time.monotonic()))
+                if self._closing or self._failure is not None:
+                    return
+                self._unpinged = 0
+            self._send(encode(message("ping", id=self._next_id())))
+            due = time.monotonic() + _PING_S
+
+    def _heard_samples(self, payloads: list[bytes], arrived_s: float) -> None:
+        with self._due:
+            self._unpinged += len(payloads)
+            if self._per_ping and self._unpinged >= self._per_ping:
+                self._due.notify_all()
+        self._samples(payloads, arrived_s)
+
+    def _heard(self, what: Message) -> None:
+        waiting = self._waiting.get(what.fields.get("id", 0))
+        if what.name in ("status", "fault"):
+            self._told(what)
+        if waiting is not None and what.name in ("ack", _ANSWERS.get(waiting.name, "ack")):
+            with self._news:
+                waiting.answer = what
+                self._news.notify_all()
+
+    def _odd(self, failure: DeviceError) -> None:
+        """A sound frame that is no message of this protocol: the identity of another version."""
+        with self._news:
+            self.odd += 1
+            self._other = self._other or DeviceError(f"{self._port.name}: {failure}")
+            self._news.notify_all()
+
+    def _line_lost(self, failure: OSError) -> None:
+        with self._news:
+            if self._failure is not None or self._closing:
+                return
+            self._failure = DeviceError(
+                f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port anew"
+            )
+            self._news.notify_all()
+        with self._due:
+            self._due.notify_all()
+        self._lost(self._failure)
+
+    def _nobody(self) -> str:
+        """Say what may stand behind a port that gives no identity."""
+        seen, name = self._listener.counters, self._port.name
+        if seen.frames:
+            return (
+                f"port {name}: sound frames come, but no answer to 'identify'; the controller does not hear the host."
+                " Look at its receive line, and reset the board"
+            )
+        if seen.discarded_bytes or seen.empty or seen.damaged:
+            total = seen.discarded_bytes + seen.empty
+            return (
+                f"port {name}: {total} bytes came, and no sound frame among them; this is another speed or another"
+                " program. Give the firmware's baud (daq.baud), or put the firmware amb_daq on the board"
+            )
+        return (
+            f"port {name}: nobody answers; a controller with the firmware amb_daq answers 'identify' at once. Look at"
+            " the cable and the supply, reset the board, or put the firmware on it"
+        )
