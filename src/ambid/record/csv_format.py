@@ -200,16 +200,11 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
         If a value is not finite, a name would break the format, or the file cannot be written.
     """
     path = Path(path)
+    lines = head_lines(record, comments)
     for c in record.channels:
-        if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in _TIME_NAMES:
-            raise RecordError(f"channel {c.name!r} cannot be a CSV column: its name would be misread. Rename it")
         if not np.isfinite(c.values).all():
             k = int(np.argmax(~np.isfinite(c.values)))
             raise RecordError(f"channel {c.name!r}, sample {k} is not finite; CSV holds numbers only. Treat gaps first")
-    units = [c.source_unit if c.unit == UNKNOWN else c.unit for c in record.channels]
-    names = [c.name if u == UNKNOWN else f"{c.name} [{u}]" for c, u in zip(record.channels, units, strict=True)]
-    lines = [f"# {line}" for text in comments for line in text.splitlines()]
-    lines.append(",".join(["time [s]", *names]))
     columns = [record.time_s.tolist(), *(c.values.tolist() for c in record.channels)]
     lines.extend(",".join(map(repr, row)) for row in zip(*columns, strict=True))
     data = ("\n".join(lines) + "\n").encode()
@@ -219,3 +214,31 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
         path.write_bytes(data)
     except OSError as failure:
         raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
+
+
+def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
+    """Return what stands above the numbers.
+
+    Parameters
+    ----------
+    record : Record
+        Its values are not looked at.
+    comments : sequence of str
+        Lines that go before the header row, each after ``#``.
+
+    Returns
+    -------
+    list of str
+        The last one is the header row.
+
+    Raises
+    ------
+    RecordError
+        If a name would break the format.
+    """
+    for c in record.channels:
+        if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in _TIME_NAMES:
+            raise RecordError(f"channel {c.name!r} cannot be a CSV column: its name would be misread. Rename it")
+    units = [c.source_unit if c.unit == UNKNOWN else c.unit for c in record.channels]
+    names = [c.name if u == UNKNOWN else f"{c.name} [{u}]" for c, u in zip(record.channels, units, strict=True)]
+    return [*(f"# {line}" for text in comments for line in text.splitlines()), ",".join(["time [s]", *names])]

@@ -43,30 +43,69 @@ def write_hdf5(record: Record, path: str | Path) -> None:
     import h5py
 
     path = Path(path)
+    history = _history_text(record)
     try:
-        history = json.dumps([{"name": s.name, "settings": s.settings} for s in record.history], default=_plain)
+        with h5py.File(path, "w") as file:
+            write_head(file, record, history)
+            for k, c in enumerate(record.channels):
+                add_channel(file, k, c, data=c.values)
+    except OSError as failure:
+        raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
+
+
+def write_head(file: Any, record: Record, history: str | None = None) -> None:
+    """Write everything but the channels.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Empty.
+    record : Record
+        Its values are not looked at.
+    history : str, optional
+        Its history as JSON, if that is there already.
+    """
+    file.attrs["schema"] = SCHEMA
+    file.attrs["rate_hz"] = record.rate_hz
+    file.attrs["start_s"] = record.start_s
+    # Text beyond 64 kB does not fit an attribute (a calibration table may be long): it is a dataset.
+    file["history"] = _history_text(record) if history is None else history
+    file["provenance"] = json.dumps(dict(record.provenance))
+    file.create_group("channels")
+
+
+def add_channel(file: Any, k: int, channel: Channel, **of: object) -> Any:
+    """Make the dataset of a channel.
+
+    Parameters
+    ----------
+    file : h5py.File
+        With its head.
+    k : int
+        Place of the channel.
+    channel : Channel
+        Its name and units.
+    **of : object
+        ``data``, or ``shape`` and ``dtype`` where the values are still to come.
+
+    Returns
+    -------
+    h5py.Dataset
+    """
+    dataset = file["channels"].create_dataset(str(k), compression="gzip", compression_opts=1, shuffle=True, **of)
+    dataset.attrs["name"] = channel.name
+    dataset.attrs["unit"] = channel.unit
+    dataset.attrs["source_unit"] = channel.source_unit
+    return dataset
+
+
+def _history_text(record: Record) -> str:
+    try:
+        return json.dumps([{"name": s.name, "settings": s.settings} for s in record.history], default=_plain)
     except TypeError as failure:
         raise RecordError(
             f"the record's history cannot be stored: {failure}. Keep JSON-able settings in each step"
         ) from None
-    try:
-        with h5py.File(path, "w") as file:
-            file.attrs["schema"] = SCHEMA
-            file.attrs["rate_hz"] = record.rate_hz
-            file.attrs["start_s"] = record.start_s
-            # Text beyond 64 kB does not fit an attribute (a calibration table may be long): it is a dataset.
-            file["history"] = history
-            file["provenance"] = json.dumps(dict(record.provenance))
-            group = file.create_group("channels")
-            for k, c in enumerate(record.channels):
-                dataset = group.create_dataset(
-                    str(k), data=c.values, compression="gzip", compression_opts=1, shuffle=True
-                )
-                dataset.attrs["name"] = c.name
-                dataset.attrs["unit"] = c.unit
-                dataset.attrs["source_unit"] = c.source_unit
-    except OSError as failure:
-        raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
 
 
 def read_hdf5_checked(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:

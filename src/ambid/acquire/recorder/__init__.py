@@ -1,0 +1,23 @@
+"""The recorder: an append-only journal that survives kills and power cuts, and becomes a record at the end."""
+
+from __future__ import annotations
+
+from ambid.acquire.recorder.convert import Recorded, Survey, read_acquisition, recorded_from, survey
+from ambid.acquire.recorder.header import Event, JournalHeader, journal_path, record_path
+from ambid.acquire.recorder.reader import Damage, JournalReader
+from ambid.acquire.recorder.recorder import Recorder
+
+__all__ = [
+    "Damage",
+    "Event",
+    "JournalHeader",
+    "JournalReader",
+    "Recorded",
+    "Recorder",
+    "Survey",
+    "journal_path",
+    "read_acquisition",
+    "record_path",
+    "recorded_from",
+    "survey",
+]

@@ -1,0 +1,284 @@
+"""The recorder: blocks go to an append-only journal beside the wanted file, and at the end become a record.
+
+The caller never waits: `Recorder.append` puts a block into a bounded queue, and a thread of the recorder's own writes
+and brings it to the disk. A block is acknowledged once it is there; from then on neither a kill nor a power cut takes
+it away. What finds no room in the queue is counted, told at once, and marked in the journal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ambid.acquire.device import DeviceEvent
+from ambid.acquire.recorder._queue import Item, WriteQueue
+from ambid.acquire.recorder._writer import JournalWriter
+from ambid.acquire.recorder.convert import Recorded, check_target, recorded_from
+from ambid.acquire.recorder.disk import JournalFile, disk_error, free_bytes
+from ambid.acquire.recorder.frames import BLOCK, EVENT, LARGEST, NO_SAMPLE, packed_values
+from ambid.acquire.recorder.header import Event, JournalHeader, event_json, journal_path
+from ambid.acquire.recorder.reader import JournalReader
+from ambid.errors import DeviceError
+from ambid.track.stream.block import Block
+
+_LEAST_FREE = 16 << 20  # bytes that are to be left on the disk
+_AHEAD_S = 10.0  # a disk that would be full in this time is told
+
+
+class Recorder:
+    """A recording: a context that makes the journal, and at its end the record. One thread may append.
+
+    Parameters
+    ----------
+    path : str or Path
+        The record to be: ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``; the journal is ``PATH.journal`` beside it.
+    header : JournalHeader
+        What is recorded.
+    sync_s : float
+        How often what was written is brought to the disk, s: a power cut costs no more.
+    write_s : float
+        How often it is written, s: a kill costs no more.
+    queue_s : float
+        How long the disk may stall before blocks find no room, s.
+    seconds : float, optional
+        How long the recording will be, where that is known: whether the disk has room for it is looked at before.
+    dtype : str, optional
+        Type of the values to try first (``int16``, ``uint16``, ``int32``, ``float32``, ``float64``); in any case each
+        block is stored in one that gives every bit back, the narrowest one if none is named.
+    force : bool
+        Whether a record that exists may be written over.
+    on_acknowledged : callable, optional
+        Takes the number of blocks that are on the disk, in the thread of the recorder.
+    on_trouble : callable, optional
+        Takes a `DeviceError` as soon as something is wrong, in whichever thread sees it.
+    on_event : callable, optional
+        Takes an `Event` of the recorder's own: blocks that found no room, numbers that went back.
+    open_file : callable
+        Makes the file from its path.
+
+    Attributes
+    ----------
+    path, journal : Path
+        The record to be, and its journal.
+    result : Recorded or None
+        What became of it, once closed; None before, and where nothing was recorded.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        header: JournalHeader,
+        *,
+        sync_s: float = 0.5,
+        write_s: float = 0.05,
+        queue_s: float = 10.0,
+        seconds: float | None = None,
+        dtype: str | None = None,
+        force: bool = False,
+        on_acknowledged: Callable[[int], object] | None = None,
+        on_trouble: Callable[[DeviceError], object] | None = None,
+        on_event: Callable[[Event], object] | None = None,
+        open_file: Callable[[Path], JournalFile] = JournalFile,
+    ) -> None:
+        self.path = Path(path)
+        self.journal = journal_path(self.path)
+        self.result: Recorded | None = None
+        self._header, self._dtype, self._force, self._seconds = header, dtype, force, seconds
+        self._open_file, self._on_event = open_file, on_event
+        self._queue = WriteQueue(max(1, round(queue_s * header.rate_hz)))
+        self._writer = JournalWriter(
+            self._queue, header, sync_s=sync_s, write_s=min(write_s, sync_s), least_free=self._reserve(),
+            on_acknowledged=on_acknowledged, on_trouble=on_trouble,
+        )  # fmt: skip
+        self._next: int | None = None
+        self._closed = False
+
+    def __enter__(self) -> Self:
+        """Make the journal.
+
+        Returns
+        -------
+        Recorder
+
+        Raises
+        ------
+        DeviceError
+            If the record or the journal exists, cannot be made, or has no room on the disk.
+        """
+        check_target(self.path, self._header, force=self._force)
+        self._check_room()
+        self._writer.start(self._open_file(self.journal))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def acknowledged(self) -> int:
+        """Number of blocks that are on the disk, counted from the first one that was taken."""
+        return self._writer.acknowledged
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks that were taken."""
+        return self._queue.blocks
+
+    @property
+    def overruns(self) -> int:
+        """Number of blocks that found no room because the disk was too slow."""
+        return self._queue.overruns
+
+    @property
+    def lost_samples(self) -> int:
+        """Samples that were appended and are not in the journal: no room, or after the disk had failed."""
+        return self._queue.lost_samples + self._writer.lost_samples
+
+    @property
+    def failed(self) -> DeviceError | None:
+        """Why nothing more is stored; None as long as all is well."""
+        return self._writer.failed
+
+    def append(self, block: Block) -> bool:
+        """Take a block, without waiting for the disk.
+
+        Parameters
+        ----------
+        block : Block
+            Copied; of as many columns as the header says. Numbers that go back are stored, and told.
+
+        Returns
+        -------
+        bool
+            False if it will not be stored: there was no room, or the disk has failed. It is then counted.
+
+        Raises
+        ------
+        DeviceError
+            If it is no block of this recording.
+        """
+        values = self._checked(block)
+        n = len(values)
+        if n == 0:
+            return True
+        if self._next is not None and block.first < self._next:
+            self._own_event("lost", f"numbers of samples went back from {self._next} to {block.first}", block.first)
+        self._next = block.first + n
+        if self._writer.failed or self._closed:
+            self._queue.count_lost(n)
+            return False
+        if not self._queue.has_room(n):
+            self._queue.overrun(block.first, n)
+            self._tell(
+                Event(kind="lost", what="the disk is too slow: no room in the queue", sample=block.first, count=n)
+            )
+            return False
+        code, payload = packed_values(values, self._dtype)
+        self._queue.put(Item(BLOCK, int(block.first), float(block.time_s), n, values.shape[1], code, payload))
+        return True
+
+    def event(self, event: Event | DeviceEvent) -> None:
+        """Put something that happened into the journal, in its place between the blocks.
+
+        Parameters
+        ----------
+        event : Event or DeviceEvent
+        """
+        own = event if isinstance(event, Event) else Event.of(event)
+        sample = NO_SAMPLE if own.sample is None else own.sample
+        self._queue.put(Item(EVENT, sample, float("nan"), 0, 0, 0, event_json(own)))
+
+    def flush(self, timeout_s: float = 60.0) -> bool:
+        """Wait until everything that was taken is on the disk.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest wait.
+
+        Returns
+        -------
+        bool
+            Whether it is.
+        """
+        return self._writer.flush(self._queue.blocks, timeout_s)
+
+    def close(self, progress: Callable[[float], object] | None = None) -> Recorded | None:
+        """End the recording: journal to record, read back, and only then the journal removed.
+
+        Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Takes the part that is done, 0 to 1.
+
+        Returns
+        -------
+        Recorded or None
+            None if nothing was recorded; there is then neither record nor journal.
+
+        Raises
+        ------
+        DeviceError
+            If the record cannot be written, or is not what the journal holds.
+        """
+        if self._closed or not self._writer.started:
+            return self.result
+        self._closed = True
+        file = self._writer.end()
+        try:
+            reader = JournalReader(file.read, file.size, self.journal)
+            extra = {"not_stored": self._writer.lost_samples} if self._writer.lost_samples else {}
+            self.result = recorded_from(reader, self.path, force=self._force, extra=extra, progress=progress)
+            if self.result is None or not self.result.keep_journal:
+                file.remove()
+        finally:
+            file.close()
+        self._writer.raise_fault()
+        return self.result
+
+    def _checked(self, block: Block) -> np.ndarray[Any, np.dtype[np.float64]]:
+        values = np.asarray(block.values, dtype=np.float64)
+        columns = len(self._header.columns)
+        if values.ndim != 2 or values.shape[1] != columns or values.nbytes > LARGEST:
+            raise DeviceError(
+                f"block at sample {block.first} has shape {values.shape}; this recording takes (n_samples, {columns})"
+                f" of at most {LARGEST >> 20} MB. Give the columns of the header"
+            )
+        return values
+
+    def _own_event(self, kind: str, what: str, sample: int) -> None:
+        event = Event(kind=kind, what=what, sample=int(sample))
+        self.event(event)
+        self._tell(event)
+
+    def _tell(self, event: Event) -> None:
+        if self._on_event is not None:
+            self._on_event(event)
+
+    def _bytes_per_s(self) -> float:
+        """Bytes of a second, as far as can be told before: counts take two a value."""
+        widths = [2 if c.unit == "1" else 8 for c in self._header.columns]
+        return self._header.rate_hz * sum(widths) * 1.1
+
+    def _reserve(self) -> int:
+        return _LEAST_FREE + round(_AHEAD_S * self._bytes_per_s())
+
+    def _check_room(self) -> None:
+        """Refuse a recording that the disk has no room for: the journal, and the record beside it."""
+        wanted = self._reserve() + round(2 * self._bytes_per_s() * (self._seconds or 0.0))
+        try:
+            free = free_bytes(self.path.parent)
+        except OSError as failure:
+            raise disk_error(f"{self.path.parent} cannot be looked at", failure) from None
+        if free < wanted:
+            raise DeviceError(
+                f"{self.path.parent} has {free / 1e6:.0f} MB left; this recording may take {wanted / 1e6:.0f} MB."
+                " Make room, choose another folder, or record for a shorter time"
+            )

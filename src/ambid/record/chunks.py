@@ -1,0 +1,161 @@
+"""Records written and read back in pieces, for those that are longer than memory: the files that `write_record` makes.
+
+Beside it two things that a recording needs: rows of NaN, where samples were lost, and further texts in HDF5.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+from zlib import crc32
+
+import numpy as np
+
+from ambid.errors import RecordError
+from ambid.record.csv_format import head_lines
+from ambid.record.hdf5_format import add_channel, write_head
+from ambid.record.record import Array, Record
+
+_PIECE = 1 << 20  # bytes, or values, that are read back at once
+
+
+def write_chunks(
+    record: Record, n_samples: int, chunks: Iterable[Array], path: str | Path, texts: Mapping[str, str]
+) -> Callable[[], None]:
+    """Write a record whose values come in pieces.
+
+    Parameters
+    ----------
+    record : Record
+        Names, units, rate, start, history and provenance; without samples.
+    n_samples : int
+        Samples that will come.
+    chunks : iterable of ndarray, shape (n, n_channels)
+        In the order of time. NaN is a sample that was lost: in CSV an empty cell.
+    path : str or Path
+        ``.csv``, ``.csv.gz``, ``.h5`` or ``.hdf5``; overwritten if it exists.
+    texts : Mapping of str to str
+        For HDF5: further datasets, by name. CSV has no place for them.
+
+    Returns
+    -------
+    callable
+        Reads the file back, and raises RecordError if a value is not what was written.
+
+    Raises
+    ------
+    RecordError
+        If the pieces are more or fewer than announced, or the file cannot be written.
+    """
+    path = Path(path)
+    write = _write_csv if path.name.lower().endswith((".csv", ".csv.gz")) else _write_hdf5
+    try:
+        return write(record, n_samples, _counted(chunks, n_samples), path, texts)
+    except (OSError, RuntimeError) as failure:  # HDF5 raises both
+        why = getattr(failure, "strerror", None) or str(failure)
+        raise RecordError(f"{path} cannot be written: {why}. Check folder and disk") from failure
+
+
+def _counted(chunks: Iterable[Array], n_samples: int) -> Iterator[Array]:
+    """Pass on what comes, and refuse more or fewer samples than announced."""
+    got = 0
+    for values in chunks:
+        got += len(values)
+        if got > n_samples:
+            break
+        yield values
+    if got != n_samples:
+        raise RecordError(f"{n_samples} samples were announced and another number came. Write the record again")
+
+
+def _write_hdf5(
+    record: Record, n_samples: int, chunks: Iterable[Array], path: Path, texts: Mapping[str, str]
+) -> Callable[[], None]:
+    import h5py
+
+    sums = [0] * len(record.channels)
+    with h5py.File(path, "w") as file:
+        write_head(file, record)
+        for name, text in texts.items():
+            file[name] = text
+        datasets = [
+            add_channel(file, k, c, shape=(n_samples,), dtype=np.float64) for k, c in enumerate(record.channels)
+        ]
+        at = 0
+        for values in chunks:
+            for k, dataset in enumerate(datasets):
+                column = np.ascontiguousarray(values[:, k])
+                dataset[at : at + len(column)] = column
+                sums[k] = crc32(column.tobytes(), sums[k])
+            at += len(values)
+    return lambda: _check_hdf5(path, n_samples, sums)
+
+
+def _check_hdf5(path: Path, n_samples: int, sums: list[int]) -> None:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            for k, wanted in enumerate(sums):
+                dataset, found = file["channels"][str(k)], 0
+                for at in range(0, n_samples, _PIECE):
+                    found = crc32(dataset[at : at + _PIECE].tobytes(), found)
+                if found != wanted or dataset.shape != (n_samples,):
+                    raise _unlike(path)
+    except (OSError, KeyError, RuntimeError) as failure:
+        raise _unlike(path) from failure
+
+
+def _write_csv(
+    record: Record, n_samples: int, chunks: Iterable[Array], path: Path, texts: Mapping[str, str]
+) -> Callable[[], None]:
+    del n_samples, texts
+    found, at = 0, 0
+    with _text_file(path, "w") as file:
+
+        def put(lines: list[str]) -> None:
+            nonlocal found
+            data = ("\n".join(lines) + "\n").encode()
+            file.write(data)
+            found = crc32(data, found)
+
+        put(head_lines(record))
+        for values in chunks:
+            time = record.start_s + np.arange(at, at + len(values)) / record.rate_hz
+            put([_row(t, row) for t, row in zip(time.tolist(), values.tolist(), strict=True)])
+            at += len(values)
+    return lambda: _check_csv(path, found)
+
+
+def _row(time: float, row: list[float]) -> str:
+    return ",".join((repr(time), *("" if x != x else repr(x) for x in row)))
+
+
+def _check_csv(path: Path, wanted: int) -> None:
+    found = 0
+    try:
+        with _text_file(path, "r") as file:
+            while data := file.read(_PIECE):
+                found = crc32(data, found)
+    except (OSError, EOFError) as failure:
+        raise _unlike(path) from failure
+    if found != wanted:
+        raise _unlike(path)
+
+
+@contextmanager
+def _text_file(path: Path, mode: str) -> Iterator[BinaryIO]:
+    with open(path, f"{mode}b") as plain:
+        if path.suffix.lower() != ".gz":
+            yield cast(BinaryIO, plain)
+            return
+        options: dict[str, Any] = {} if mode == "r" else {"compresslevel": 6, "mtime": 0}
+        with gzip.GzipFile(filename="", mode=f"{mode}b", fileobj=plain, **options) as packed:
+            yield cast(BinaryIO, packed)
+
+
+def _unlike(path: Path) -> RecordError:
+    return RecordError(f"{path} does not read back as it was written. Check the disk, and write it again")
