@@ -20,7 +20,7 @@
 #define MSG_SAMPLE 0x01 /* to the host: one tick */
 #define MSG_ACK 0x02 /* to the host: answer to every command that has no answer of its own, and to every refused one */
 #define MSG_IDENTITY 0x03 /* to the host: answer to identify */
-#define MSG_STATUS 0x04 /* to the host: answer to status; with id 0 unasked, every 256 ticks */
+#define MSG_STATUS 0x04 /* to the host: answer to ask_status; with id 0 unasked, every 256 ticks */
 #define MSG_SELF_TEST_RESULT 0x05 /* to the host: answer to self_test */
 #define MSG_FAULT 0x06 /* to the host: sent once, at once, when the safe state is entered */
 #define MSG_IDENTIFY 0x10 /* to the controller: who are you; any state; the number of the last command is forgotten */
@@ -230,7 +230,7 @@ static inline uint8_t write_identity(uint8_t *p, uint8_t id, uint8_t protocol, u
     return LENGTH_IDENTITY;
 }
 
-/* status: answer to status; with id 0 unasked, every 256 ticks */
+/* status: answer to ask_status; with id 0 unasked, every 256 ticks */
 struct msg_status {
     uint8_t id; /* of the command, or 0 */
     uint8_t state; /* state */

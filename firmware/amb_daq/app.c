@@ -1,0 +1,61 @@
+/*
+ * Setup and main loop: what interrupts leave behind is sent, at most one command is carried out, then sleep.
+ */
+#include "app.h"
+
+#include <string.h>
+
+#include "commands.h"
+#include "daq.h"
+#include "frame.h"
+#include "report.h"
+
+static struct decoder decoder;
+
+void amb_setup(void)
+{
+    uint8_t by_watchdog = board_begin();
+    memset(&decoder, 0, sizeof decoder);
+    commands_begin();
+    daq_begin(by_watchdog);
+}
+
+/* Takes bytes until one command is done. While an answer finds no room, bytes wait. */
+static void listen(void)
+{
+    uint8_t answer[ANSWER_LARGEST], n = 0;
+    if (tx_free(&board_tx) < FRAME_BYTES(ANSWER_LARGEST))
+        return;
+    while (n == 0 && rx_waiting(&board_rx)) {
+        n = decoder_feed(&decoder, rx_take(&board_rx));
+        if (n == FRAME_DAMAGED) {
+            daq_count(&daq.rx_errors);
+            n = 0;
+        }
+    }
+    if (n == 0)
+        return;
+    n = commands_handle(decoder.body, n, answer);
+    frame_put(&board_tx, answer, n, 0);
+    board_send();
+}
+
+static uint8_t pending(void)
+{
+    return report_waits() || (rx_waiting(&board_rx) && tx_free(&board_tx) >= FRAME_BYTES(ANSWER_LARGEST));
+}
+
+/* On while levitating; after a fault it blinks, some two times a second. */
+static void show(uint16_t beats)
+{
+    uint8_t state = daq.state;
+    board_lamp(state == STATE_LEVITATING || (state == STATE_FAULT && (beats & 0x200)));
+}
+
+void amb_loop(void)
+{
+    show(board_alive());
+    report_pending();
+    listen();
+    board_sleep(pending);
+}

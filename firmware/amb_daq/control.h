@@ -1,0 +1,42 @@
+/*
+ * The position loop in fixed point: the law of src/ambid/physics/loop.py in counts.
+ *
+ *   duty = limit(bias + kp e + I + D - kc (i - rest) + excitation),  e = setpoint - x
+ *   I of the next tick = I + ki e, but while the duty is limited I only moves back (anti-windup)
+ *   D = pole * D of the last tick - kd (x - x of the last tick)
+ *
+ * x, i: 10-bit counts. kp, kd, kc, D: 2^-12 counts of pulse width; ki, I: 2^-16; pole: 2^-16. The sum is made in 2^-12
+ * and rounded to the nearest count once, at the end.
+ *
+ * Nothing can overflow 32 bits: |gain| <= CONTROL_LARGEST = 2^20 (256 counts per count; ki: 16 per count and tick), so a
+ * product with a difference of two inputs (|.| <= 1023) is below 2^30; P, D and C are limited to +-2^28 (65536 counts of
+ * pulse width, eighty times its range) and I to +-2^27 (2048 counts), so their sum stays below 2^30. Larger gains are
+ * refused.
+ */
+#ifndef AMB_DAQ_CONTROL_H
+#define AMB_DAQ_CONTROL_H
+
+#include <stdint.h>
+
+#include "protocol.h"
+
+#define CONTROL_LARGEST (1L << 20)
+
+struct control {
+    int32_t integral;   /* 2^-16 counts */
+    int32_t derivative; /* 2^-12 counts */
+    uint16_t last;      /* position of the last tick */
+    uint8_t begun;      /* there was a last tick */
+};
+
+/* Returns 0, or the number of the field (from 1, the id is 1) of a gain that could overflow. */
+uint8_t control_refuses(const struct msg_gains *gains);
+
+/* Forgets integral and derivative. */
+void control_reset(struct control *control);
+
+/* One tick: returns the pulse width, within low and high. */
+uint16_t control_step(struct control *control, const struct msg_gains *gains, uint16_t position, uint16_t current,
+                      int16_t excitation, uint16_t low, uint16_t high);
+
+#endif

@@ -1,0 +1,89 @@
+/*
+ * The state of the controller, shared by all parts. Interrupts change what is volatile here, and read the rest: the
+ * main loop writes it ATOMICALLY while ticks go on.
+ */
+#ifndef AMB_DAQ_DAQ_H
+#define AMB_DAQ_DAQ_H
+
+#include <stdint.h>
+
+#include "board.h"
+#include "control.h"
+#include "excitation.h"
+#include "protocol.h"
+
+#define FIRMWARE_MAJOR 1
+#define FIRMWARE_MINOR 0
+
+/* No command goes beyond these. A bench that must never see the full pulse width is compiled with less. */
+#ifndef CAP_DUTY_LOW
+#define CAP_DUTY_LOW 0
+#endif
+#ifndef CAP_DUTY_HIGH
+#define CAP_DUTY_HIGH BOARD_PWM_TOP
+#endif
+#ifndef CAP_CURRENT_LOW
+#define CAP_CURRENT_LOW 0
+#endif
+#ifndef CAP_CURRENT_HIGH
+#define CAP_CURRENT_HIGH BOARD_ADC_TOP
+#endif
+#define CAP_OUTPUT_PERIOD 20 /* periods of a tick: below 1 kHz the output stays off */
+#define HOST_MS_LEAST 20
+#define HOST_MS_MOST 2000
+#define LIFT_MS_MOST 2000
+
+struct daq {
+    volatile uint8_t state, cause;
+    uint8_t ready;    /* bits READY_ */
+    uint8_t sampling; /* ticks go on */
+    uint16_t period;  /* of a tick, in periods of the pulse width */
+    uint8_t stream;
+    struct msg_limits limits;
+    struct msg_gains gains;
+    struct control control;
+    struct excitation excitation;
+
+    volatile uint32_t ticks; /* since start; the tick being worked on is the one before */
+    volatile uint16_t silent_ticks, host_ticks;
+    volatile uint16_t lift_ticks; /* left in which out_of_gap does not count */
+    uint16_t inputs[BOARD_ANALOG];
+
+    uint32_t fault_tick;
+    uint16_t fault_position, fault_current;
+    volatile uint8_t fault_untold; /* the message is still to be sent */
+
+    volatile uint16_t overruns, dropped, busy_us;
+    uint16_t rx_errors, supply_mv, digest;
+    int8_t table[EXCITATION_TABLE];
+};
+
+extern struct daq daq;
+
+static inline uint8_t daq_output_on(void)
+{
+    uint8_t state = daq.state;
+    return state == STATE_DRIVING || state == STATE_LEVITATING;
+}
+
+/* One more of what is counted since reset; a full counter stays full. */
+static inline void daq_count(volatile uint16_t *counter)
+{
+    ATOMICALLY
+    {
+        uint16_t value = *counter;
+        if (value != 0xffff)
+            *counter = (uint16_t)(value + 1);
+    }
+}
+
+/* As after a reset. */
+void daq_begin(uint8_t by_watchdog);
+/* Ticks from 0. */
+void daq_start(void);
+/* Output on from the next tick on: STATE_DRIVING or STATE_LEVITATING. */
+void daq_output(uint8_t state);
+/* Output off, no ticks; a fault stays. */
+void daq_stop(void);
+
+#endif

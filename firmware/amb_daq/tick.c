@@ -1,0 +1,113 @@
+/*
+ * The work of one tick.
+ */
+#include "tick.h"
+
+#include <stddef.h>
+
+#include "daq.h"
+#include "safety.h"
+
+static struct sample queue[SAMPLE_QUEUE];
+static volatile uint8_t queue_head, queue_tail;
+
+uint8_t tick_begin(uint8_t still_working)
+{
+    daq.ticks++;
+    if (!still_working)
+        return 1;
+    daq_count(&daq.overruns);
+    if (daq_output_on())
+        safety_enter(CAUSE_OVERRUN);
+    return 0;
+}
+
+static uint16_t limited(int16_t duty)
+{
+    if (duty < (int16_t)daq.limits.duty_low)
+        return daq.limits.duty_low;
+    if (duty > (int16_t)daq.limits.duty_high)
+        return daq.limits.duty_high;
+    return (uint16_t)duty;
+}
+
+static int16_t bias(void)
+{
+    return (int16_t)((daq.ready & READY_GAINS) ? daq.gains.duty_bias : daq.limits.duty_off);
+}
+
+/* Orders the pulse width; a fault that came meanwhile wins. */
+static uint16_t order(uint16_t duty)
+{
+    ATOMICALLY
+    {
+        if (daq_output_on()) {
+            board_duty(duty);
+            board_output(1);
+        } else {
+            duty = daq.limits.duty_off;
+        }
+    }
+    return duty;
+}
+
+static void keep(uint16_t tick, uint16_t duty, int16_t excitation)
+{
+    uint8_t head = queue_head, next = (uint8_t)((head + 1) & (SAMPLE_QUEUE - 1)), stream = daq.stream;
+    uint8_t state = daq.state;
+    struct sample *sample = &queue[head];
+    uint16_t *value = sample->values;
+    if (next == queue_tail) {
+        daq_count(&daq.dropped);
+        return;
+    }
+    sample->tick = tick;
+    sample->state = (uint8_t)(state == STATE_FAULT ? state | (daq.cause << 4) : state);
+    if (stream & STREAM_ANALOG_0)
+        *value++ = daq.inputs[0];
+    if (stream & STREAM_ANALOG_1)
+        *value++ = daq.inputs[1];
+    if (stream & STREAM_ANALOG_2)
+        *value++ = daq.inputs[2];
+    if (stream & STREAM_DUTY)
+        *value++ = duty;
+    if (stream & STREAM_EXCITATION)
+        *value++ = (uint16_t)excitation;
+    if (stream & STREAM_SETPOINT)
+        *value++ = daq.gains.setpoint;
+    sample->n = (uint8_t)(value - sample->values);
+    queue_head = next;
+}
+
+void tick_work(void)
+{
+    uint16_t tick, duty = daq.limits.duty_off;
+    int16_t excitation = 0;
+    uint8_t cause;
+    ATOMICALLY { tick = (uint16_t)(daq.ticks - 1); }
+    if (daq_output_on()) {
+        cause = safety_check();
+        if (cause) {
+            safety_enter(cause);
+        } else {
+            excitation = excitation_next(&daq.excitation, daq.table);
+            if (daq.state == STATE_LEVITATING)
+                duty = control_step(&daq.control, &daq.gains, daq.inputs[0], daq.inputs[1], excitation,
+                                    daq.limits.duty_low, daq.limits.duty_high);
+            else
+                duty = limited((int16_t)(bias() + excitation));
+            duty = order(duty);
+        }
+    }
+    keep(tick, duty, excitation);
+}
+
+const struct sample *tick_sample(void)
+{
+    return queue_tail == queue_head ? NULL : &queue[queue_tail];
+}
+
+void tick_sent(void)
+{
+    queue_tail = (uint8_t)((queue_tail + 1) & (SAMPLE_QUEUE - 1));
+}
