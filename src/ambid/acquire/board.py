@@ -17,8 +17,12 @@ PWM_HZ = CLOCK_HZ / PWM_TOP
 """Frequency of the pulse width modulation, Hz."""
 ADC_TOP = 1023
 """Largest value of the converter, counts."""
-TABLE_LENGTH = 512
+TABLE_LENGTH = 1000
 """Elements of the excitation table."""
+BYTE_BITS = 11
+"""Bit times that a byte may take on the line: ten, and one kept for answers."""
+LARGEST_GAIN = 2**20
+"""Largest step number of a gain: no product can then overflow the controller's arithmetic."""
 SHORTEST_PERIOD = 4
 """Shortest tick that the controller's work fits into, in periods of the pulse width modulation."""
 LAG_S = 0.15e-3

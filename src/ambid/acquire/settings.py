@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ambid.acquire._limits import count_inside, duty_off, duty_range, trip_counts
-from ambid.acquire.board import ADC_TOP, LAG_S, PWM_HZ, period_of
+from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, period_of
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
 from ambid.acquire.scales import scale_of, who
@@ -36,10 +36,8 @@ __all__ = [
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
 """Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
 
-_LARGEST_GAIN = 2**31 - 1
 _FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
 _FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state, CRC, COBS, end
-_LINE_SHARE = 0.95
 _CONFIGURE = ("period", "stream")
 _LIMITS = ("position_low", "position_high", "current_low", "current_high", "duty_low", "duty_high", "duty_off")
 _GAINS = ("kp", "ki", "kd", "pole", "kc", "setpoint", "current_rest", "duty_bias")
@@ -277,9 +275,9 @@ def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
 
 
 def _gain(rig: Rig, name: str, value: float) -> int:
-    if abs(value) > _LARGEST_GAIN:
+    if abs(value) > LARGEST_GAIN:
         raise RigError(
-            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {_LARGEST_GAIN} at"
+            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {LARGEST_GAIN} at"
             f" most. Lower loop.{name}, or correct the calibrations of the channels"
         )
     steps = round(value)
@@ -292,9 +290,9 @@ def _gain(rig: Rig, name: str, value: float) -> int:
 
 
 def _check_line(rig: Rig, daq: Daq, settings: ControllerSettings) -> None:
-    bits = 10.0 * (_FRAME_BYTES + 2 * len(carried(settings)))
-    if bits * settings.rate_hz > _LINE_SHARE * daq.baud:
+    bits = BYTE_BITS * (_FRAME_BYTES + 2 * len(carried(settings)))
+    if bits * settings.rate_hz > daq.baud:
         raise RigError(
-            f"{who(rig)}: {settings.rate_hz:g} samples of {bits:g} bits a second do not fit into daq.baud ="
-            f" {daq.baud} bit/s. At most {_LINE_SHARE * daq.baud / bits:.0f} Hz do; lower daq.rate_hz"
+            f"{who(rig)}: {settings.rate_hz:g} samples a second of {bits} bit times each do not fit into daq.baud ="
+            f" {daq.baud} bit/s, but {daq.baud / bits:.0f} do. Lower daq.rate_hz"
         )
