@@ -5,17 +5,16 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from threading import Event as Signal
-from threading import Thread, current_thread, main_thread
-from types import FrameType
+from threading import Thread
 from typing import TYPE_CHECKING, Literal, TypeVar
 
+from ambid.cli.interrupts import signals
 from ambid.cli.keys import Keys
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
@@ -104,7 +103,7 @@ class Follower:
             `complete` is False where the run was stopped; None where it was stopped before its first line.
         """
         found: TrackSummary | None = None
-        with self._before_header, _signals(self._signalled):
+        with self._before_header, signals(self._signalled):
             self._say = self._before_header.enter_context(progress("track"))
             try:
                 found = job().summary
@@ -356,23 +355,3 @@ class _Picture:
             for key in keys.read(min(left, _SLICE_S)):
                 self._key(key)
         return True
-
-
-@contextmanager
-def _signals(take: Callable[[int], None]) -> Iterator[None]:
-    """Give Ctrl-C, and the signal to terminate, to a function; as before afterwards."""
-    if current_thread() is not main_thread():
-        yield
-        return
-
-    def handler(number: int, frame: FrameType | None) -> None:
-        del frame
-        take(number)
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old if old is not None else signal.SIG_DFL)

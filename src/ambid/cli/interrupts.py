@@ -1,0 +1,80 @@
+"""Ctrl-C and the signal to terminate, for runs that end in an orderly way instead of being torn off."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import current_thread, main_thread
+from types import FrameType
+
+
+@contextmanager
+def signals(take: Callable[[int], None]) -> Iterator[None]:
+    """Give Ctrl-C, and the signal to terminate, to a function; as before afterwards.
+
+    Parameters
+    ----------
+    take : callable
+        Given the number of the signal, in the main thread. In another thread nothing is done.
+    """
+    if current_thread() is not main_thread():
+        yield
+        return
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        del frame
+        take(number)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old if old is not None else signal.SIG_DFL)
+
+
+class Stop:
+    """Takes the first signal as a wish to end; the second one interrupts at once.
+
+    Attributes
+    ----------
+    number : int or None
+        Of the signal; None as long as there was none.
+    """
+
+    def __init__(self) -> None:
+        """Nothing has been wished."""
+        self.number: int | None = None
+
+    def take(self, number: int) -> None:
+        """Take a signal.
+
+        Parameters
+        ----------
+        number : int
+
+        Raises
+        ------
+        KeyboardInterrupt
+            At the second one.
+        """
+        if self.number is not None:
+            raise KeyboardInterrupt
+        self.number = number
+
+    def wished(self) -> bool:
+        """Return whether the run is to end.
+
+        Returns
+        -------
+        bool
+            True after a signal.
+        """
+        return self.number is not None
+
+    @property
+    def code(self) -> int:
+        """Exit code: 0 without a signal, else 128 and its number."""
+        return 0 if self.number is None else 128 + self.number
