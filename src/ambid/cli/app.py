@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli import compare, demo, fit, frf, identify, info, init, models, simulate, track, validate
+from ambid.cli import compare, demo, fit, frf, identify, info, init, models, recover, simulate, track, validate
 from ambid.cli.terminal import plain_where_needed
 
 app = typer.Typer(
@@ -25,6 +25,7 @@ app.command("fit", short_help="a black-box model from a record")(fit.command)
 app.command("frf", short_help="a frequency response, and models from it")(frf.command)
 app.command("compare", short_help="several black-box structures side by side")(compare.command)
 app.command("track", short_help="parameters followed through a record, as on-line")(track.command)
+app.command("recover", short_help="the record of a recording that was cut off")(recover.command)
 app.command("init", short_help="a first rig file, guessed from a record")(init.command)
 app.command("simulate", short_help="a record from the physics")(simulate.command)
 app.command("validate", short_help="the checks of an estimate on another record")(validate.command)

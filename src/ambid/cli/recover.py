@@ -1,0 +1,110 @@
+"""``ambid recover``: the record of a recording that could not finish."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ambid.cli.options import FAILED_CHECK
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import progress
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.acquire.recorder import Recorded
+
+
+def command(
+    journals: Annotated[
+        list[Path],
+        typer.Argument(metavar="JOURNAL", help="What is left of a recording: NAME.journal.", show_default=False),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="Record to write: .h5, .hdf5, .csv or .csv.gz.", show_default="NAME"
+        ),
+    ] = None,
+    delete: Annotated[
+        bool, typer.Option("--delete", help="Remove the journal once its record is written and nothing was damaged.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write over a record that exists.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="End with exit code 3 if something was damaged.")] = False,
+) -> None:
+    """Make the record of a recording that was killed or whose power was cut, from the journal that it left.
+
+    Every block that the recorder had acknowledged comes back; what is damaged or missing is counted, and becomes rows
+    without values, which --gaps of the other verbs treats.
+    """
+    if output is not None and len(journals) > 1:
+        raise AmbidError(
+            f"-o {output} is one file for {len(journals)} journals. Recover them one by one, or without -o"
+        )
+    refused: list[AmbidError] = []
+    sound = True
+    for journal in journals:
+        try:
+            sound &= _recover(journal, output, delete=delete, force=force)
+        except AmbidError as failure:
+            refused.append(failure)
+    for other in refused[1:]:
+        typer.echo(f"ambid: {other}", err=True)
+    if refused:
+        raise refused[0]
+    if strict and not sound:
+        raise typer.Exit(FAILED_CHECK)
+
+
+def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -> bool:
+    """Make the record of one journal, say what was found, and return whether nothing of it was damaged."""
+    from ambid.acquire.recorder import JournalReader, record_path, recorded_from
+    from ambid.acquire.recorder.disk import sync_folder
+    from ambid.errors import DeviceError
+
+    path = record_path(journal) if output is None else output
+    Outputs(journal).claim(path, "-o")
+    with JournalReader.open(journal) as reader, progress("recover"):
+        made = recorded_from(reader, path, force=force)
+        if made is None:
+            raise DeviceError(f"journal {journal} holds no sound block: nothing was acknowledged. Remove it")
+        gone = delete and not made.keep_journal
+        if gone:
+            journal.unlink()
+            sync_folder(journal)
+    typer.echo(f"{journal}: {_found(made)}")
+    typer.echo(f"{path} written{_lacks(made)}.{_fate(journal, delete=delete, gone=gone)}")
+    return not made.keep_journal
+
+
+def _found(made: Recorded) -> str:
+    found = made.survey
+    text = f"{found.blocks} blocks, {found.samples} samples, {found.samples / made.rate_hz:.6g} s"
+    if found.damage.closed:
+        return f"{text}; complete"
+    tail = f", {found.damage.tail_bytes} bytes at the end are no sound block" if found.damage.tail_bytes else ""
+    return f"{text}; cut off while recording{tail}"
+
+
+def _lacks(made: Recorded) -> str:
+    """Say what is missing; nothing where all is there."""
+    found, damage = made.survey, made.survey.damage
+    parts = []
+    if damage.frames or damage.places:
+        events = damage.frames - damage.blocks
+        also = f" and {events} other entries" if events else ""
+        parts.append(f"{damage.blocks} damaged blocks{also} in {max(damage.places, 1)} places")
+    if found.gap_samples:
+        parts.append(f"{found.gap_samples} missing samples in {found.gaps} places (read it with --gaps)")
+    if found.misplaced:
+        parts.append(f"{found.misplaced} samples left out whose numbers had come before")
+    return f" with {'; '.join(parts)}" if parts else ""
+
+
+def _fate(journal: Path, *, delete: bool, gone: bool) -> str:
+    if gone:
+        return f" {journal.name} removed"
+    if delete:
+        return f" {journal.name} is kept: it holds more than the record"
+    return f" {journal.name} is kept; --delete removes it"
