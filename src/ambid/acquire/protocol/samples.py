@@ -118,7 +118,8 @@ class SampleDecoder:
         Stream mask that was configured.
     rate_hz : float or None
         Samples in one second. With it and with times of arrival, gaps of more than 65535 ticks are counted right, up to
-        ten minutes; without, such a gap is counted short by a multiple of 65536.
+        ten minutes and as long as what comes after the gap is late by less than 32768 ticks; without, such a gap is
+        counted short by a multiple of 65536.
     """
 
     def __init__(self, mask: int, *, rate_hz: float | None = None) -> None:
@@ -134,6 +135,8 @@ class SampleDecoder:
                 self._known[state.value | cause.value << 4] = True
         self._rate = rate_hz or math.nan
         self._given = self._lost = self._gaps = self._damaged = self._misnumbered = self._repeated = 0
+        self._held = b""  # one sample whose number jumped, until the next one speaks for it
+        self._held_s: float | None = None  # and when it arrived
         self.restart()
 
     @property
@@ -154,7 +157,7 @@ class SampleDecoder:
         return None if self._last is None else self._last + 1
 
     def restart(self, first: int | None = 0) -> None:
-        """Expect a new stream; what was counted stays.
+        """Expect a new stream; what was counted stays. A sample that is still held counts as misnumbered.
 
         Parameters
         ----------
@@ -162,7 +165,8 @@ class SampleDecoder:
             Number of its first sample; None: any, of a stream joined on its way.
         """
         self._last = None if first is None else first - 1
-        self._held: bytes = b""  # one sample whose number jumped, until the next one speaks for it
+        self._misnumbered += bool(self._held)
+        self._held = b""
         self._zero_s = math.inf  # earliest time, by the host's clock, that tick 0 can have had
         self._zero_at = 0.0
 
@@ -197,7 +201,7 @@ class SampleDecoder:
         Samples
             One or none.
         """
-        rest = self._take((), None, final=True)
+        rest = self._take((), self._held_s, final=True)
         if ticks is None or self._last is None:
             return rest
         missing = (ticks - 1 - self._last) % _STATUS_WRAP
@@ -226,8 +230,10 @@ class SampleDecoder:
         values = raw["values"].astype(np.float64)
         for j in self._signed:
             values[:, j] = raw["values"][:, j].astype(np.int16)
-        states = raw["state"]
-        return Samples(ticks=numbers, states=states & 15, causes=states >> 4, values=values, gaps=tuple(gaps))
+        states = raw["state"].astype(np.uint8)
+        return Samples(
+            ticks=numbers, states=states & np.uint8(15), causes=states >> np.uint8(4), values=values, gaps=tuple(gaps)
+        )
 
     def _stack(self, payloads: Iterable[bytes]) -> NDArray[np.void]:
         size = self._layout.itemsize
@@ -237,7 +243,7 @@ class SampleDecoder:
         return np.frombuffer(b"".join(sound), dtype=self._layout)
 
     def _sound(self, raw: NDArray[np.void]) -> NDArray[np.bool_]:
-        sound = self._known[raw["state"]]
+        sound: NDArray[np.bool_] = self._known[raw["state"]]
         self._damaged += len(raw) - int(np.count_nonzero(sound))
         return sound
 
@@ -261,7 +267,7 @@ class SampleDecoder:
                 begin, step = begin + 1, 1
             elif step > 1 and end - begin == 1 and not (final and end == len(ticks)):
                 if end == len(ticks):
-                    self._held = raw[begin:].tobytes()
+                    self._held, self._held_s = raw[begin:].tobytes(), arrived_s
                     continue
                 if 0 < (int(ticks[end]) - last) % _WRAP < short:
                     self._misnumbered += 1
