@@ -1,0 +1,146 @@
+"""The plant file of the emulated bench: what stands at the controller's pins, in its own words (firmware/bench).
+
+A converter's count c stands for the volts in the middle of its step, (c + 1/2) 5 V / 1024, so that a calibrated reading
+is right in the mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+from ambid.acquire.board import ADC_TOP
+from ambid.acquire.devices.benches import Bench, bench_of
+from ambid.acquire.scales import Scale, scale_of
+from ambid.errors import DeviceError
+from ambid.physics.magnet import DifferentialPair
+from ambid.physics.nonlinear import NonlinearPlant
+from ambid.physics.presets import Preset
+from ambid.rig.rig import Rig
+
+_VOLT_PER_COUNT = 5.0 / (ADC_TOP + 1)
+
+
+def write_plant_file(
+    path: Path,
+    rig: Rig,
+    *,
+    bench: Preset | Rig | None = None,
+    pwm: Literal["switched", "averaged"] = "switched",
+    off: Literal["diodes", "short"] = "diodes",
+    start: float | None = None,
+    noise: float = 1.0,
+    pin_noise: float = 0.0,
+    third: tuple[float, float, float] = (0.0, 0.0, 2.5),
+) -> None:
+    """Write the bench that stands behind a rig as a plant file.
+
+    Parameters
+    ----------
+    path : Path
+        File to be written.
+    rig : Rig
+        With calibrations from counts: they say what volts the sensors show, and what voltage a pulse width makes.
+    bench : Preset or Rig or None
+        The truth; None: what daq.bench names, else the rig's own numbers.
+    pwm : {"switched", "averaged"}
+        Whether the coil sees each pulse, or its mean over the period.
+    off : {"diodes", "short"}
+        What the coil sees while ENABLE is low: the supply against its current until there is none, or nothing.
+    start : float or None
+        Position at the beginning, m. None: where the rotor comes to lie without current.
+    noise : float
+        Factor on the bench's noise; 0 for none.
+    pin_noise : float
+        More noise at all three analog inputs, V rms.
+    third : (float, float, float)
+        Third input: V/m, V/A and V.
+
+    Raises
+    ------
+    DeviceError
+        If the emulated bench knows no such plant, or lacks a number.
+    RigError
+        If a channel has no calibration from counts.
+    """
+    truth = bench_of(rig, bench)
+    position, current, voltage = (scale_of(rig, role) for role in ("position", "current", "voltage"))
+    if voltage.raw.size > 2:
+        raise DeviceError(
+            f"rig {rig.name!r}: channels.voltage is calibrated by a table; the emulated power stage is a straight line"
+            " from counts to volts. Give gain and offset"
+        )
+    low, high = (float(v) for v in voltage.to_si([0.0, float(voltage.top)]))
+    stage = {"high_voltage": high, "low_voltage": low}
+    lines = [
+        f"# {truth.name}",
+        *_plant(truth),
+        *_numbers(stage),
+        *_numbers(_noise(truth, noise) | {"pin_noise": pin_noise}),
+    ]
+    lines += [*_sensor("position", position), *_sensor("current", current)]
+    lines += _numbers(dict(zip(("third_position_gain", "third_current_gain", "third_offset"), third, strict=True)))
+    lines += _numbers({"start_position": _resting_place(truth) if start is None else start})
+    # A single transistor with its diode: no current the other way, and a coil that is switched off runs out slowly.
+    one_way = min(low, high) >= 0.0
+    lines += [f"pwm {pwm}", f"off {'short' if one_way else off}", f"current {'one-way' if one_way else 'both-ways'}"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _plant(bench: Bench) -> Iterator[str]:
+    plant, point = bench.plant, bench.point
+    if isinstance(plant, NonlinearPlant):
+        w = plant.magnet.coenergy
+        pair = isinstance(plant.magnet, DifferentialPair)
+        yield f"kind {'differential' if pair else 'single'}"
+        yield from _numbers({"m": plant.m, "R": plant.R, "c": plant.c, "k": w.k_b, "leakage": w.leakage})
+        yield from _numbers({"gravity": plant.gravity} | ({"gap": w.s_b, "bias": w.i0} if pair else {}))
+    elif plant.model.name == "one-axis":
+        yield "kind linear"
+        yield from _numbers(dict(plant.parameters))
+        rest = {"position": point.position, "current": point.current, "voltage": point.voltage}
+        yield from _numbers({f"rest_{name}": value for name, value in rest.items()})
+    else:
+        raise DeviceError(
+            f"bench {bench.name!r} is of model {plant.model.name!r}; the emulated bench knows one-axis and its magnets."
+            " Give a bench of one axis"
+        )
+    low, high = bench.limits.position
+    floor, ceiling = (-math.inf, math.inf) if not isinstance(plant, NonlinearPlant) else plant.magnet.range
+    if isinstance(plant, NonlinearPlant) and not floor < low < high < ceiling:
+        raise DeviceError(
+            f"bench {bench.name!r}: limits.position is {low:g} to {high:g} m; the emulated rotor needs stops inside its"
+            f" air gap, {floor:g} to {ceiling:g} m. Give loop.limits.position"
+        )
+    yield from _numbers({k: v for k, v in (("stop_low", low), ("stop_high", high)) if math.isfinite(v)})
+
+
+def _noise(bench: Bench, factor: float) -> dict[str, float]:
+    n = bench.noise
+    numbers = {"position_noise": n.position, "current_noise": n.current}
+    return {k: factor * v for k, v in (numbers | {"force_noise": n.force, "voltage_noise": n.voltage}).items()}
+
+
+def _sensor(role: str, scale: Scale) -> Iterator[str]:
+    volts = (scale.raw + 0.5) * _VOLT_PER_COUNT
+    if scale.raw.size > 2:
+        yield from (f"{role}_point {v!r} {q!r}" for v, q in zip(volts.tolist(), scale.si.tolist(), strict=True))
+        return
+    gain = float((volts[1] - volts[0]) / (scale.si[1] - scale.si[0]))
+    yield from _numbers({f"{role}_gain": gain, f"{role}_offset": float(volts[0]) - gain * float(scale.si[0])})
+
+
+def _resting_place(bench: Bench) -> float:
+    """Return where an unpowered rotor lies: on a stop if nothing brings it back, along its weight if it has one."""
+    plant, stops = bench.plant, bench.limits.position
+    nonlinear = isinstance(plant, NonlinearPlant)
+    weight = plant.gravity if isinstance(plant, NonlinearPlant) else 0.0
+    stable = not nonlinear and bench.plant.parameters["k_x"] > 0.0  # type: ignore[union-attr]
+    stop = stops[1] if weight > 0.0 else stops[0]
+    return bench.point.position if stable or not math.isfinite(stop) else stop
+
+
+def _numbers(values: dict[str, float]) -> list[str]:
+    return [f"{name} {float(value)!r}" for name, value in values.items()]
