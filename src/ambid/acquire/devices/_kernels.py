@@ -135,7 +135,7 @@ def tripped(position: int, current: int, settings: Integers, memory: Integers) -
         return 0
     if not settings[CURRENT_LOW] <= current <= settings[CURRENT_HIGH]:
         return OVER_CURRENT
-    lifting = memory[STATE] == LEVITATING and memory[TICK] - memory[LIFTED] < settings[LIFT]
+    lifting = memory[TICK] - memory[LIFTED] < settings[LIFT]
     if not lifting and not settings[POSITION_LOW] <= position <= settings[POSITION_HIGH]:
         return OUT_OF_GAP
     return 0

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from ambid.acquire.link.listener import Hearing, Listener
 from ambid.acquire.link.port import Port
@@ -22,6 +23,8 @@ _ANSWERS = {"identify": "identity", "ask_status": "status", "self_test": "self_t
 _SLOW = {"self_test": 10.0}  # times as long as another command's answer: the program memory is summed up
 _PING_S = 0.05  # of the host's clock, or
 _PING_SAMPLES_S = 0.025  # of samples received, whichever comes first
+_SILENT_S = 0.5  # without a sample: it is asked for its status
+_NONE: Mapping[str, int] = MappingProxyType({})
 _LOST = "the controller goes to its safe state by itself"
 
 
@@ -82,6 +85,7 @@ class Controller:
         self._due = threading.Condition()
         self._unpinged, self._per_ping = 0, 0
         self._closing = False
+        self._heard_s = time.monotonic()
         hearing = Hearing(samples=self._heard_samples, message=self._heard, odd=self._odd, lost=self._line_lost)
         self._listener = Listener(port, hearing)
         self._pinger = threading.Thread(target=self._keep_alive, name=f"ping {port.name}", daemon=True)
@@ -93,9 +97,14 @@ class Controller:
         return self._listener.counters
 
     @property
+    def overruns(self) -> int:
+        """Reads that the host had no room for."""
+        return self._listener.overruns[0]
+
+    @property
     def overrun_bytes(self) -> int:
-        """Bytes that the host had no room for."""
-        return self._listener.overrun_bytes
+        """Bytes in them."""
+        return self._listener.overruns[1]
 
     @property
     def failure(self) -> DeviceError | None:
@@ -124,17 +133,17 @@ class Controller:
                 raise
             raise DeviceError(self._nobody()) from None
 
-    def ask(self, name: str, *, values: tuple[int, ...] = (), **fields: int) -> Message:
+    def ask(self, name: str, fields: Mapping[str, int] = _NONE, *, values: tuple[int, ...] = ()) -> Message:
         """Send a command and wait for its answer.
 
         Parameters
         ----------
         name : str
             Of the message.
+        fields : Mapping of str to int
+            Its fields but ``id``.
         values : tuple of int
             Elements of its last field, where that is an array.
-        **fields : int
-            Its fields but ``id``.
 
         Returns
         -------
@@ -226,11 +235,14 @@ class Controller:
                 if self._closing or self._failure is not None:
                     return
                 self._unpinged = 0
-            self._send(encode(message("ping", id=self._next_id())))
+                silent = time.monotonic() - self._heard_s > _SILENT_S
+            # A controller that was reset still answers pings: only its status tells.
+            self._send(encode(message("ask_status" if silent else "ping", id=self._next_id())))
             due = time.monotonic() + _PING_S
 
     def _heard_samples(self, payloads: list[bytes], arrived_s: float) -> None:
         with self._due:
+            self._heard_s = time.monotonic()
             self._unpinged += len(payloads)
             if self._per_ping and self._unpinged >= self._per_ping:
                 self._due.notify_all()

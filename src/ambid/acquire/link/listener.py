@@ -64,9 +64,9 @@ class Listener:
         return self._decoder.counters
 
     @property
-    def overrun_bytes(self) -> int:
-        """Bytes that the host had no room for."""
-        return self._reader.overrun_bytes
+    def overruns(self) -> tuple[int, int]:
+        """Reads that the host had no room for, and the bytes in them."""
+        return self._reader.overruns, self._reader.overrun_bytes
 
     def close(self) -> None:
         """Listen no more, after what has come already; again is harmless. The port stays open."""

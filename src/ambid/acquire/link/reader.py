@@ -47,8 +47,8 @@ class Reader:
 
     Attributes
     ----------
-    overrun_bytes : int
-        Bytes dropped for want of room.
+    overruns, overrun_bytes : int
+        Reads dropped for want of room, and the bytes in them.
     failure : OSError or None
         Why the line is lost, once it is.
     """
@@ -57,7 +57,7 @@ class Reader:
         self._port, self._room = port, room
         self._chunks: deque[Chunk] = deque()
         self._held = self._dropped = 0
-        self.overrun_bytes = 0
+        self.overruns = self.overrun_bytes = 0
         self.failure: OSError | None = None
         self._stopping = False
         self._over = False
@@ -116,6 +116,7 @@ class Reader:
         with self._news:
             if self._held + len(data) > self._room:
                 self._dropped += len(data)
+                self.overruns += 1
                 self.overrun_bytes += len(data)
                 return
             self._chunks.append(Chunk(data=data, arrived_s=arrived_s, after_loss=self._dropped))

@@ -1,0 +1,64 @@
+"""A device by the word that a person gives for its port."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ambid.acquire.device import Device
+from ambid.acquire.devices.played import Pace
+from ambid.errors import DeviceError
+from ambid.rig.rig import Rig
+
+REPLAY = "replay:"
+"""What a port begins with that is a record."""
+
+
+def open_device(port: str, rig: Rig, *, pace: Pace | None = None, seed: int = 0, script: Path | None = None) -> Device:
+    """Return the device that a port's name stands for, not yet opened: it is a context.
+
+    Parameters
+    ----------
+    port : str
+        ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port.
+    rig : Rig
+        Of the bench.
+    pace : {"real", "fastest"}, optional
+        Of what is no hardware; default as fast as possible, a replay in real time.
+    seed : int
+        Of the noise of what is emulated or simulated.
+    script : Path, optional
+        What happens to an emulated bench meanwhile.
+
+    Returns
+    -------
+    Device
+        Not yet opened.
+
+    Raises
+    ------
+    DeviceError
+        If an option does not fit the device, or as the device's own constructor.
+    RigError
+        If the rig does not say what the device needs.
+    """
+    if script is not None and port != "emulated":
+        raise DeviceError(f"a script is for --port emulated; {port!r} has none. Leave it out")
+    if port == "emulated":
+        from ambid.acquire.devices.emulated import EmulatedDevice
+
+        return EmulatedDevice(rig, pace=pace or "fastest", seed=seed, script=script)
+    if port == "simulated":
+        from ambid.acquire.devices.simulated import SimulatedDevice
+
+        return SimulatedDevice(rig, pace=pace or "fastest", seed=seed)
+    if port.startswith(REPLAY):
+        from ambid.acquire.devices.replay import ReplayDevice
+
+        return ReplayDevice(port.removeprefix(REPLAY), rig, pace=pace or "real")
+    if pace is not None:
+        raise DeviceError(
+            f"port {port} has its own pace; one is chosen for emulated, simulated or replay. Leave it out"
+        )
+    from ambid.acquire.devices.serial_device import SerialDevice
+
+    return SerialDevice(port, rig)

@@ -1,0 +1,109 @@
+"""The very firmware, run by an emulator before a simulated bearing, behind an ordinary serial port."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+from ambid.acquire.default_daq import with_default_daq
+from ambid.acquire.devices.emulator import Emulator
+from ambid.acquire.devices.frames import ROOM
+from ambid.acquire.devices.line_device import LineDevice
+from ambid.acquire.devices.plant_file import write_plant_file
+from ambid.acquire.devices.played import Pace
+from ambid.acquire.link.port import Port, open_port
+from ambid.errors import DeviceError
+from ambid.physics.presets import Preset
+from ambid.rig.rig import Rig
+
+_ANSWER_S = 2.0  # a busy machine may hold the emulator up
+
+
+class EmulatedDevice(LineDevice):
+    """The firmware in an emulated controller. Everything but the copper is real: binary, converter, line, protocol.
+
+    As fast as possible, its time is not the host's: it waits for a host that says nothing, and no drift is told.
+
+    Parameters
+    ----------
+    rig : Rig
+        What the controller is told; where it has no calibrations or no ``[daq]`` they are made up, and columns are SI.
+    bench : Preset or Rig, optional
+        The truth; default what daq.bench names, else the rig's own numbers.
+    pace : {"fastest", "real"}
+    seed : int
+        Of the noise.
+    script : str or Path, optional
+        What happens to bench and line meanwhile, see `Emulator`.
+    folder : Path, optional
+        Where the emulator's files go and stay; default a temporary one.
+    trajectory : bool
+        Write the bench's true motion into the folder.
+    room : int
+        Samples that wait for a reader at most.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such bench or pace, or the controller has no such rate.
+    RigError
+        If the rig does not say what the controller needs.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        bench: Preset | Rig | None = None,
+        pace: Pace = "fastest",
+        seed: int = 0,
+        script: str | Path | None = None,
+        folder: Path | None = None,
+        trajectory: bool = False,
+        room: int = ROOM,
+    ) -> None:
+        if pace not in ("real", "fastest"):
+            raise DeviceError(f"pace is {pace!r}; a device goes in 'real' time or 'fastest'. Give one of them")
+        full = with_default_daq(rig)
+        si = any(rig.channel(c.role).calibration is None and c.calibration is not None for c in full.channels)
+        super().__init__(
+            full, kind="emulated", where="emulated", si=si, real=pace == "real", answer_s=_ANSWER_S, room=room
+        )
+        self._bench, self._pace, self._seed, self._script = bench, pace, seed, script
+        self._kept, self._trajectory = folder, trajectory
+        self._folder: Path | None = None
+        self._emulator: Emulator | None = None
+
+    @property
+    def emulator(self) -> Emulator | None:
+        """The process, while the device is open: its log says what happened at the bench."""
+        return self._emulator
+
+    def _open(self) -> Port:
+        self._folder = self._kept or Path(tempfile.mkdtemp(prefix="ambid-emulated-"))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        plant = self._folder / "plant.txt"
+        write_plant_file(plant, self._rig, bench=self._bench)
+        self._emulator = Emulator(
+            plant,
+            script=self._script,
+            pace=self._pace,
+            seed=self._seed,
+            folder=self._folder,
+            trajectory=self._trajectory,
+        )
+        self._emulator.start()
+        return open_port(self._emulator.port, baud=self._baud, boot_s=0.0)
+
+    @property
+    def _baud(self) -> int:
+        return 1_000_000 if self._rig.daq is None else self._rig.daq.baud
+
+    def _let_go(self) -> None:
+        emulator, self._emulator = self._emulator, None
+        if emulator is not None:
+            emulator.close()
+        folder, self._folder = self._folder, None
+        if folder is not None and self._kept is None:
+            shutil.rmtree(folder, ignore_errors=True)

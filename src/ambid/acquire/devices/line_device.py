@@ -1,0 +1,363 @@
+"""A controller at the end of a line, whatever the line is: hardware or its emulation."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType, TracebackType
+from typing import Literal, Self
+
+from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State
+from ambid.acquire.devices.excitation import counts_of
+from ambid.acquire.devices.frames import ROOM
+from ambid.acquire.devices.stream import SampleStream
+from ambid.acquire.layout import columns, in_si
+from ambid.acquire.link.controller import Controller
+from ambid.acquire.link.port import Port
+from ambid.acquire.protocol.codec import Message
+from ambid.acquire.protocol.table import table
+from ambid.acquire.settings import controller_settings
+from ambid.errors import DeviceError
+from ambid.rig.rig import Rig
+from ambid.track.stream.block import Array, Frame
+
+_MODES: dict[Mode, State] = {"sample": "sampling", "drive": "driving", "levitate": "levitating"}
+_NONE: Mapping[str, int] = MappingProxyType({})
+_TABLE_PART = 48  # elements in one message
+_TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv")  # of a status
+
+
+class LineDevice(ABC):
+    """A device behind a port. See `ambid.acquire.device.Device` for what its methods promise.
+
+    Parameters
+    ----------
+    rig : Rig
+        With ``[daq]`` and calibrations from counts.
+    kind : {"serial", "emulated"}
+    where : str
+        The port's name, for whoever asks before it is open.
+    si : bool
+        Columns in SI instead of in counts.
+    real : bool
+        Whether the controller's time runs with the host's.
+    answer_s : float
+        How long to wait for an answer before a command is sent again, s.
+    room : int
+        Samples that wait at most.
+
+    Raises
+    ------
+    RigError
+        If the rig does not say what the controller needs.
+    DeviceError
+        If the controller has no such rate.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        kind: Literal["serial", "emulated"],
+        where: str,
+        si: bool = False,
+        real: bool = True,
+        answer_s: float = 0.3,
+        room: int = ROOM,
+    ) -> None:
+        self._rig, self._si, self._real, self._answer_s = rig, si, real, answer_s
+        self._settings = controller_settings(rig)
+        rate = self._settings.rate_hz
+        self._info = DeviceInfo(kind=kind, port=where, rate_hz=rate, columns=columns(rig, self._settings, si=si))
+        self._room = room
+        self._stream = self._new_stream()
+        self._controller: Controller | None = None
+        self._status: dict[str, float] = {}
+        self._before = (0, 0)
+        self._damaged_told = 0
+        self._loss_told = False
+        self._last = Counters()
+
+    @abstractmethod
+    def _open(self) -> Port:
+        """Return the open port."""
+
+    def _let_go(self) -> None:  # noqa: B027 - most lines have nothing behind the port
+        """End whatever stands behind the port."""
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Who is there."""
+        return self._info
+
+    @property
+    def state(self) -> State:
+        """The state as last heard."""
+        return self._stream.state
+
+    def __enter__(self) -> Self:
+        if self._controller is not None:
+            raise DeviceError(f"{self._where} is open already; a device is opened once. Close it first")
+        self._stream, self._status, self._damaged_told, self._loss_told = self._new_stream(), {}, 0, False
+        try:
+            port = self._open()
+            self._controller = Controller(
+                port, samples=self._heard, told=self._told, lost=self._lost, answer_s=self._answer_s
+            )
+            self._prepare(self._controller, port.name)
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._controller is None:
+            return
+        try:
+            if self._controller.failure is None:
+                self.stop()
+            elif not self._loss_told and kind is None:
+                raise DeviceError(str(self._controller.failure))
+        except DeviceError:
+            if kind is None:  # else there is a greater trouble on its way
+                raise
+        finally:
+            self._end()
+
+    def self_test(self) -> SelfTest:
+        """Let the controller look at itself; idle only.
+
+        Returns
+        -------
+        SelfTest
+
+        Raises
+        ------
+        DeviceError
+            If it is not idle, or the line is lost.
+        """
+        found = self._ask("self_test")
+        about = {e.name: e.about for e in table().bits["failed"]}
+        failed = tuple(about[name] for name in table().names_of_bits("failed", found["failed"]))
+        numbers = {name: float(v) for name, v in found.fields.items() if name not in ("id", "failed")}
+        return SelfTest(failed=failed, numbers=MappingProxyType(numbers))
+
+    def start(self, mode: Mode) -> None:
+        """Begin.
+
+        Parameters
+        ----------
+        mode : {"sample", "drive", "levitate"}
+
+        Raises
+        ------
+        DeviceError
+            If the controller refuses, or the line is lost.
+        """
+        if mode not in _MODES:
+            raise DeviceError(f"{self._where} has no mode {mode!r}; there are {', '.join(_MODES)}. Give one of them")
+        before = self.state
+        if before == "idle":
+            self._stream.begin()
+        try:
+            self._ask("start", {"mode": table().value("mode", mode)})
+        except DeviceError:
+            if before == "idle":
+                self._stream.finish(None)
+            raise
+        self._stream.enter(_MODES[mode], unless_fault=True)  # it may have tripped in its first tick
+
+    def excite(self, program: Program | None) -> None:
+        """Play an excitation from the next tick on.
+
+        Parameters
+        ----------
+        program : Program or None
+            None ends it.
+
+        Raises
+        ------
+        DeviceError
+            If the controller refuses, or the line is lost.
+        """
+        on = self.state in ("driving", "levitating")
+        if program is not None and not on:
+            raise DeviceError(
+                f"{self._where} refuses excite in state {self.state}; an excitation is played while driving or"
+                " levitating. Start one of these first"
+            )
+        if on:
+            self._ask("excite", {"on": 0})
+        if program is None:
+            return
+        fields = counts_of(program, self._rig, self._settings)
+        for at in range(0, len(program.table), _TABLE_PART):
+            self._ask("table", {"offset": at}, values=program.table[at : at + _TABLE_PART])
+        self._ask("excitation", fields)
+        if program.kind != "none":
+            self._ask("excite", {"on": 1})
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """Return the next block.
+
+        Parameters
+        ----------
+        timeout_s : float
+            How long to wait for it, s.
+
+        Returns
+        -------
+        Frame or None
+            None if none came in time, or at the end.
+
+        Raises
+        ------
+        DeviceError
+            If the line is lost and all that came is read, or the device was never opened.
+        """
+        frame = None
+        try:
+            frame = self._stream.frames.take(timeout_s)
+        except DeviceError as failure:
+            self._loss_told = True
+            raise DeviceError(str(failure)) from None
+        if frame is None and self._controller is None:
+            self._ready()
+        return frame
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come."""
+        return self._stream.frames.ended
+
+    def events(self) -> Sequence[DeviceEvent]:
+        """Return what was told since the last call."""
+        found = self._stream.events()
+        damaged = self.counters().damaged
+        if damaged > self._damaged_told:
+            new, self._damaged_told = damaged - self._damaged_told, damaged
+            found.append(DeviceEvent(kind="damaged", sample=None, what="frames with wrong check values", count=new))
+        return tuple(found)
+
+    def counters(self) -> Counters:
+        """Return what was counted so far."""
+        c = self._controller
+        if c is None:
+            return self._last
+        line, kept, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
+        return Counters(
+            samples=kept.samples - frames.overrun_samples,
+            lost=kept.lost + frames.overrun_samples,
+            damaged=line.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0],
+            discarded_bytes=line.discarded_bytes + c.overrun_bytes - self._before[1],
+            overruns=frames.overruns + c.overruns,
+            resent=c.resent,
+            controller=MappingProxyType(dict(self._status)),
+            drift=drift.drift,
+            drift_sd=drift.drift_sd,
+        )
+
+    def stop(self) -> None:
+        """Output off, no more samples; those on their way can still be read.
+
+        Raises
+        ------
+        DeviceError
+            If the line is lost; the controller then goes to its safe state by itself.
+        """
+        self._stream.ending = True
+        try:
+            self._ask("stop")
+            # What was sampled has come before this answer.
+            self._stream.finish(self._ask("ask_status")["ticks"])
+        finally:
+            self._stream.ending = False
+        self._stream.enter("idle", unless_fault=True)
+
+    def clear(self) -> None:
+        """Leave the safe state after a fault whose cause is gone.
+
+        Raises
+        ------
+        DeviceError
+            If the cause is still there, there is no fault, or the line is lost.
+        """
+        self._ask("clear")
+        self._stream.finish(self._ask("ask_status")["ticks"])
+        self._stream.enter("idle")
+
+    @property
+    def _where(self) -> str:
+        return f"the {self._info.kind} device at {self._info.port}"
+
+    def _ready(self) -> Controller:
+        if self._controller is None:
+            raise DeviceError(f"{self._where} is not open; it answers while it is. Use it in a with statement")
+        return self._controller
+
+    def _ask(self, name: str, fields: Mapping[str, int] = _NONE, *, values: tuple[int, ...] = ()) -> Message:
+        controller = self._ready()
+        try:
+            return controller.ask(name, fields, values=values)
+        except DeviceError:
+            self._loss_told = self._loss_told or controller.failure is not None
+            raise
+
+    def _new_stream(self) -> SampleStream:
+        return SampleStream(
+            self._settings.stream, self._settings.rate_hz, real=self._real, convert=self._converted, room=self._room
+        )
+
+    def _converted(self, counts: Array) -> Array:
+        return in_si(self._rig, self._settings, counts) if self._si else counts
+
+    def _heard(self, payloads: list[bytes], arrived_s: float) -> None:
+        self._stream.heard(payloads, arrived_s)
+
+    def _told(self, what: Message) -> None:
+        if what.name == "status":
+            self._status = {name: float(what[name]) for name in _TOLD}
+        self._stream.told(what)
+
+    def _lost(self, failure: DeviceError) -> None:
+        self._stream.fail(failure)
+
+    def _prepare(self, controller: Controller, where: str) -> None:
+        """Identify, bring to idle whatever was before, and tell it the settings."""
+        who = controller.identify()
+        self._info = DeviceInfo(
+            kind=self._info.kind,
+            port=where,
+            rate_hz=self._info.rate_hz,
+            columns=self._info.columns,
+            identity=MappingProxyType({k: v for k, v in who.fields.items() if k != "id"}),
+        )
+        controller.ask("stop")
+        before = controller.ask("ask_status")
+        if before["state"] == table().value("state", "fault"):
+            controller.ask("clear")  # refused while the cause is there
+            cause = table().name("cause", before["cause"])
+            told = f"a fault of an earlier session ({cause}) was cleared"
+            self._stream.tell(DeviceEvent(kind="link", sample=None, what=told))
+        controller.ask("configure", self._settings.configure())
+        controller.ask("limits", self._settings.limits())
+        controller.ask("gains", self._settings.gains())
+        controller.pace(self._settings.rate_hz)
+        # What came before is not of this session.
+        line = controller.counters
+        self._before = (line.damaged + controller.odd, line.discarded_bytes)
+        self._stream.live = True
+
+    def _end(self) -> None:
+        controller, self._controller = self._controller, None
+        try:
+            if controller is not None:
+                controller.close()
+                self._stream.frames.end()
+                self._controller = controller
+                self._last = self.counters()
+                self._controller = None
+        finally:
+            self._let_go()
