@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 from zlib import crc32
+from zlib import error as ZlibError
 
 import numpy as np
 
@@ -105,7 +106,7 @@ def _check_hdf5(path: Path, n_samples: int, sums: list[int]) -> None:
                     found = crc32(dataset[at : at + _PIECE].tobytes(), found)
                 if found != wanted or dataset.shape != (n_samples,):
                     raise _unlike(path)
-    except (OSError, KeyError, RuntimeError) as failure:
+    except (OSError, KeyError, RuntimeError, ValueError) as failure:
         raise _unlike(path) from failure
 
 
@@ -140,7 +141,7 @@ def _check_csv(path: Path, wanted: int) -> None:
         with _text_file(path, "r") as file:
             while data := file.read(_PIECE):
                 found = crc32(data, found)
-    except (OSError, EOFError) as failure:
+    except (OSError, EOFError, ZlibError) as failure:
         raise _unlike(path) from failure
     if found != wanted:
         raise _unlike(path)
