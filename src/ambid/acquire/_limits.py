@@ -77,7 +77,7 @@ def trip_counts(rig: Rig, scale: Scale) -> tuple[int, int]:
         low, high = _one_sided(scale, wanted, low, high)
     elif low < 1 or high > ADC_TOP - 1:
         raise _beyond(rig, scale, wanted)
-    if low > high or low > ADC_TOP or high < 0:
+    if low >= high or low > ADC_TOP or high < 0:
         raise _beyond(rig, scale, wanted)
     return low, high
 

@@ -1,7 +1,7 @@
 """What the controller (ATmega328P at 16 MHz, an Arduino Uno) can do, as far as a rig has to fit it.
 
-The tick is Timer2 cleared on compare, a whole number of periods of the pulse width modulation; it exists only where
-one of the timer's prescalers divides that time into at most 256 exact steps.
+A tick is a whole number of periods of the pulse width modulation, so that the inputs are always held at the same point
+of a pulse.
 """
 
 from __future__ import annotations
@@ -21,44 +21,14 @@ TABLE_LENGTH = 1000
 """Elements of the excitation table."""
 BYTE_BITS = 11
 """Bit times that a byte may take on the line: ten, and one kept for answers."""
+SLOWEST_OUTPUT = 20
+"""Longest tick with which the output may be on, periods: a fault must end in the safe state within 2 ms."""
 LARGEST_GAIN = 2**20
 """Largest step number of a gain: no product can then overflow the controller's arithmetic."""
-SHORTEST_PERIOD = 4
-"""Shortest tick that the controller's work fits into, in periods of the pulse width modulation."""
+SHORTEST_PERIOD, LONGEST_PERIOD = 4, 20_000
+"""Of a tick, in periods of the pulse width modulation."""
 LAG_S = 0.15e-3
 """From a tick to the pulse width that it orders: conversions, control law, then the next modulation period, s."""
-
-_PRESCALERS = (1, 8, 32, 64, 128, 256, 1024)
-_COMPARE = 256
-
-
-def exact_period(period: int) -> bool:
-    """Return whether the timer can make a tick of so many periods.
-
-    Parameters
-    ----------
-    period : int
-        Periods of the pulse width modulation.
-
-    Returns
-    -------
-    bool
-        True where prescaler * (compare + 1) is exactly that many clock cycles.
-    """
-    cycles = period * PWM_TOP
-    return any(cycles % p == 0 and cycles // p <= _COMPARE for p in _PRESCALERS)
-
-
-def possible_periods() -> tuple[int, ...]:
-    """Return every tick that the controller can make.
-
-    Returns
-    -------
-    tuple of int
-        In periods of the pulse width modulation, rising.
-    """
-    longest = _COMPARE * _PRESCALERS[-1] // PWM_TOP
-    return tuple(n for n in range(SHORTEST_PERIOD, longest + 1) if exact_period(n))
 
 
 def period_of(rate_hz: float) -> int:
@@ -81,14 +51,13 @@ def period_of(rate_hz: float) -> int:
     """
     exact = PWM_HZ / rate_hz
     period = round(exact)
-    if period in possible_periods() and math.isclose(exact, period, rel_tol=1e-9):
+    if SHORTEST_PERIOD <= period <= LONGEST_PERIOD and math.isclose(exact, period, rel_tol=1e-9):
         return period
-    rates = sorted(PWM_HZ / n for n in possible_periods())
-    below, above = [r for r in rates if r < rate_hz], [r for r in rates if r > rate_hz]
-    near = " or ".join(f"{r:.10g}" for r in (*below[-1:], *above[:1]))
+    near = sorted({_possible(math.ceil(exact)), _possible(math.floor(exact))}, reverse=True)
     raise DeviceError(
-        f"daq.rate_hz is {rate_hz:g} Hz; the controller has exact ticks of {rates[0]:.4g} to {rates[-1]:.4g} Hz, a"
-        f" whole part of {PWM_HZ:g} Hz that its timer divides. The nearest are {near} Hz; give one of them"
+        f"daq.rate_hz is {rate_hz:g} Hz; a tick of the controller is a whole number of periods of {PWM_HZ:g} Hz,"
+        f" {SHORTEST_PERIOD} to {LONGEST_PERIOD} of them. The nearest: give"
+        f" {' or '.join(f'{PWM_HZ / n:.10g}' for n in near)} Hz"
     )
 
 
@@ -105,4 +74,10 @@ def nearest_rate(rate_hz: float) -> float:
     float
         Hz.
     """
-    return min((PWM_HZ / n for n in possible_periods()), key=lambda r: abs(math.log(r / rate_hz)))
+    exact = PWM_HZ / rate_hz
+    rates = [PWM_HZ / _possible(n) for n in (math.floor(exact), math.ceil(exact))]
+    return min(rates, key=lambda rate: abs(math.log(rate / rate_hz)))
+
+
+def _possible(period: int) -> int:
+    return min(max(period, SHORTEST_PERIOD), LONGEST_PERIOD)

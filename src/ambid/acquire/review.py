@@ -6,12 +6,14 @@ import math
 
 import numpy as np
 
+from ambid.acquire.board import PWM_HZ, SLOWEST_OUTPUT
 from ambid.acquire.layout import has_position
 from ambid.acquire.scales import scale_of
 from ambid.acquire.settings import ControllerSettings, exact_gains, realised
 from ambid.physics.models import model
 from ambid.rig.rig import Rig
 
+_SLOWEST_HZ = PWM_HZ / SLOWEST_OUTPUT
 _ROUNDED = 0.01  # of a gain: more is worth a line
 _BENT = 1.5  # largest over least slope of a calibration between the trips
 _NEAR_TRIP = 8  # counts between rest and a trip, under which noise may trip it
@@ -35,6 +37,11 @@ def review(rig: Rig, settings: ControllerSettings) -> tuple[str, ...]:
         One line each, with its remedy; empty where nothing is to be said.
     """
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
+    if not settings.drives:
+        lines.append(
+            f"at {settings.rate_hz:g} Hz the controller only samples: its output stays off below {_SLOWEST_HZ:g} Hz."
+            " Raise daq.rate_hz to drive or levitate"
+        )
     if settings.closed:
         lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings)]
     elif has_position(rig):

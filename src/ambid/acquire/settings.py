@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ambid.acquire._limits import count_inside, duty_off, duty_range, trip_counts
-from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, period_of
+from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, SLOWEST_OUTPUT, period_of
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
 from ambid.acquire.scales import scale_of, who
@@ -89,6 +89,11 @@ class ControllerSettings:
         return PWM_HZ / self.period
 
     @property
+    def drives(self) -> bool:
+        """True where ticks are fast enough for the output to be on; else the controller only samples."""
+        return self.period <= SLOWEST_OUTPUT
+
+    @property
     def closed(self) -> bool:
         """True where any gain acts: without one there is nothing to levitate with."""
         return any((self.kp, self.ki, self.kd, self.kc))
@@ -131,6 +136,7 @@ def controller_settings(rig: Rig) -> ControllerSettings:
     position = scale_of(rig, "position") if has_position(rig) else None
     rest = rest_of(rig)
     duty_low, duty_high = duty_range(rig, daq, voltage)
+    off = duty_off(rig, daq, voltage)
     current_low, current_high = trip_counts(rig, current)
     position_low, position_high = trip_counts(rig, position) if position else (0, ADC_TOP)
     bias = count_inside(rig, voltage, rest["voltage"], duty_low, duty_high, "pulse widths allowed (daq.duty)")
@@ -147,7 +153,7 @@ def controller_settings(rig: Rig) -> ControllerSettings:
         current_high=current_high,
         duty_low=duty_low,
         duty_high=duty_high,
-        duty_off=duty_off(rig, daq, voltage),
+        duty_off=off,
         host_ms=daq.host_ms,
         lift_ms=daq.lift_ms,
         setpoint=setpoint,
@@ -263,7 +269,6 @@ def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
     if loop is None or not loop.closed or not has_position(rig):
         return {}
     assert rig.daq is not None
-    rounded = {name: _gain(rig, name, value) for name, value in exact_gains(rig, rest).items()}
     period, tau = 1.0 / rig.daq.rate_hz, loop.filter_s
     pole = round(tau / (tau + period) * 2**POLE_BITS)
     if pole >= 2**POLE_BITS:
@@ -271,6 +276,7 @@ def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
             f"{who(rig)}: loop.derivative_cutoff_hz is {loop.derivative_cutoff_hz:.4g} Hz, too low for a tick of"
             f" {period:.4g} s. Give at least {rig.daq.rate_hz / (2 * math.pi * 2**POLE_BITS):.4g} Hz"
         )
+    rounded = {name: _gain(rig, name, value) for name, value in exact_gains(rig, rest).items()}
     return {**rounded, "pole": pole if loop.kd else 0}
 
 
