@@ -165,7 +165,7 @@ static uint8_t on_gains(struct request *r)
         return out_of_range(r, 8);
     if (duty_outside(wanted.duty_bias))
         return out_of_range(r, 9);
-    ATOMICALLY { daq.gains = wanted; }
+    ATOMICALLY { daq.control.gains = wanted; }
     daq.ready |= READY_GAINS;
     return CODE_DONE;
 }
@@ -177,7 +177,7 @@ static uint8_t on_setpoint(struct request *r)
         return unready(r);
     if (position_outside(wanted.setpoint))
         return out_of_range(r, 2);
-    ATOMICALLY { daq.gains.setpoint = wanted.setpoint; }
+    ATOMICALLY { daq.control.gains.setpoint = wanted.setpoint; }
     return CODE_DONE;
 }
 
@@ -241,7 +241,7 @@ static uint8_t on_start(struct request *r)
     if (mode != MODE_SAMPLE) {
         if (daq.period > CAP_OUTPUT_PERIOD)
             return out_of_range(r, 2);
-        if (mode == MODE_LEVITATE && (position_outside(daq.gains.setpoint) || duty_outside(daq.gains.duty_bias)))
+        if (mode == MODE_LEVITATE && (position_outside(daq.control.gains.setpoint) || duty_outside(daq.control.gains.duty_bias)))
             return out_of_range(r, 2); /* limits that came after the gains leave these out */
         if (board_interlock_open())
             return CODE_INTERLOCK;

@@ -1,10 +1,15 @@
 /*
- * The position loop. Right shifts of negative numbers are arithmetic, as in every compiler for these machines.
+ * The position loop. Right shifts of negative numbers are arithmetic, as in every compiler for these machines. Shifts of
+ * 32 bits are by 4 or 16 only: the processor shifts by one bit at a time, but moves whole bytes.
  */
+#ifdef __AVR__
+#pragma GCC optimize("O2") /* also where the Arduino IDE asks for small code: it runs in each tick */
+#endif
 #include "control.h"
 
-#define TERM_LARGEST (1L << 28)
+#define DERIVATIVE_LARGEST (1L << 28)
 #define INTEGRAL_LARGEST (1L << 27)
+#define SUM_LARGEST ((1L << 26) - 1)
 
 static uint8_t too_large(int32_t gain)
 {
@@ -30,7 +35,7 @@ void control_reset(struct control *control)
     control->begun = 0;
 }
 
-static int32_t within(int32_t value, int32_t largest)
+static inline int32_t within(int32_t value, int32_t largest)
 {
     if (value > largest)
         return largest;
@@ -39,45 +44,63 @@ static int32_t within(int32_t value, int32_t largest)
     return value;
 }
 
-/* value * fraction / 2^16, to the nearest, without a product of 48 bits. */
-static int32_t part(int32_t value, uint16_t fraction)
+/* Keeps a half of a number from being seen as part of it: else the compiler calls for a product of full length, which
+ * takes three times as long. */
+#define HALF(x) __asm__("" : "+r"(x))
+
+/* gain * factor, which fits 32 bits. */
+static inline int32_t product(int32_t gain, int16_t factor)
 {
-    int32_t upper = (int32_t)(int16_t)(value >> 16) * fraction;
-    uint32_t lower = (uint32_t)(uint16_t)value * fraction + 0x8000u;
-    return upper + (int32_t)(lower >> 16);
+    int16_t upper = (int16_t)((int16_t)(gain >> 16) * factor);
+    uint16_t lower = (uint16_t)gain;
+    HALF(lower);
+    return upper * 65536L + (int32_t)lower * factor;
 }
 
-static int32_t filtered(struct control *control, const struct msg_gains *gains, uint16_t position)
+/* value * fraction / 2^16, to the nearest, without a product of 48 bits. */
+static inline int32_t part(int32_t value, uint16_t fraction)
 {
-    int32_t derivative = part(control->derivative, gains->pole);
+    int16_t upper = (int16_t)(value >> 16);
+    uint16_t lower = (uint16_t)value;
+    HALF(upper);
+    HALF(lower);
+    return (int32_t)upper * fraction + (int32_t)(((uint32_t)lower * fraction + 0x8000u) >> 16);
+}
+
+static inline int32_t filtered(struct control *control, uint16_t position)
+{
+    int32_t derivative = part(control->derivative, control->gains.pole);
     if (control->begun)
-        derivative -= gains->kd * (int16_t)(position - control->last);
+        derivative -= product(control->gains.kd, (int16_t)(position - control->last));
     control->begun = 1;
     control->last = position;
-    return control->derivative = within(derivative, TERM_LARGEST);
+    return control->derivative = within(derivative, DERIVATIVE_LARGEST);
 }
 
-uint16_t control_step(struct control *control, const struct msg_gains *gains, uint16_t position, uint16_t current,
-                      int16_t excitation, uint16_t low, uint16_t high)
+uint16_t control_step(struct control *control, uint16_t position, uint16_t current, int16_t excitation, uint16_t low,
+                      uint16_t high)
 {
-    int16_t error = (int16_t)(gains->setpoint - position);
-    int32_t growth = gains->ki * error;
-    int32_t wanted = (int32_t)((int16_t)gains->duty_bias + excitation) * 4096;
-    int8_t beyond = 0;
-    uint16_t duty;
-    wanted += within(gains->kp * error, TERM_LARGEST) + (control->integral >> 4);
-    wanted += filtered(control, gains, position);
-    wanted -= within(gains->kc * (int16_t)(current - gains->current_rest), TERM_LARGEST);
-    if (wanted > (int32_t)high * 4096) {
-        duty = high;
-        beyond = 1;
-    } else if (wanted < (int32_t)low * 4096) {
-        duty = low;
-        beyond = -1;
-    } else {
-        duty = (uint16_t)((wanted + 2048) >> 12);
+    int16_t error = (int16_t)(control->gains.setpoint - position);
+    int32_t growth = product(control->gains.ki, error);
+    int32_t sum = product(control->gains.kp, error) + (control->integral >> 4);
+    uint16_t fraction; /* of a count, 2^-16 */
+    int16_t whole;     /* counts below or at what is wanted */
+    uint8_t growing = 1;
+    sum += filtered(control, position);
+    sum -= product(control->gains.kc, (int16_t)(current - control->gains.current_rest));
+    sum = within(sum, SUM_LARGEST) * 16;
+    whole = (int16_t)((int16_t)(sum >> 16) + (int16_t)control->gains.duty_bias + excitation);
+    fraction = (uint16_t)sum;
+    if (whole > (int16_t)high || (whole == (int16_t)high && fraction)) {
+        whole = (int16_t)high;
+        growing = growth <= 0;
+    } else if (whole < (int16_t)low) {
+        whole = (int16_t)low;
+        growing = growth >= 0;
+    } else if (fraction & 0x8000u) {
+        whole++;
     }
-    if (!(beyond > 0 && growth > 0) && !(beyond < 0 && growth < 0))
+    if (growing)
         control->integral = within(control->integral + growth, INTEGRAL_LARGEST);
-    return duty;
+    return (uint16_t)whole;
 }

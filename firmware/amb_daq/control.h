@@ -8,10 +8,10 @@
  * x, i: 10-bit counts. kp, kd, kc, D: 2^-12 counts of pulse width; ki, I: 2^-16; pole: 2^-16. The sum is made in 2^-12
  * and rounded to the nearest count once, at the end.
  *
- * Nothing can overflow 32 bits: |gain| <= CONTROL_LARGEST = 2^20 (256 counts per count; ki: 16 per count and tick), so a
- * product with a difference of two inputs (|.| <= 1023) is below 2^30; P, D and C are limited to +-2^28 (65536 counts of
- * pulse width, eighty times its range) and I to +-2^27 (2048 counts), so their sum stays below 2^30. Larger gains are
- * refused.
+ * Nothing can overflow 32 bits: |gain| <= CONTROL_LARGEST = 2^19 (128 counts per count; ki: 8 per count and tick), so a
+ * product with a difference of two inputs (|.| <= 1023) is below 2^29; D is limited to +-2^28 and I to +-2^27 (2048
+ * counts), so their sum stays below 2^29 + 2^23 + 2^28 + 2^29 < 2^31. It is limited to +-2^26 (16384 counts of pulse
+ * width, twenty times its range) before bias and excitation are added. Larger gains are refused.
  */
 #ifndef AMB_DAQ_CONTROL_H
 #define AMB_DAQ_CONTROL_H
@@ -20,9 +20,10 @@
 
 #include "protocol.h"
 
-#define CONTROL_LARGEST (1L << 20)
+#define CONTROL_LARGEST (1L << 19)
 
 struct control {
+    struct msg_gains gains;
     int32_t integral;   /* 2^-16 counts */
     int32_t derivative; /* 2^-12 counts */
     uint16_t last;      /* position of the last tick */
@@ -36,7 +37,7 @@ uint8_t control_refuses(const struct msg_gains *gains);
 void control_reset(struct control *control);
 
 /* One tick: returns the pulse width, within low and high. */
-uint16_t control_step(struct control *control, const struct msg_gains *gains, uint16_t position, uint16_t current,
-                      int16_t excitation, uint16_t low, uint16_t high);
+uint16_t control_step(struct control *control, uint16_t position, uint16_t current, int16_t excitation, uint16_t low,
+                      uint16_t high);
 
 #endif

@@ -40,7 +40,6 @@ struct daq {
     uint16_t period;  /* of a tick, in periods of the pulse width */
     uint8_t stream;
     struct msg_limits limits;
-    struct msg_gains gains;
     struct control control;
     struct excitation excitation;
 

@@ -1,6 +1,9 @@
 /*
  * Encoding into the transmit ring, and decoding byte by byte.
  */
+#ifdef __AVR__
+#pragma GCC optimize("O2") /* it runs in each tick */
+#endif
 #include "frame.h"
 
 #include "crc16.h"

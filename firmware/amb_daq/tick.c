@@ -1,6 +1,9 @@
 /*
  * The work of one tick.
  */
+#ifdef __AVR__
+#pragma GCC optimize("O2") /* it runs in each tick */
+#endif
 #include "tick.h"
 
 #include <stddef.h>
@@ -33,7 +36,7 @@ static uint16_t limited(int16_t duty)
 
 static int16_t bias(void)
 {
-    return (int16_t)((daq.ready & READY_GAINS) ? daq.gains.duty_bias : daq.limits.duty_off);
+    return (int16_t)((daq.ready & READY_GAINS) ? daq.control.gains.duty_bias : daq.limits.duty_off);
 }
 
 /* Orders the pulse width; a fault that came meanwhile wins. */
@@ -74,7 +77,7 @@ static void keep(uint16_t tick, uint16_t duty, int16_t excitation)
     if (stream & STREAM_EXCITATION)
         *value++ = (uint16_t)excitation;
     if (stream & STREAM_SETPOINT)
-        *value++ = daq.gains.setpoint;
+        *value++ = daq.control.gains.setpoint;
     sample->n = (uint8_t)(value - sample->values);
     queue_head = next;
 }
@@ -92,8 +95,8 @@ void tick_work(void)
         } else {
             excitation = excitation_next(&daq.excitation, daq.table);
             if (daq.state == STATE_LEVITATING)
-                duty = control_step(&daq.control, &daq.gains, daq.inputs[0], daq.inputs[1], excitation,
-                                    daq.limits.duty_low, daq.limits.duty_high);
+                duty = control_step(&daq.control, daq.inputs[0], daq.inputs[1], excitation, daq.limits.duty_low,
+                                    daq.limits.duty_high);
             else
                 duty = limited((int16_t)(bias() + excitation));
             duty = order(duty);
