@@ -120,7 +120,7 @@ def test_ten_thousand_mutated_frames_one_by_one():
             assert set(found) <= {payload, first, second}
     assert accounted(decoder) == fed
     assert collisions <= CHANCE_ALLOWS
-    assert harmless < 1000  # e.g. swapped with itself, a zero more between frames, all of it lost
+    assert harmless < 1300  # e.g. swapped with itself, a zero more between frames, all of it lost
 
 
 def stream(source, count, mutate):
