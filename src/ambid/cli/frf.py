@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, orders_of
-from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.options import (
+    FAILED_CHECK,
+    From,
+    Gaps,
+    JsonFile,
+    Rate,
+    RecordFile,
+    RigFile,
+    Strict,
+    To,
+    band_of,
+    json_path,
+)
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError
@@ -101,7 +113,7 @@ def command(
     with Outputs(record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
         outputs.claim(plot, "--plot", FIGURE_ENDINGS)
-        between, wanted, n, late = _band(band), _orders(orders), _order(state_space), _delay(delay)
+        between, wanted, n, late = band_of(band), _orders(orders), _order(state_space), _delay(delay)
         with progress("measure") as tick:
             found = frf(
                 record,
@@ -165,18 +177,3 @@ def _delay(text: str | None) -> float | Literal["auto"] | None:
         return float(text)
     except ValueError:
         raise AmbidError(f"--delay is {text!r}; it is a time in s, or auto. Give e.g. --delay 1e-4") from None
-
-
-def _band(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    low, _, high = text.partition(":")
-    try:
-        found = (float(low), float(high))
-    except ValueError:
-        found = (0.0, 0.0)
-    if not 0.0 <= found[0] < found[1] < float("inf"):
-        raise AmbidError(
-            f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000"
-        )
-    return found

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.physics.presets import Preset
 
 RecordFile = Annotated[
     Path, typer.Argument(metavar="RECORD", help="Record: .csv, .csv.gz, .h5 or .mat.", show_default=False)
@@ -60,3 +65,60 @@ def json_path(json: str | None) -> Path | None:
         None where no file is to be written.
     """
     return None if json in (None, "-") else Path(str(json))
+
+
+def band_of(text: str | None) -> tuple[float, float] | None:
+    """Read ``--band``.
+
+    Parameters
+    ----------
+    text : str or None
+        Two frequencies in Hz with a colon between.
+
+    Returns
+    -------
+    (float, float) or None
+        None where none was given.
+
+    Raises
+    ------
+    AmbidError
+        If it is not of that form, or the second is not above the first.
+    """
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    try:
+        found = (float(low), float(high))
+    except ValueError:
+        found = (0.0, 0.0)
+    if not 0.0 <= found[0] < found[1] < float("inf"):
+        raise AmbidError(
+            f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000"
+        )
+    return found
+
+
+def preset_of(name: str) -> Preset | None:
+    """Take a word for a preset if it is one, or cannot be a file.
+
+    Parameters
+    ----------
+    name : str
+        A preset or the path of a rig file.
+
+    Returns
+    -------
+    Preset or None
+        None for a path.
+
+    Raises
+    ------
+    ModelError
+        If it is neither.
+    """
+    from ambid.physics.presets import preset, preset_names
+
+    if name in preset_names() or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
+        return preset(name)
+    return None

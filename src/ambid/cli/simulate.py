@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ambid.cli.options import band_of, preset_of
 from ambid.cli.output import Outputs
 from ambid.cli.scenario import Course, simulate_course, truth_words, warn
 from ambid.cli.terminal import progress
@@ -113,7 +114,7 @@ def command(
     from ambid.record import Channel, write_record
     from ambid.signals import excitation as make_excitation
 
-    preset, closed = _preset(rig), None if loop is None else loop == "closed"
+    preset, closed = preset_of(rig), None if loop is None else loop == "closed"
     if scenario is not None:
         _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
                                "--periods": None if periods == 1 else periods})  # fmt: skip
@@ -131,7 +132,7 @@ def command(
         )
         n = _samples(duration, rate_hz)
         shape = _repeated(
-            lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=_band(band), seed=seed), n, periods
+            lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
         )
         peak = _largest(respond, shape, limits, point) if amplitude is None else amplitude
         done = respond(peak * shape)
@@ -149,15 +150,6 @@ def _refuse(of: str, given: Mapping[str, object]) -> None:
     for option, value in given.items():
         if value is not None:
             raise AmbidError(f"{of} has no {option}. Leave {option} out")
-
-
-def _preset(name: str) -> Preset | None:
-    """Take the word for a preset if it is one, or cannot be a file."""
-    from ambid.physics.presets import preset, preset_names
-
-    if name in preset_names() or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
-        return preset(name)
-    return None
 
 
 def _of_preset(preset: Preset, rate: float | None, seed: int, closed: bool | None, nonlinear: bool) -> tuple[Any, ...]:
@@ -212,18 +204,6 @@ def _repeated(make: Callable[[int], Array], n: int, periods: int) -> Array:
     if n % periods:
         raise AmbidError(f"--periods {periods}: {n} samples are no whole number each. Change --duration or --periods")
     return np.tile(make(n // periods), periods)
-
-
-def _band(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    low, colon, high = text.partition(":")
-    try:
-        if colon:
-            return float(low), float(high)
-    except ValueError:
-        pass
-    raise AmbidError(f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000")
 
 
 def _comments(rig: str, excitation: str, size: float, band: str | None, seed: int, done: Simulation) -> tuple[str, ...]:

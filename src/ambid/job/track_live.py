@@ -72,6 +72,7 @@ def track_live(
     flags: Sequence[tuple[float, Flag]] = (),
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
+    on_run: Callable[[RunReport], object] | None = None,
     on_header: Callable[[TrackHeader], None] | None = None,
     on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
     keep: bool = True,
@@ -96,6 +97,8 @@ def track_live(
         Others who listen to the run, such as a recorder.
     on_event : callable, optional
         Told of the device's events, in the thread of the run.
+    on_run : callable, optional
+        Given what came of the run, also where tracking was interrupted.
 
     Returns
     -------
@@ -113,7 +116,7 @@ def track_live(
     with BlockRing.create(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
-        runner = _Runner(device, course, [_RingTap(ring, view), *taps], on_event, ring)
+        runner = _Runner(device, course, [_RingTap(ring, view), *taps], on_event, on_run, ring)
         with runner:
             wanted_s = _wanted_s(start, start_s, view.rate_hz)
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
@@ -156,9 +159,11 @@ class _Runner:
         course: Course,
         taps: Sequence[Tap],
         on_event: Callable[[DeviceEvent], object] | None,
+        on_run: Callable[[RunReport], object] | None,
         ring: BlockRing,
     ) -> None:
         self._job = (device, course, taps, on_event)
+        self._on_run = on_run
         self._ring, self._stop = ring, Signal()
         self._report: RunReport | None = None
         self._failure: BaseException | None = None
@@ -171,6 +176,9 @@ class _Runner:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         self._stop.set()
         self._thread.join()
+        if self._on_run is not None and self._report is not None:
+            self._on_run(self._report)
+            self._on_run = None
 
     def report(self) -> RunReport:
         """Return what came of the run; raise what ended it."""

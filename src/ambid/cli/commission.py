@@ -1,0 +1,132 @@
+"""``ambid commission``: guided, from a controller that answers to physical parameters that are tracked."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
+from ambid.cli.interrupts import Stop, signals
+from ambid.cli.options import FAILED_CHECK, band_of
+from ambid.cli.terminal import painter
+from ambid.cli.watch import watching
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.acquire.device import Device
+    from ambid.job.acquire import Progress
+    from ambid.job.commission import Step, StepName
+
+
+def command(
+    port: Port,
+    rig: RigOfDevice,
+    folder: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FOLDER", help="Where records, estimate and report go.", show_default=False
+        ),
+    ],
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the record in s.")] = 20.0,
+    track_seconds: Annotated[
+        float, typer.Option("--track-seconds", metavar="S", help="Length of live tracking in the end, in s.")
+    ] = 5.0,
+    amplitude: Annotated[
+        float | None,
+        typer.Option(
+            "--amplitude", metavar="V", help="Peak of the excitation in V.", show_default="found by trials, small first"
+        ),
+    ] = None,
+    band: BandHz = None,
+    widest: Annotated[
+        float, typer.Option("--widest", metavar="X", help="Largest half width of a 95 % interval that is good enough.")
+    ] = 0.10,
+    bench: BenchName = None,
+    pace: Pace = "fastest",
+    seed: Seed = 0,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask before the controller switches its output on.")
+    ] = False,
+) -> None:
+    """Commission a bench: self-test, rest, levitate, excite, record, identify, validate, report, then track.
+
+    Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
+    what was found up to there stays in the folder.
+    """
+    from ambid.job.commission import STEPS, Wishes, commission
+    from ambid.report.acquire_text import progress_line
+    from ambid.report.commission_text import step_text
+    from ambid.rig import load_rig
+
+    _check({"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest})
+    wishes = Wishes(
+        record_s=seconds, track_s=track_seconds, amplitude_v=amplitude, band_hz=band_of(band), widest=widest, seed=seed
+    )
+    known, paint, stop = load_rig(rig), painter(), Stop()
+    _make(folder)
+    with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
+
+        def begin(name: StepName) -> None:
+            watch.show(name, STEPS.index(name) / len(STEPS), "")
+
+        def show(now: Progress) -> None:
+            watch.show("record", now.samples / max(now.wanted, 1), progress_line(now))
+
+        def tell(step: Step) -> None:
+            watch.clear()
+            typer.echo(step_text(step, STEPS.index(step.name) + 1, len(STEPS), paint=paint))
+
+        def agreed(name: StepName) -> bool:
+            watch.clear()
+            return _agreed(name, device, yes=yes)
+
+        done = commission(
+            device,
+            known,
+            folder,
+            wishes=wishes,
+            on_begin=begin,
+            on_step=tell,
+            on_progress=show,
+            confirm=agreed,
+            stopped=stop.wished,
+        )
+    if stop.number is not None:
+        typer.echo(f"ambid: interrupted; {folder} holds what was found before", err=True)
+        raise typer.Exit(stop.code)
+    if not done.passed:
+        typer.echo(paint(f"stopped at {done.steps[-1].name}; {folder} holds what was found before", "bad"))
+        raise typer.Exit(FAILED_CHECK)
+    typer.echo(f"{folder}: rig, records, estimate, report and track")
+
+
+def _check(given: dict[str, float | None]) -> None:
+    for option, x in given.items():
+        if x is not None and not (math.isfinite(x) and x > 0):
+            raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as failure:
+        raise AmbidError(f"-o {folder} cannot be made: {failure.strerror or failure}. Choose another folder") from None
+
+
+def _agreed(name: StepName, device: Device, *, yes: bool) -> bool:
+    """Ask before a real bench moves."""
+    del name
+    if yes or device.info.kind != "serial":
+        return True
+    if not sys.stdin.isatty():
+        raise AmbidError(
+            f"{device.info.port}: the controller is to switch its output on, and nobody can be asked. Clear the bench"
+            " and give --yes"
+        )
+    return typer.confirm(
+        "The controller will switch its output on and lift the rotor. Is the bench clear, the emergency stop at hand?"
+    )

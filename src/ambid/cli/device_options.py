@@ -1,0 +1,113 @@
+"""Options and openings that the verbs with a device share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from ambid.cli.options import preset_of
+
+if TYPE_CHECKING:
+    from ambid.acquire.device import Device, Mode
+    from ambid.physics.presets import Preset
+    from ambid.rig import Rig
+
+Port = Annotated[
+    str,
+    typer.Option(
+        "--port", metavar="PORT", help="Serial port, or: emulated, simulated, replay:FILE.", show_default=False
+    ),
+]
+RigOfDevice = Annotated[
+    Path,
+    typer.Option("--rig", metavar="RIG", help="Rig file (TOML): calibrations, [loop], [daq].", show_default=False),
+]
+BandHz = Annotated[
+    str | None,
+    typer.Option(
+        "--band", metavar="LO:HI", help="Band of the excitation in Hz.", show_default="what the controller can play"
+    ),
+]
+BenchName = Annotated[
+    str | None,
+    typer.Option(
+        "--bench",
+        metavar="PRESET|RIG",
+        help="Plant behind an emulated or simulated controller.",
+        show_default="daq.bench of the rig, or its own values",
+    ),
+]
+Pace = Annotated[
+    Literal["fastest", "real-time"],
+    typer.Option("--pace", help="Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
+]
+Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and simulated noise.", min=0)]
+
+
+def course_mode(rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
+    """Choose what a device does where the user does not say.
+
+    Parameters
+    ----------
+    rig : Rig
+        Of the device.
+    mode : str or None
+        As given.
+    excitation : str or None
+        As given.
+
+    Returns
+    -------
+    {"sample", "drive", "levitate"}
+        Levitate where the rig has a loop and does not say ``open_loop``; else drive, if there is something to play.
+    """
+    if mode is not None:
+        return mode
+    if rig.loop is not None and rig.loop.closed and not rig.open_loop:
+        return "levitate"
+    return "sample" if excitation is None else "drive"
+
+
+@contextmanager
+def opened(port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int) -> Iterator[Device]:
+    """Open a device and close it.
+
+    Parameters
+    ----------
+    port : str
+        See ``--port``.
+    rig : Rig
+        Of the device.
+    bench : str or None
+        See ``--bench``.
+    pace : {"fastest", "real-time"}
+        Of a device that is no hardware.
+    seed : int
+        Of simulated noise.
+
+    Yields
+    ------
+    Device
+        Idle.
+
+    Raises
+    ------
+    AmbidError
+        If there is no such bench, or the device cannot be opened.
+    """
+    from ambid.acquire.devices import open_device
+
+    with open_device(port, rig, bench=_bench(bench), pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
+        yield device
+
+
+def _bench(name: str | None) -> Preset | Rig | None:
+    if name is None:
+        return None
+    from ambid.rig import load_rig
+
+    return preset_of(name) or load_rig(Path(name))

@@ -1,0 +1,240 @@
+"""The acquisition job: a device does a course, a recorder writes it down, quality is watched; a record results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ambid.acquire.device import Counters, Device, DeviceEvent, DeviceInfo
+from ambid.acquire.quality import Quality, QualityReport
+from ambid.acquire.recorder import Event, JournalHeader, Recorded, Recorder
+from ambid.acquire.session import Course, RunReport, Tap, run
+from ambid.errors import DeviceError
+from ambid.rig import Rig
+from ambid.track.stream.block import Frame
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far an acquisition is.
+
+    Attributes
+    ----------
+    samples, wanted : int
+        So far, and in all.
+    quality : QualityReport
+        Of what came so far.
+    counters : Counters
+        Of the line.
+    """
+
+    samples: int
+    wanted: int
+    quality: QualityReport
+    counters: Counters
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acquired:
+    """What an acquisition gave.
+
+    Attributes
+    ----------
+    info : DeviceInfo
+        Who gave it.
+    run : RunReport
+        Of the device.
+    quality : QualityReport
+        Of the samples.
+    counters : Counters
+        Of the line.
+    recorded : Recorded or None
+        The record's file; None where no sample came.
+    troubles : tuple of DeviceError
+        What the recorder told; where the disk failed, the rest of the samples is not stored.
+    """
+
+    info: DeviceInfo
+    run: RunReport
+    quality: QualityReport
+    counters: Counters
+    recorded: Recorded | None
+    troubles: tuple[DeviceError, ...]
+
+
+def acquire(
+    device: Device,
+    rig: Rig,
+    path: str | Path,
+    course: Course,
+    *,
+    force: bool = False,
+    taps: Sequence[Tap] = (),
+    every_s: float = 0.25,
+    on_progress: Callable[[Progress], object] | None = None,
+    on_event: Callable[[DeviceEvent], object] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Acquired:
+    """Record what a device samples during a course.
+
+    Parameters
+    ----------
+    device : Device
+        Opened, idle.
+    rig : Rig
+        Its bench; its text goes with the record.
+    path : str or Path
+        The record: .h5, .hdf5, .csv or .csv.gz.
+    course : Course
+        What the device is to do.
+    force : bool
+        Whether a record that exists may be written over.
+    taps : sequence of Tap
+        Others who listen.
+    every_s : float
+        How often `on_progress` is called, s of the device's clock.
+    on_progress, on_event : callable, optional
+        Told how far it is, and what the device tells.
+    stopped : callable, optional
+        Asked between blocks; True ends the run in an orderly way, with what came so far.
+
+    Returns
+    -------
+    Acquired
+        Also where a fault ended the run early: see ``run.fault``.
+
+    Raises
+    ------
+    DeviceError
+        If device or disk refuse, or the line is lost; samples that came before are in the record, or in its journal.
+    """
+    with recording(
+        device, rig, path, course, force=force, every_s=every_s, on_progress=on_progress, on_event=on_event
+    ) as tap:
+        report = run(device, course, taps=[tap, *taps], on_event=tap.tell, stopped=stopped)
+    return tap.acquired(report)
+
+
+@contextmanager
+def recording(
+    device: Device,
+    rig: Rig,
+    path: str | Path,
+    course: Course,
+    *,
+    force: bool = False,
+    every_s: float = 0.25,
+    on_progress: Callable[[Progress], object] | None = None,
+    on_event: Callable[[DeviceEvent], object] | None = None,
+) -> Iterator[Recording]:
+    """Record what a run passes on, whoever runs it.
+
+    Parameters
+    ----------
+    device, rig, path, course, force, every_s, on_progress, on_event
+        As `acquire`.
+
+    Yields
+    ------
+    Recording
+        A tap of the run; on leaving, the journal becomes the record.
+
+    Raises
+    ------
+    DeviceError
+        If the record exists, or cannot be written.
+    """
+    troubles: list[DeviceError] = []
+    recorder = Recorder(
+        path, JournalHeader.of(device.info, _text(rig)), seconds=course.seconds, force=force, on_trouble=troubles.append
+    )
+    with recorder:
+        if course.program is not None:
+            recorder.event(Event(kind="excitation", what=str(course.program)))
+        yield Recording(recorder, device, course, every_s, on_progress, on_event, troubles)
+
+
+def _text(rig: Rig) -> str:
+    from ambid.rig import rig_text
+
+    return rig_text(rig, Path.cwd() if rig.source is None else rig.source.resolve().parent)
+
+
+class Recording:
+    """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`."""
+
+    def __init__(
+        self,
+        recorder: Recorder,
+        device: Device,
+        course: Course,
+        every_s: float,
+        on_progress: Callable[[Progress], object] | None,
+        on_event: Callable[[DeviceEvent], object] | None,
+        troubles: list[DeviceError],
+    ) -> None:
+        """Begin with nothing."""
+        rate_hz = device.info.rate_hz
+        self._recorder, self._device, self._troubles = recorder, device, troubles
+        self._quality = Quality(device.info, course.program)
+        self._on_progress, self._on_event = on_progress, on_event
+        self._every, self._wanted = max(1, round(every_s * rate_hz)), round(course.seconds * rate_hz)
+        self._samples = self._told = 0
+
+    def take(self, frame: Frame) -> None:
+        """Take a block.
+
+        Parameters
+        ----------
+        frame : Frame
+            As it came.
+        """
+        self._recorder.append(frame.block)
+        self._quality.add(frame)
+        self._samples += len(frame.block.values)
+        if self._on_progress is not None and self._samples - self._told >= self._every:
+            self._told = self._samples
+            self._on_progress(
+                Progress(
+                    samples=self._samples,
+                    wanted=self._wanted,
+                    quality=self._quality.report(),
+                    counters=self._device.counters(),
+                )
+            )
+
+    def tell(self, event: DeviceEvent) -> None:
+        """Take what the device tells.
+
+        Parameters
+        ----------
+        event : DeviceEvent
+            It goes into the record too.
+        """
+        self._recorder.event(event)
+        if self._on_event is not None:
+            self._on_event(event)
+
+    def acquired(self, report: RunReport) -> Acquired:
+        """Return what came of it, once the recording is closed.
+
+        Parameters
+        ----------
+        report : RunReport
+            Of the run.
+
+        Returns
+        -------
+        Acquired
+            With the record's file.
+        """
+        return Acquired(
+            info=self._device.info,
+            run=report,
+            quality=self._quality.report(),
+            counters=self._device.counters(),
+            recorded=self._recorder.result,
+            troubles=tuple(self._troubles),
+        )

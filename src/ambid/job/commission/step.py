@@ -1,0 +1,124 @@
+"""What a guided commissioning consists of: steps, each with findings and, where it is not good enough, the reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"]
+
+STEPS: tuple[StepName, ...] = (
+    "self-test",
+    "rest",
+    "levitate",
+    "excite",
+    "record",
+    "identify",
+    "validate",
+    "report",
+    "track",
+)
+"""In their order."""
+
+_NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One step, done.
+
+    Attributes
+    ----------
+    name : str
+        One of `STEPS`.
+    findings : tuple of str
+        What was measured, one line each.
+    reasons : tuple of str
+        Why it is not good enough, and what to do, one line each; empty: it is.
+    cautions : tuple of str
+        What a reader should know although the step is good enough.
+    numbers : Mapping of str to float
+        The same as numbers, SI.
+    """
+
+    name: StepName
+    findings: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
+    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)
+
+    @property
+    def passed(self) -> bool:
+        """Whether commissioning may go on."""
+        return not self.reasons
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as a JSON object.
+
+        Returns
+        -------
+        dict
+            ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``.
+        """
+        return {
+            "name": self.name,
+            "passed": self.passed,
+            "findings": list(self.findings),
+            "reasons": list(self.reasons),
+            "cautions": list(self.cautions),
+            "numbers": dict(self.numbers),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wishes:
+    """What a commissioning is to reach, and how long it may take for it.
+
+    Attributes
+    ----------
+    record_s, second_s, hover_s, rest_s, trial_s, track_s : float
+        Length of the record, of the one for validation, of levitation without excitation, of the look at rest, of each
+        trial of the amplitude, and of tracking, s.
+    settle_s : float
+        Time that lift-off is given, s.
+    amplitude_v : float or None
+        Peak of the excitation, V; None: found by trials.
+    band_hz : (float, float) or None
+        Of the excitation; None: a thousandth to a thirtieth of the rate.
+    use : float
+        Part of the way to the trips that the excitation may use.
+    widest : float
+        Largest half width of a 95 % interval, relative to the value, of a parameter that counts as found.
+    seed : int
+        Of the excitation.
+    """
+
+    record_s: float = 20.0
+    second_s: float = 8.0
+    hover_s: float = 2.0
+    rest_s: float = 0.5
+    trial_s: float = 1.0
+    track_s: float = 5.0
+    settle_s: float = 1.0
+    amplitude_v: float | None = None
+    band_hz: tuple[float, float] | None = None
+    use: float = 0.4
+    widest: float = 0.10
+    seed: int = 0
+
+    def band(self, rate_hz: float) -> tuple[float, float]:
+        """Return the band of the excitation in Hz.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the device, Hz.
+
+        Returns
+        -------
+        (float, float)
+            As wished, or from the rate.
+        """
+        return self.band_hz or (rate_hz / 1000.0, rate_hz / 30.0)

@@ -1,0 +1,163 @@
+"""Short looks at a bench: a course is run and kept in memory, seen through the rig, with the room that it may use."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.acquire.device import Device
+from ambid.acquire.session import Course, RunReport, run
+from ambid.acquire.view import BenchView
+from ambid.physics.models import model
+from ambid.rig import Rig
+from ambid.track.stream.block import Frame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """Where a bench may work, SI.
+
+    Attributes
+    ----------
+    trips : Mapping of str to (float, float)
+        Of position and current: the controller's limits.
+    voltage : (float, float)
+        Of the power stage.
+    """
+
+    trips: Mapping[str, tuple[float, float]]
+    voltage: tuple[float, float]
+
+    @classmethod
+    def of(cls, rig: Rig) -> Room:
+        """Take it from a rig.
+
+        Parameters
+        ----------
+        rig : Rig
+            With ``[daq]``.
+
+        Returns
+        -------
+        Room
+            Infinite where the rig knows no limit.
+        """
+        unlimited = (-math.inf, math.inf)
+        trips = {role: rig.trip(role) or unlimited for role in ("position", "current")}
+        return cls(trips=MappingProxyType(trips), voltage=rig.limits.voltage if rig.limits else unlimited)
+
+    def used(self, role: str, values: Array, rest: float) -> float:
+        """Return which part of the way from rest to the nearer trip is used, 0 to 1 and beyond.
+
+        Parameters
+        ----------
+        role : str
+            ``position`` or ``current``.
+        values : ndarray, shape (n_samples,), SI
+            Measured.
+        rest : float
+            Where the bench rests, SI.
+
+        Returns
+        -------
+        float
+            0 where there is no limit.
+        """
+        low, high = self.trips[role]
+        up, down = float(values.max()) - rest, rest - float(values.min())
+        return max(
+            up / (high - rest) if high > rest else math.inf, down / (rest - low) if rest > low else math.inf, 0.0
+        )
+
+
+class Kept:
+    """Keeps what a run passes on, seen through the rig.
+
+    Parameters
+    ----------
+    view : BenchView
+        Of device and rig.
+    """
+
+    def __init__(self, view: BenchView) -> None:
+        self._view = view
+        self._values: list[Array] = []
+
+    def take(self, frame: Frame) -> None:
+        """Take a block."""
+        self._values.append(self._view.block(frame.block).values)
+
+    def roles(self) -> dict[str, Array]:
+        """Return what came, by role.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n_samples,), SI
+            Empty arrays where nothing came.
+        """
+        n = len(self._view.units)
+        values = np.concatenate(self._values) if self._values else np.empty((0, n))
+        return {role: values[:, k] for k, role in enumerate(self._view.units)}
+
+
+Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
+
+
+def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
+    """Return a way of running a course and keeping what it shows.
+
+    Parameters
+    ----------
+    device : Device
+        Opened, idle.
+    rig : Rig
+        Its bench.
+    stopped : callable
+        As `session.run`.
+
+    Returns
+    -------
+    callable
+        Takes a course, gives report and values by role.
+    """
+    plant = model(rig.model)
+    view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
+
+    def look(course: Course) -> tuple[RunReport, dict[str, Array]]:
+        kept = Kept(view)
+        report = run(device, course, taps=[kept], stopped=stopped)
+        return report, kept.roles()
+
+    return look
+
+
+def ended(report: RunReport, what: str) -> tuple[str, ...]:
+    """Say why a run is not whole.
+
+    Parameters
+    ----------
+    report : RunReport
+        Of the run.
+    what : str
+        What it was for.
+
+    Returns
+    -------
+    tuple of str
+        Empty where it is whole.
+    """
+    if report.fault is not None:
+        at = "" if report.fault.sample is None else f" at sample {report.fault.sample}"
+        return (f"the controller went to its safe state during {what}{at}: {report.fault.what}",)
+    if report.lost:
+        return (f"{report.lost} of {report.wanted} samples were lost during {what}: look at cable, baud rate and load",)
+    if not report.complete:
+        return (f"{what} ended after {report.samples} of {report.wanted} samples",)
+    return ()
