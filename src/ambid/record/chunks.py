@@ -16,6 +16,7 @@ from zlib import error as ZlibError
 import numpy as np
 
 from ambid.errors import RecordError
+from ambid.record._hdf5_file import new_hdf5
 from ambid.record.csv_format import head_lines
 from ambid.record.hdf5_format import add_channel, write_head
 from ambid.record.record import Array, Record
@@ -75,10 +76,8 @@ def _counted(chunks: Iterable[Array], n_samples: int) -> Iterator[Array]:
 def _write_hdf5(
     record: Record, n_samples: int, chunks: Iterable[Array], path: Path, texts: Mapping[str, str]
 ) -> Callable[[], None]:
-    import h5py
-
     sums = [0] * len(record.channels)
-    with h5py.File(path, "w") as file:
+    with new_hdf5(path) as (file, check):
         write_head(file, record)
         for name, text in texts.items():
             file[name] = text
@@ -92,6 +91,7 @@ def _write_hdf5(
                 dataset[at : at + len(column)] = column
                 sums[k] = crc32(column.tobytes(), sums[k])
             at += len(values)
+            check()
     return lambda: _check_hdf5(path, n_samples, sums)
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ambid.errors import RecordError
+from ambid.record._hdf5_file import new_hdf5
 from ambid.record.files import file_bytes, sha256_of
 from ambid.record.record import Channel, Record, Step
 from ambid.record.sampling import JITTER, GapPolicy, Table, check_gap_policy, sample_uniformly
@@ -40,12 +41,10 @@ def write_hdf5(record: Record, path: str | Path) -> None:
     RecordError
         If the history cannot be written as JSON, or the file cannot be written.
     """
-    import h5py
-
     path = Path(path)
     history = _history_text(record)
     try:
-        with h5py.File(path, "w") as file:
+        with new_hdf5(path) as (file, _):
             write_head(file, record, history)
             for k, c in enumerate(record.channels):
                 add_channel(file, k, c, data=c.values)

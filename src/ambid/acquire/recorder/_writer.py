@@ -196,7 +196,9 @@ class JournalWriter:
     def _look_at_file(self) -> None:
         fault = self._open.fault()
         if fault == REMOVED:
-            self.removed = True
+            with self._wake:
+                self.removed = True
+                self._wake.notify_all()
             self._trouble(fault, f"journal {self._open.path} {fault}; the recording goes on in the open file, and is"
                           " lost if this program is killed. End it in order: it is then saved as a record")  # fmt: skip
         elif fault:

@@ -211,7 +211,8 @@ class Recorder:
     def close(self, progress: Callable[[float], object] | None = None) -> Recorded | None:
         """End the recording: journal to record, read back, and only then the journal removed.
 
-        Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record.
+        Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record. So does
+        a disk that had failed, from which reading back proves little, and a journal that holds more than the record.
 
         Parameters
         ----------
@@ -236,7 +237,7 @@ class Recorder:
             reader = JournalReader(file.read, file.size, self.journal)
             extra = {"not_stored": self._writer.lost_samples} if self._writer.lost_samples else {}
             self.result = recorded_from(reader, self.path, force=self._force, extra=extra, progress=progress)
-            if self.result is None or not self.result.keep_journal:
+            if self.result is None or not (self.result.keep_journal or self.failed):
                 file.remove()
         finally:
             file.close()

@@ -1,0 +1,99 @@
+"""An HDF5 file that is being written on a disk that may be full.
+
+The HDF5 library does not survive a write that fails: what it could not flush crashes the program when it ends. So it
+writes through a file of ours, which never fails towards the library and raises afterwards what the disk had said.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[tuple[Any, Callable[[], None]]]:
+    """Make an HDF5 file, and close it; what the disk said is raised as OSError then, or by ``check`` in between.
+
+    Yields the h5py.File, and that check.
+    """
+    import h5py
+
+    with open(path, "w+b", buffering=0) as plain:
+        file = _Unfailing(plain)
+        with h5py.File(file, "w") as hdf5:
+            yield hdf5, file.check
+        file.check()
+
+
+class _Unfailing:
+    """A file whose writes always succeed: what the disk does not take is held in memory from then on."""
+
+    def __init__(self, plain: io.FileIO) -> None:
+        self._plain, self._at, self._size = plain, 0, 0
+        self._held: list[tuple[int, bytes]] = []
+        self._failure: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the first failure."""
+        if self._failure is not None:
+            raise self._failure
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = offset + (0, self._at, self._size)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def read(self, n: int = -1) -> bytes:
+        """Return the next `n` bytes, or all."""
+        data = bytearray(n if n >= 0 else max(self._size - self._at, 0))
+        self.readinto(data)
+        return bytes(data)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        at, n = self._at, len(view)
+        self._plain.seek(at)
+        data = bytearray((self._plain.read(n) or b"").ljust(n, b"\0"))
+        for offset, held in self._held:
+            begin, end = max(offset, at), min(offset + len(held), at + n)
+            if begin < end:
+                data[begin - at : end - at] = held[begin - offset : end - offset]
+        view[:] = data
+        self._at += n
+        return n
+
+    def write(self, data: Any) -> int:
+        content = bytes(data)
+        if self._failure is None:
+            try:
+                self._put(content)
+            except OSError as failure:
+                self._failure = failure
+        if self._failure is not None:
+            self._held.append((self._at, content))
+        self._at += len(content)
+        self._size = max(self._size, self._at)
+        return len(content)
+
+    def _put(self, content: bytes) -> None:
+        self._plain.seek(self._at)
+        rest = memoryview(content)
+        while rest:  # an unbuffered file may take a part, and fails with the next one
+            rest = rest[self._plain.write(rest) or 0 :]
+
+    def truncate(self, size: int) -> int:
+        self._size = size
+        if self._failure is None:
+            try:
+                self._plain.truncate(size)
+            except OSError as failure:
+                self._failure = failure
+        return size
+
+    def flush(self) -> None:
+        """Nothing is held back."""
