@@ -1,12 +1,15 @@
 """An HDF5 file that is being written on a disk that may be full.
 
 The HDF5 library does not survive a write that fails: what it could not flush crashes the program when it ends. So it
-writes through a file of ours, which never fails towards the library and raises afterwards what the disk had said.
+writes through a file of ours, which never fails towards the library and raises afterwards what the disk had said. For
+the same reason Ctrl-C waits until the library has come back.
 """
 
 from __future__ import annotations
 
 import io
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,9 +26,23 @@ def new_hdf5(path: Path) -> Iterator[tuple[Any, Callable[[], None]]]:
 
     with open(path, "w+b", buffering=0) as plain:
         file = _Unfailing(plain)
-        with h5py.File(file, "w") as hdf5:
+        with _no_interrupt(file), h5py.File(file, "w") as hdf5:
             yield hdf5, file.check
         file.check()
+
+
+@contextmanager
+def _no_interrupt(file: _Unfailing) -> Iterator[None]:
+    """Take Ctrl-C for a failure of the file, which is raised by the next check."""
+    usual = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: file.fail(KeyboardInterrupt()))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 class _Unfailing:
@@ -34,7 +51,11 @@ class _Unfailing:
     def __init__(self, plain: io.FileIO) -> None:
         self._plain, self._at, self._size = plain, 0, 0
         self._held: list[tuple[int, bytes]] = []
-        self._failure: OSError | None = None
+        self._failure: BaseException | None = None
+
+    def fail(self, failure: BaseException) -> None:
+        """Take note of the first failure."""
+        self._failure = self._failure or failure
 
     def check(self) -> None:
         """Raise the first failure."""
@@ -73,7 +94,7 @@ class _Unfailing:
             try:
                 self._put(content)
             except OSError as failure:
-                self._failure = failure
+                self.fail(failure)
         if self._failure is not None:
             self._held.append((self._at, content))
         self._at += len(content)
@@ -92,7 +113,7 @@ class _Unfailing:
             try:
                 self._plain.truncate(size)
             except OSError as failure:
-                self._failure = failure
+                self.fail(failure)
         return size
 
     def flush(self) -> None:

@@ -21,7 +21,7 @@ from ambid.record.csv_format import head_lines
 from ambid.record.hdf5_format import add_channel, write_head
 from ambid.record.record import Array, Record
 
-_PIECE = 1 << 20  # bytes, or values, that are read back at once
+_PIECE = 1 << 17  # bytes, or values, that are read back at once
 
 
 def write_chunks(

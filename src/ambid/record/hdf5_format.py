@@ -44,10 +44,11 @@ def write_hdf5(record: Record, path: str | Path) -> None:
     path = Path(path)
     history = _history_text(record)
     try:
-        with new_hdf5(path) as (file, _):
+        with new_hdf5(path) as (file, check):
             write_head(file, record, history)
             for k, c in enumerate(record.channels):
                 add_channel(file, k, c, data=c.values)
+                check()
     except OSError as failure:
         raise RecordError(f"{path} cannot be written: {failure.strerror or failure}. Check the folder") from None
 
