@@ -115,7 +115,9 @@ class SampleStream:
         """
         with self._lock:
             if self._running:
-                self._pass_on(self._decoder.finish(ticks), None)
+                # A stop may break off the tick under way: it has a number, but never became a sample.
+                whole = ticks is not None and ticks - (self._decoder.next_tick or 0) > 1
+                self._pass_on(self._decoder.finish(ticks if whole else None), None)
             self._running = False
             self.frames.end()
 
