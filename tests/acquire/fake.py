@@ -31,6 +31,7 @@ class FakeController:
         self.last = None
         self.settings, self.commands, self.tables = {}, [], {}
         self.playing = False
+        self.deaf = False
         self.mute = 0  # answers that are swallowed
         self.refuse = {}  # name -> (code, detail)
         self.interlock_open = False
@@ -38,6 +39,8 @@ class FakeController:
         self.clear_refused = False
 
     def hear(self, data):
+        if self.deaf:
+            return
         for payload in self.decoder.feed(data):
             self.command(unpack(payload, "controller"), payload)
 

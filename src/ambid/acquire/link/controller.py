@@ -176,7 +176,7 @@ class Controller:
         return answer
 
     def pace(self, rate_hz: float) -> None:
-        """Count samples as the time between pings.
+        """Begin with pings, and count samples as the time between them.
 
         Parameters
         ----------
@@ -185,6 +185,7 @@ class Controller:
         """
         with self._due:
             self._per_ping = max(1, int(_PING_SAMPLES_S * rate_hz))
+            self._due.notify_all()
 
     def close(self) -> None:
         """End all threads and let the port go; again is harmless."""
@@ -227,11 +228,12 @@ class Controller:
             self._line_lost(failure)
 
     def _keep_alive(self) -> None:
+        with self._due:  # whoever is not known yet is not talked at
+            self._due.wait_for(lambda: self._per_ping or self._closing or self._failure is not None)
         due = time.monotonic() + _PING_S
         while True:
             with self._due:
-                enough = lambda: self._closing or (self._per_ping and self._unpinged >= self._per_ping)  # noqa: E731
-                self._due.wait_for(enough, max(0.0, due - time.monotonic()))
+                self._due.wait_for(self._ping_is_due, max(0.0, due - time.monotonic()))
                 if self._closing or self._failure is not None:
                     return
                 self._unpinged = 0
@@ -239,6 +241,10 @@ class Controller:
             # A controller that was reset still answers pings: only its status tells.
             self._send(encode(message("ask_status" if silent else "ping", id=self._next_id())))
             due = time.monotonic() + _PING_S
+
+    def _ping_is_due(self) -> bool:
+        enough = 0 < self._per_ping <= self._unpinged
+        return enough or self._closing or self._failure is not None
 
     def _heard_samples(self, payloads: list[bytes], arrived_s: float) -> None:
         with self._due:
