@@ -18,7 +18,7 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types peers bench docs format changelog lock clean distclean
+.PHONY: help setup demo test lint types firmware peers bench docs format changelog lock clean distclean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -41,8 +41,9 @@ $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools
 demo: setup  ## identify the embedded record and print the estimate beside the truth
 	@$(BIN)/ambid demo
 
-test: setup  ## everything that must hold: lint, types, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
+test: setup  ## everything that must hold: lint, types, firmware, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
 	@$(MAKE) --no-print-directory -j1 lint types
+	@sh tools/firmware_tools.sh && $(MAKE) --no-print-directory -C firmware all || [ $$? -eq 3 ]
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 lint: setup  ## formatting and lint
@@ -51,6 +52,10 @@ lint: setup  ## formatting and lint
 
 types: setup  ## strict type check
 	$(BIN)/mypy
+
+firmware:  ## build the controller's firmware and the emulated bench into firmware/build (installs gcc-avr avr-libc libsimavr-dev where it may)
+	@sh tools/firmware_tools.sh
+	@$(MAKE) --no-print-directory -C firmware all
 
 peers: bench/.venv/linear/.setup bench/.venv/tracking/.setup  ## make the environments of the packages that the benchmarks compare with
 
@@ -83,7 +88,7 @@ lock: setup  ## pin the newest allowed versions again (needs the package index)
 	@sh tools/lock.sh $(BIN)/python
 
 clean:  ## remove caches and builds
-	@rm -rf build dist docs/_site docs/api .pytest_cache .mypy_cache .ruff_cache
+	@rm -rf build dist firmware/build docs/_site docs/api .pytest_cache .mypy_cache .ruff_cache
 	@find src tests bench tools docs -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean  ## clean, and remove .venv

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ambid.rig import Rig
 
 _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
-_TRIAL_S = 1.0  # of each trial of an amplitude
+_TRIAL_S = 2.0  # of each trial of an amplitude
 
 
 def command(
@@ -100,7 +100,7 @@ def command(
     if done.recorded is None and done.run.fault is None and stop.number is None:
         raise AmbidError(f"{port}: no sample came. Look at cable and supply")
     if done.recorded is not None:
-        typer.echo(acquired_text(done, paint=painter()))
+        typer.echo(acquired_text(done, record, paint=painter()))
     _finish(done, port, record, stop, strict=strict)
 
 

@@ -8,7 +8,22 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli import compare, demo, fit, frf, identify, info, init, models, recover, simulate, track, validate
+from ambid.cli import (
+    acquire,
+    commission,
+    compare,
+    demo,
+    fit,
+    frf,
+    identify,
+    info,
+    init,
+    models,
+    recover,
+    simulate,
+    track,
+    validate,
+)
 from ambid.cli.terminal import plain_where_needed
 
 app = typer.Typer(
@@ -24,6 +39,8 @@ app.command("identify", short_help="physical parameters with uncertainty from a 
 app.command("fit", short_help="a black-box model from a record")(fit.command)
 app.command("frf", short_help="a frequency response, and models from it")(frf.command)
 app.command("compare", short_help="several black-box structures side by side")(compare.command)
+app.command("acquire", short_help="a record from a controller, real or emulated")(acquire.command)
+app.command("commission", short_help="guided: from a controller to tracked parameters")(commission.command)
 app.command("track", short_help="parameters followed through a record, as on-line")(track.command)
 app.command("recover", short_help="the record of a recording that was cut off")(recover.command)
 app.command("init", short_help="a first rig file, guessed from a record")(init.command)

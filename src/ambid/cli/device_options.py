@@ -73,7 +73,9 @@ def course_mode(rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
 
 
 @contextmanager
-def opened(port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int) -> Iterator[Device]:
+def opened(
+    port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int
+) -> Iterator[Device]:
     """Open a device and close it.
 
     Parameters
@@ -99,9 +101,11 @@ def opened(port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "
     AmbidError
         If there is no such bench, or the device cannot be opened.
     """
-    from ambid.acquire.devices import open_device
+    from ambid.acquire.devices.choose import open_device
 
-    with open_device(port, rig, bench=_bench(bench), pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
+    with open_device(
+        port, rig, bench=_bench(bench), pace="real" if pace == "real-time" else "fastest", seed=seed
+    ) as device:
         yield device
 
 

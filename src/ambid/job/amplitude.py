@@ -19,7 +19,7 @@ from ambid.job.look import Array, Look, Room, ended, looking
 from ambid.rig import Rig
 
 _TRIALS, _FIRST, _GROWTH = 6, 0.08, 4.0  # first: as a part of half the voltage; growth: largest step
-_ENOUGH = 0.6  # of what is wished
+_ENOUGH = 0.75  # of what is wished
 _NEAR = 0.85  # of the way to a trip, or of the voltage: no room left
 
 
@@ -127,7 +127,7 @@ def find_amplitude(
 
 
 def fitting_amplitude(
-    device: Device, rig: Rig, trial: Trial, *, use: float = 0.4, stopped: Callable[[], bool] = lambda: False
+    device: Device, rig: Rig, trial: Trial, *, use: float = 0.3, stopped: Callable[[], bool] = lambda: False
 ) -> float:
     """Find an amplitude for a device that has not run yet.
 

@@ -178,7 +178,7 @@ def _prototype() -> Preset:
     position_step, current_step = 2.5e-3 / 1024, 2.5 / 1024
     return Preset(
         name="prototype",
-        summary="table-top bearing on an Arduino Uno: 12 V bridge, 10-bit converter, 2 kHz; k_i 20.1 N/A, k_x -6702 N/m",
+        summary="table-top bearing on an Arduino Uno: 12 V bridge, 10 bits, 2 kHz; k_i 20.1 N/A, k_x -6702 N/m",
         parameters=MappingProxyType(parameters),
         plant=plant,
         loop=placed_loop(parameters, (-320, -80 + 80j, -80 - 80j, -16), derivative_cutoff_hz=300.0, delay=0.3),

@@ -7,13 +7,22 @@ from pathlib import Path
 from ambid.acquire.device import Device
 from ambid.acquire.devices.played import Pace
 from ambid.errors import DeviceError
+from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 
 REPLAY = "replay:"
 """What a port begins with that is a record."""
 
 
-def open_device(port: str, rig: Rig, *, pace: Pace | None = None, seed: int = 0, script: Path | None = None) -> Device:
+def open_device(
+    port: str,
+    rig: Rig,
+    *,
+    bench: Preset | Rig | None = None,
+    pace: Pace | None = None,
+    seed: int = 0,
+    script: Path | None = None,
+) -> Device:
     """Return the device that a port's name stands for, not yet opened: it is a context.
 
     Parameters
@@ -22,6 +31,8 @@ def open_device(port: str, rig: Rig, *, pace: Pace | None = None, seed: int = 0,
         ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port.
     rig : Rig
         Of the bench.
+    bench : Preset or Rig, optional
+        The plant behind what is emulated or simulated; default what the rig's ``daq.bench`` names, or its own values.
     pace : {"real", "fastest"}, optional
         Of what is no hardware; default as fast as possible, a replay in real time.
     seed : int
@@ -43,14 +54,16 @@ def open_device(port: str, rig: Rig, *, pace: Pace | None = None, seed: int = 0,
     """
     if script is not None and port != "emulated":
         raise DeviceError(f"a script is for --port emulated; {port!r} has none. Leave it out")
+    if bench is not None and port not in ("emulated", "simulated"):
+        raise DeviceError(f"a bench is chosen for --port emulated or simulated; {port!r} has its own. Leave it out")
     if port == "emulated":
         from ambid.acquire.devices.emulated import EmulatedDevice
 
-        return EmulatedDevice(rig, pace=pace or "fastest", seed=seed, script=script)
+        return EmulatedDevice(rig, bench=bench, pace=pace or "fastest", seed=seed, script=script)
     if port == "simulated":
         from ambid.acquire.devices.simulated import SimulatedDevice
 
-        return SimulatedDevice(rig, pace=pace or "fastest", seed=seed)
+        return SimulatedDevice(rig, bench=bench, pace=pace or "fastest", seed=seed)
     if port.startswith(REPLAY):
         from ambid.acquire.devices.replay import ReplayDevice
 

@@ -99,12 +99,12 @@ class Wishes:
     second_s: float = 8.0
     hover_s: float = 2.0
     rest_s: float = 0.5
-    trial_s: float = 1.0
+    trial_s: float = 2.0
     track_s: float = 5.0
     settle_s: float = 1.0
     amplitude_v: float | None = None
     band_hz: tuple[float, float] | None = None
-    use: float = 0.4
+    use: float = 0.3
     widest: float = 0.10
     seed: int = 0
 

@@ -1,0 +1,129 @@
+"""What an acquisition shows while it runs, and what is said of it at its end."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from typing import TYPE_CHECKING, Protocol
+
+from ambid.report.text import WIDTH, Paint, plain
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ambid.acquire.device import Counters, DeviceInfo
+    from ambid.acquire.quality import ColumnQuality, QualityReport
+    from ambid.acquire.session import RunReport
+
+_SHOWN = ("position", "current", "voltage")  # roles whose signal-to-noise ratio is worth a place on the line
+
+
+class Under(Protocol):
+    """An acquisition under way: quality and counters so far."""
+
+    @property
+    def quality(self) -> QualityReport: ...  # noqa: D102
+    @property
+    def counters(self) -> Counters: ...  # noqa: D102
+
+
+class Finished(Protocol):
+    """An acquisition that is over."""
+
+    @property
+    def info(self) -> DeviceInfo: ...  # noqa: D102
+    @property
+    def run(self) -> RunReport: ...  # noqa: D102
+    @property
+    def quality(self) -> QualityReport: ...  # noqa: D102
+    @property
+    def counters(self) -> Counters: ...  # noqa: D102
+
+
+def progress_line(now: Under) -> str:
+    """Write how an acquisition goes: time, rate, gaps, signal-to-noise ratio, saturation.
+
+    Parameters
+    ----------
+    now : Progress
+        So far.
+
+    Returns
+    -------
+    str
+        One short line.
+    """
+    q = now.quality
+    rate = f"{q.measured_hz:.0f} Hz" if math.isfinite(q.measured_hz) else f"{q.rate_hz:g} Hz"
+    parts = [f"{q.seconds:.1f} s", rate, f"{q.lost} lost"]
+    if now.counters.damaged:
+        parts.append(f"{now.counters.damaged} damaged")
+    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in q.columns if c.role in _SHOWN[:2] and c.snr_db is not None]
+    saturated = max((c.saturated for c in q.columns), default=0.0)
+    if saturated > 0.0:
+        parts.append(f"saturated {100.0 * saturated:.1f} %")
+    return ", ".join(parts)
+
+
+def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what an acquisition gave, for people.
+
+    Parameters
+    ----------
+    done : Acquired
+        From `ambid.job.acquire.acquire`.
+    path : Path
+        The record.
+    width : int
+        Columns of the terminal.
+    paint : callable
+        Adds colour; the layout does not depend on it.
+
+    Returns
+    -------
+    str
+        Lines without the last line's end.
+    """
+    q, counters = done.quality, done.counters
+    head = (
+        f"{path}: {done.run.samples} samples at {q.rate_hz:g} Hz ({done.run.samples / q.rate_hz:.4g} s) from"
+        f" {done.info.kind} {done.info.port}"
+    )
+    lines = [*textwrap.wrap(head, width), "", *_table(q.columns, paint), ""]
+    lines += textwrap.wrap(_line_words(done.run, counters), width)
+    if q.verdict:
+        lines += ["", *(paint(x, "bad") for v in q.verdict for x in textwrap.wrap(v, width, subsequent_indent="  "))]
+    return "\n".join(lines)
+
+
+def _line_words(run: RunReport, counters: Counters) -> str:
+    words = f"{run.lost} samples lost, {counters.damaged} frames damaged, {counters.overruns} blocks overrun"
+    busy = counters.controller.get("busy_us")
+    if busy is not None:
+        words += f"; the controller worked {busy:.0f} us in its longest tick"
+    if math.isfinite(counters.drift):
+        words += f"; its clock is {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm off"
+    return words
+
+
+def _table(columns: tuple[ColumnQuality, ...], paint: Paint) -> list[str]:
+    """Write one row for each column, in its own unit."""
+    rows = [("column", "mean", "rms about it", "noise", "SNR", "range used", "saturated")]
+    for c in columns:
+        unit = "" if c.unit == "1" else f" {c.unit}"
+        used = "-" if c.used is None else f"{100.0 * c.used:.0f} %"
+        snr = "-" if c.snr_db is None else f"{c.snr_db:.1f} dB"
+        rows.append(
+            (
+                c.name,
+                f"{c.mean:.4g}{unit}",
+                f"{c.sd:.3g}{unit}",
+                f"{c.noise_sd:.2g}{unit}",
+                snr,
+                used,
+                f"{100.0 * c.saturated:.2g} %",
+            )
+        )
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [paint(lines[0], "dim"), *lines[1:]]
