@@ -15,7 +15,7 @@ static inline uint16_t crc16_add(uint16_t crc, uint8_t byte)
     uint8_t i;
     crc = (uint16_t)(crc ^ ((uint16_t)byte << 8));
     for (i = 0; i < 8; i++)
-        crc = (uint16_t)((crc & 0x8000u) ? (crc << 1) ^ 0x1021u : crc << 1);
+        crc = (uint16_t)((crc << 1) ^ ((crc & 0x8000u) ? 0x1021 : 0));
     return crc;
 }
 #endif
