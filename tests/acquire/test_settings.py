@@ -216,7 +216,7 @@ def test_slow_ticks_only_sample():
             '[operating_point]\nvoltage = { value = 12, unit = "V" }\n[daq]\n',
             "outside the pulse widths allowed",
         ),
-        ("kp = 1.94e4", "kp = 1e10", "loop.kp is 3.333e+09 steps of the controller, which takes 1048576 at most"),
+        ("kp = 1.94e4", "kp = 1e10", "loop.kp is 3.333e+09 steps of the controller, which takes 524288 at most"),
         ("ki = 7.85e4", "ki = 500.0", "loop.ki is 1.3 steps of the controller, fewer than 3"),
         (
             "derivative_cutoff_hz = 300.0",

@@ -23,7 +23,7 @@ BYTE_BITS = 11
 """Bit times that a byte may take on the line: ten, and one kept for answers."""
 SLOWEST_OUTPUT = 20
 """Longest tick with which the output may be on, periods: a fault must end in the safe state within 2 ms."""
-LARGEST_GAIN = 2**20
+LARGEST_GAIN = 2**19
 """Largest step number of a gain: no product can then overflow the controller's arithmetic."""
 SHORTEST_PERIOD, LONGEST_PERIOD = 4, 20_000
 """Of a tick, in periods of the pulse width modulation."""

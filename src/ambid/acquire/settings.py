@@ -283,8 +283,9 @@ def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
 def _gain(rig: Rig, name: str, value: float) -> int:
     if abs(value) > LARGEST_GAIN:
         raise RigError(
-            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {LARGEST_GAIN} at"
-            f" most. Lower loop.{name}, or correct the calibrations of the channels"
+            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {LARGEST_GAIN} at most: one"
+            " count of the sensor would order too much. Use a sensor of a smaller range, lower that gain, or correct the"
+            " calibrations"
         )
     steps = round(value)
     if value != 0.0 and abs(steps) < _FEWEST_STEPS:
