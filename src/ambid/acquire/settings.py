@@ -284,8 +284,8 @@ def _gain(rig: Rig, name: str, value: float) -> int:
     if abs(value) > LARGEST_GAIN:
         raise RigError(
             f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {LARGEST_GAIN} at most: one"
-            " count of the sensor would order too much. Use a sensor of a smaller range, lower that gain, or correct the"
-            " calibrations"
+            " count of the sensor would order too much. Use a sensor of a smaller range, lower that gain, or correct"
+            " the calibrations"
         )
     steps = round(value)
     if value != 0.0 and abs(steps) < _FEWEST_STEPS:
