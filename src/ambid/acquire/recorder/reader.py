@@ -172,10 +172,12 @@ class JournalReader:
         for _, head, data in self._frames(None):
             if head.kind == frames.HEADER:
                 return head.journal, JournalHeader.from_json(json.loads(_payload(head, data)))
+        if not self._size:
+            raise DeviceError(f"journal {self.path} is empty: it was cut off before anything was recorded. Remove it")
         if version is None:
             raise DeviceError(f"{self.path} is not a journal of ambid. Name a file that ends in .journal")
         raise DeviceError(f"journal {self.path} holds no sound header: it was cut off before anything was acknowledged,"
-                          " or is damaged throughout. There is nothing to recover")  # fmt: skip
+                          " or is damaged throughout. There is nothing to recover: remove it")  # fmt: skip
 
     def _frames(self, journal: int | None) -> Iterator[tuple[int, Head, bytes]]:
         """Yield place, head and bytes of every sound frame, of one journal if its number is given."""

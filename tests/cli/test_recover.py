@@ -1,0 +1,144 @@
+"""``ambid recover``: what a recording that could not finish has left becomes a record, and what is missing is said."""
+
+import numpy as np
+import pytest
+
+from ambid.acquire.recorder import Recorder, journal_path
+from ambid.record import read_record
+from tests.acquire.recorder.signals import ROWS, block, header, same_bits, values_at
+
+BLOCKS = 30
+
+
+@pytest.fixture
+def left(tmp_path, monkeypatch):
+    """A folder with what a killed recording of 30 blocks leaves: run.h5.journal; the command runs there."""
+    monkeypatch.chdir(tmp_path)
+    with Recorder(tmp_path / "run.h5", header()) as recorder:
+        for k in range(BLOCKS):
+            recorder.append(block(k))
+        assert recorder.flush()
+        data = recorder.journal.read_bytes()
+    (tmp_path / "run.h5").unlink()
+    journal_path(tmp_path / "run.h5").write_bytes(data)
+    return tmp_path
+
+
+def damaged(folder):
+    path = folder / "run.h5.journal"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(bytes(data))
+
+
+def values_of(path, gaps="error"):
+    return np.column_stack([c.values for c in read_record(path, gaps=gaps).channels])
+
+
+def test_what_was_acknowledged_comes_back(left, ambid):
+    found = ambid("recover", "run.h5.journal", "--strict")
+    assert (found.code, found.err) == (0, "")
+    assert found.out.splitlines() == [
+        "run.h5.journal: 30 blocks, 600 samples, 0.3 s; cut off while recording",
+        "run.h5 written. run.h5.journal is kept; --delete removes it",
+    ]
+    assert same_bits(values_of("run.h5"), values_at(0, BLOCKS * ROWS))
+    assert (left / "run.h5.journal").exists()
+    assert ambid("identify", "run.h5").code == 2  # a record like any other: its columns are no bearing
+
+
+def test_delete_removes_the_journal(left, ambid):
+    found = ambid("recover", "run.h5.journal", "--delete")
+    assert found.code == 0
+    assert "run.h5.journal removed" in found.out
+    assert [p.name for p in left.iterdir()] == ["run.h5"]
+
+
+def test_a_complete_journal_says_so_and_an_incomplete_end_too(left, ambid):
+    data = (left / "run.h5.journal").read_bytes()
+    (left / "cut.h5.journal").write_bytes(data[:-30] + bytes(100))
+    found = ambid("recover", "run.h5.journal", "cut.h5.journal", "--strict")
+    assert found.code == 0  # what was being written at the end was not acknowledged
+    lines = found.out.splitlines()
+    assert len(lines) == 4
+    assert "29 blocks" in lines[2]
+    assert "bytes at the end are no sound block" in lines[2]
+    assert same_bits(values_of("cut.h5"), values_at(0, 29 * ROWS))
+
+
+def test_a_damaged_block_is_counted_and_becomes_rows_without_values(left, ambid):
+    damaged(left)
+    found = ambid("recover", "run.h5.journal", "--delete")
+    assert found.code == 0
+    assert "1 damaged blocks in 1 places; 20 missing samples in 1 places (read it with --gaps)" in found.out
+    assert "is kept: it holds more than the record" in found.out
+    assert (left / "run.h5.journal").exists()
+    refused = ambid("identify", "run.h5")
+    assert refused.code == 2
+    assert "--gaps interpolate or --gaps cut" in refused.err
+    assert ambid("recover", "run.h5.journal", "--force", "--strict").code == 3
+
+
+def test_a_record_that_exists_is_written_over_only_with_force(left, ambid):
+    (left / "run.h5").write_text("precious")
+    found = ambid("recover", "run.h5.journal")
+    assert found.code == 2
+    assert "run.h5 exists already" in found.err
+    assert (left / "run.h5").read_text() == "precious"
+    assert ambid("recover", "run.h5.journal", "--force").code == 0
+    assert len(values_of("run.h5")) == BLOCKS * ROWS
+
+
+def test_another_name_and_another_format(left, ambid):
+    assert ambid("recover", "run.h5.journal", "-o", "other.csv").code == 0
+    assert same_bits(values_of("other.csv"), values_at(0, BLOCKS * ROWS))
+    assert not (left / "run.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["none.journal"], "No such file"),
+        (["text.csv"], "is not a journal"),
+        (["empty.journal"], "is empty"),
+        (["run.h5.journal", "-o", "run.mat"], "is written as"),
+        (["run.h5.journal", "-o", "none/run.h5"], "there is no folder"),
+        (["run.h5.journal", "-o", "run.h5.journal"], "also read"),
+        (["run.h5.journal", "run.h5.journal", "-o", "a.h5"], "one by one"),
+        ([], "Missing argument"),
+    ],
+)
+def test_what_cannot_be_recovered_is_refused_on_one_line(left, ambid, words, says):
+    (left / "text.csv").write_text("time [s],x [m]\n")
+    (left / "empty.journal").write_bytes(b"")
+    before = sorted(p.name for p in left.iterdir())
+    found = ambid("recover", *words)
+    assert (found.code, found.out) == (2, "")
+    assert len(found.err.splitlines()) == 1
+    assert says in found.err
+    assert sorted(p.name for p in left.iterdir()) == before
+
+
+def test_a_journal_without_a_block_is_refused(left, ambid):
+    with Recorder(left / "none.h5", header()) as recorder:
+        data = recorder.journal.read_bytes()
+    (left / "none.h5.journal").write_bytes(data)
+    found = ambid("recover", "none.h5.journal")
+    assert found.code == 2
+    assert "no sound block" in found.err
+
+
+def test_a_recording_that_goes_on_is_left_alone(left, ambid):
+    with Recorder(left / "live.h5", header()) as recorder:
+        recorder.append(block(0))
+        found = ambid("recover", "live.h5.journal", "--delete", "--force")
+        assert found.code == 2
+        assert "is being written by a recorder" in found.err
+    assert same_bits(values_of("live.h5"), values_at(0, ROWS))
+
+
+def test_one_that_is_refused_does_not_keep_the_others_back(left, ambid):
+    found = ambid("recover", "none.journal", "run.h5.journal", "nor.journal")
+    assert found.code == 2
+    assert [line.split()[2] for line in found.err.splitlines()] == ["nor.journal", "none.journal"]
+    assert len(values_of("run.h5")) == BLOCKS * ROWS
