@@ -121,6 +121,7 @@ int line_move(struct line *line)
             put(&line->to_controller, some[k]);
         came += (int)n;
     }
-    line->spoke |= came > 0;
+    if (came > 0)
+        line->heard = line->spoke = 1; /* opened since we looked: the answer may be quicker than the next look */
     return came;
 }

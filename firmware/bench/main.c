@@ -143,10 +143,10 @@ static void keep_pace(void)
 
 /* ---- script ---------------------------------------------------------------------------------------------------- */
 
-static void carry_out(struct event *e, struct options *o)
+/* `e` is a copy: the end of a pulse may take its place. */
+static void carry_out(const struct event *e, struct options *o)
 {
     controller_carry(&controller);
-    e->done = 1;
     switch (e->deed) {
     case DEED_FORCE:
         plant.push = e->number;
@@ -187,9 +187,12 @@ static void carry_out(struct event *e, struct options *o)
 
 static void follow_script(struct options *o)
 {
-    struct event *e;
-    while ((e = script_due(&script, controller.avr->cycle, controller.first_enable)) != NULL)
-        carry_out(e, o);
+    struct event *due;
+    while ((due = script_due(&script, controller.avr->cycle, controller.first_enable)) != NULL) {
+        const struct event now = *due;
+        due->done = 1;
+        carry_out(&now, o);
+    }
 }
 
 /* ---- the run --------------------------------------------------------------------------------------------------- */
@@ -197,6 +200,9 @@ static void follow_script(struct options *o)
 static void look_around(struct options *o)
 {
     static int there;
+    static unsigned rounds;
+    if (rounds++ % 256 == 0 && over())
+        return;
     listen_to_line();
     if (line.heard != there) {
         there = line.heard;
@@ -280,8 +286,7 @@ static int read_options(int argc, char **argv, struct options *o)
     return 0;
 }
 
-/* The one line on standard output; after it, whatever the emulator's library prints goes to standard error. */
-static int tell_port(const struct options *o)
+static int make_link(const struct options *o)
 {
     if (o->link != NULL && (unlink(o->link) != 0 && errno != ENOENT)) {
         fprintf(stderr, "amb_bench: --link %s: %s\n", o->link, strerror(errno));
@@ -316,11 +321,12 @@ int main(int argc, char **argv)
     if (read_options(argc, argv, &o) != 0 || plant_read(o.plant, &config, stderr) != 0 ||
         script_read(o.script, &script) != 0)
         return 2;
+    /* Whatever the emulator's library prints goes to standard error; standard output is for the one line. */
     const int out = dup(STDOUT_FILENO);
     dup2(STDERR_FILENO, STDOUT_FILENO);
     plant_begin(&plant, &config, o.seed);
     if (listen_for_signals() != 0 || line_open(&line, o.seed ^ UINT64_C(0x6c696e65)) != 0 ||
-        controller_begin(&controller, o.firmware, &plant, &line) != 0 || open_files(&o) != 0 || tell_port(&o) != 0)
+        controller_begin(&controller, o.firmware, &plant, &line) != 0 || open_files(&o) != 0 || make_link(&o) != 0)
         return 2;
     journal_write(0.0, "start", "\"firmware\": \"%s\", \"seed\": %llu, \"position\": %.9g", journal_quoted(o.firmware),
                   (unsigned long long)o.seed, plant.x);

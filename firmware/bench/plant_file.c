@@ -150,12 +150,10 @@ static int lacks(const struct plant_config *config, const char seen[NUMBERS], co
             return 1;
         }
     }
-    const double low = config->kind == PLANT_SINGLE ? fmax(config->stop[0], 0.0)
-                       : config->kind == PLANT_DIFFERENTIAL ? fmax(config->stop[0], -config->gap)
-                                                            : config->stop[0];
-    const double high = config->kind == PLANT_DIFFERENTIAL ? fmin(config->stop[1], config->gap) : config->stop[1];
-    const int closes = config->kind != PLANT_LINEAR && (low != config->stop[0] || high != config->stop[1]);
-    if (closes || !(config->stop[0] < config->stop[1])) {
+    const int linear = config->kind == PLANT_LINEAR, pair = config->kind == PLANT_DIFFERENTIAL;
+    const double closed_low = pair ? -config->gap : 0.0, closed_high = config->gap;
+    const int inside = linear || (config->stop[0] > closed_low && (!pair || config->stop[1] < closed_high));
+    if (!inside || !(config->stop[0] < config->stop[1])) {
         fprintf(complaints, "%s: stop_low must be below stop_high, and both inside the air gap\n", path);
         return 1;
     }

@@ -9,6 +9,7 @@
  *   f        frames without stop bit so far
  *   g N      answers with N bytes 0, 1, 2, ...
  *   h        hangs, until the watchdog resets; the next boot says 'w', any other boot says 'B'
+ *   l        bits of port D that were high at every tick since the last 'l'
  *   s V      stream: V = 1 sends tick (16 bits) and two conversions at every tick, V = 0 ends it; answers nothing
  *   t        ticks so far, 32 bits
  *   x V      answers with V
@@ -19,7 +20,7 @@
 #include <avr/wdt.h>
 
 static volatile uint16_t result[3];
-static volatile uint8_t channel, wrong_frames, streaming;
+static volatile uint8_t channel, wrong_frames, streaming, always_high = 0xff;
 static volatile uint32_t ticks;
 
 static volatile uint8_t in[64], in_last, out[256], out_last;
@@ -65,6 +66,7 @@ ISR(USART_RX_vect)
 ISR(TIMER2_COMPA_vect)
 {
     ticks++;
+    always_high &= PIND;
     channel = 0;
     ADMUX = _BV(REFS0);
     ADCSRA |= _BV(ADSC);
@@ -138,6 +140,10 @@ static void answer(uint8_t letter)
         wdt_enable(WDTO_15MS);
         for (;;)
             ;
+    case 'l':
+        say(always_high);
+        always_high = 0xff;
+        return;
     case 's':
         streaming = next();
         return;
