@@ -23,7 +23,13 @@ class Tap(Protocol):
     """Whoever listens to a run."""
 
     def take(self, frame: Frame) -> None:
-        """Take a block; must not keep the run waiting."""
+        """Take a block; must not keep the run waiting.
+
+        Parameters
+        ----------
+        frame : Frame
+            A block with its time of arrival.
+        """
         ...
 
 

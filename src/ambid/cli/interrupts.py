@@ -17,6 +17,11 @@ def signals(take: Callable[[int], None]) -> Iterator[None]:
     ----------
     take : callable
         Given the number of the signal, in the main thread. In another thread nothing is done.
+
+    Yields
+    ------
+    None
+        While signals are taken.
     """
     if current_thread() is not main_thread():
         yield

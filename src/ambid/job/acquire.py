@@ -163,7 +163,23 @@ def _text(rig: Rig) -> str:
 
 
 class Recording:
-    """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`."""
+    """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        Opened.
+    device : Device
+        That samples.
+    course : Course
+        What it does.
+    every_s : float
+        How often `on_progress` is called, s of the device's clock.
+    on_progress, on_event : callable or None
+        As `acquire`.
+    troubles : list of DeviceError
+        What the recorder tells.
+    """
 
     def __init__(
         self,

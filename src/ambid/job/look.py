@@ -91,7 +91,13 @@ class Kept:
         self._values: list[Array] = []
 
     def take(self, frame: Frame) -> None:
-        """Take a block."""
+        """Take a block.
+
+        Parameters
+        ----------
+        frame : Frame
+            As it came.
+        """
         self._values.append(self._view.block(frame.block).values)
 
     def roles(self) -> dict[str, Array]:

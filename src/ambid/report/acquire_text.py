@@ -22,22 +22,38 @@ class Under(Protocol):
     """An acquisition under way: quality and counters so far."""
 
     @property
-    def quality(self) -> QualityReport: ...  # noqa: D102
+    def quality(self) -> QualityReport:
+        """Of the samples."""
+        ...
+
     @property
-    def counters(self) -> Counters: ...  # noqa: D102
+    def counters(self) -> Counters:
+        """Of the line."""
+        ...
 
 
 class Finished(Protocol):
     """An acquisition that is over."""
 
     @property
-    def info(self) -> DeviceInfo: ...  # noqa: D102
+    def info(self) -> DeviceInfo:
+        """Who gave it."""
+        ...
+
     @property
-    def run(self) -> RunReport: ...  # noqa: D102
+    def run(self) -> RunReport:
+        """Of the device."""
+        ...
+
     @property
-    def quality(self) -> QualityReport: ...  # noqa: D102
+    def quality(self) -> QualityReport:
+        """Of the samples."""
+        ...
+
     @property
-    def counters(self) -> Counters: ...  # noqa: D102
+    def counters(self) -> Counters:
+        """Of the line."""
+        ...
 
 
 def progress_line(now: Under) -> str:

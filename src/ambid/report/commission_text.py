@@ -15,13 +15,24 @@ class StepLike(Protocol):
     """Anything that has the lines of a step: findings, reasons and cautions."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def name(self) -> str:
+        """Of the step."""
+        ...
+
     @property
-    def findings(self) -> tuple[str, ...]: ...  # noqa: D102
+    def findings(self) -> tuple[str, ...]:
+        """What was measured."""
+        ...
+
     @property
-    def reasons(self) -> tuple[str, ...]: ...  # noqa: D102
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is not good enough."""
+        ...
+
     @property
-    def cautions(self) -> tuple[str, ...]: ...  # noqa: D102
+    def cautions(self) -> tuple[str, ...]:
+        """What to know beside it."""
+        ...
 
 
 def step_text(step: StepLike, number: int, of: int, *, width: int = WIDTH, paint: Paint = plain) -> str:
