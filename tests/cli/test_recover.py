@@ -62,7 +62,7 @@ def test_a_complete_journal_says_so_and_an_incomplete_end_too(left, ambid):
     lines = found.out.splitlines()
     assert len(lines) == 4
     assert "29 blocks" in lines[2]
-    assert "bytes at the end are no sound block" in lines[2]
+    assert "at its end not of a whole block" in lines[2]
     assert same_bits(values_of("cut.h5"), values_at(0, 29 * ROWS))
 
 
@@ -70,8 +70,8 @@ def test_a_damaged_block_is_counted_and_becomes_rows_without_values(left, ambid)
     damaged(left)
     found = ambid("recover", "run.h5.journal", "--delete")
     assert found.code == 0
-    assert "1 damaged blocks in 1 places; 20 missing samples in 1 places (read it with --gaps)" in found.out
-    assert "is kept: it holds more than the record" in found.out
+    assert "1 block damaged, in 1 place; 20 samples missing in 1 place (read it with --gaps)" in found.out
+    assert "is kept: not all of it is in the record" in found.out
     assert (left / "run.h5.journal").exists()
     refused = ambid("identify", "run.h5")
     assert refused.code == 2

@@ -80,10 +80,12 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
 
 def _found(made: Recorded) -> str:
     found = made.survey
-    text = f"{found.blocks} blocks, {found.samples} samples, {found.samples / made.rate_hz:.6g} s"
+    text = f"{_many(found.blocks, 'block')}, {_many(found.samples, 'sample')}, {found.samples / made.rate_hz:.6g} s"
     if found.damage.closed:
         return f"{text}; complete"
-    tail = f", {found.damage.tail_bytes} bytes at the end are no sound block" if found.damage.tail_bytes else ""
+    tail = (
+        f"; {_many(found.damage.tail_bytes, 'byte')} at its end not of a whole block" if found.damage.tail_bytes else ""
+    )
     return f"{text}; cut off while recording{tail}"
 
 
@@ -92,19 +94,25 @@ def _lacks(made: Recorded) -> str:
     found, damage = made.survey, made.survey.damage
     parts = []
     if damage.frames or damage.places:
-        events = damage.frames - damage.blocks
-        also = f" and {events} other entries" if events else ""
-        parts.append(f"{damage.blocks} damaged blocks{also} in {max(damage.places, 1)} places")
+        others = damage.frames - damage.blocks
+        also = f" and {_many(others, 'other entry', 'other entries')}" if others else ""
+        parts.append(f"{_many(damage.blocks, 'block')}{also} damaged, in {_many(max(damage.places, 1), 'place')}")
     if found.gap_samples:
-        parts.append(f"{found.gap_samples} missing samples in {found.gaps} places (read it with --gaps)")
+        parts.append(
+            f"{_many(found.gap_samples, 'sample')} missing in {_many(found.gaps, 'place')} (read it with --gaps)"
+        )
     if found.misplaced:
-        parts.append(f"{found.misplaced} samples left out whose numbers had come before")
+        parts.append(f"{_many(found.misplaced, 'sample')} left out whose number had come before")
     return f" with {'; '.join(parts)}" if parts else ""
+
+
+def _many(n: int, one: str, more: str = "") -> str:
+    return f"{n} {one if n == 1 else more or one + 's'}"
 
 
 def _fate(journal: Path, *, delete: bool, gone: bool) -> str:
     if gone:
         return f" {journal.name} removed"
     if delete:
-        return f" {journal.name} is kept: it holds more than the record"
+        return f" {journal.name} is kept: not all of it is in the record"
     return f" {journal.name} is kept; --delete removes it"
