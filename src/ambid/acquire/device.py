@@ -174,7 +174,8 @@ class Device(Protocol):
     """A bench that can be asked for samples. Made ready by its constructor's arguments; a context opens and closes it.
 
     Closing always leaves the bench in its safe state, whatever happened before. All methods raise `DeviceError` where
-    the device refuses or the line is lost, with what, where, rule and remedy.
+    the device refuses or the line is lost, with what, where, rule and remedy. A replay has mode ``sample`` alone, and
+    refuses every excitation. Every other device has all modes.
     """
 
     @property
@@ -198,21 +199,48 @@ class Device(Protocol):
         ...
 
     def self_test(self) -> SelfTest:
-        """Let the device look at itself; idle only."""
+        """Let the device look at itself; idle only.
+
+        Returns
+        -------
+        SelfTest
+        """
         ...
 
     def start(self, mode: Mode) -> None:
-        """Begin; numbers of samples count from 0 at the first start out of idle."""
+        """Begin; numbers of samples count from 0 at the first start out of idle, and on at each later one.
+
+        Parameters
+        ----------
+        mode : {"sample", "drive", "levitate"}
+            From idle; from sampling to one of the others, too.
+        """
         ...
 
     def excite(self, program: Program | None) -> None:
-        """Play an excitation from the next tick on; None ends it."""
+        """Play an excitation from the next tick on, in place of one that is played; driving or levitating.
+
+        Parameters
+        ----------
+        program : Program or None
+            None ends it; harmless where none is played.
+        """
         ...
 
     def read(self, timeout_s: float) -> Frame | None:
         """Return the next block with its time of arrival, or None if none came in time or the stream has ended.
 
         ``Block.time_s`` is by the device's clock; a gap in ``Block.first`` is samples that were lost, each counted.
+        Where the line is lost, what came before can still be read; then the error is raised.
+
+        Parameters
+        ----------
+        timeout_s : float
+            How long to wait for it, s.
+
+        Returns
+        -------
+        Frame or None
         """
         ...
 
@@ -230,9 +258,9 @@ class Device(Protocol):
         ...
 
     def stop(self) -> None:
-        """Output off, no more samples; those on their way can still be read."""
+        """Output off, no more samples; those on their way can still be read. Harmless when idle; a fault stays."""
         ...
 
     def clear(self) -> None:
-        """Leave the safe state after a fault whose cause is gone."""
+        """Leave the safe state after a fault whose cause is gone: idle, no more samples."""
         ...

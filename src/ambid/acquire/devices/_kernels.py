@@ -42,7 +42,7 @@ PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY = 9, 10, 11, 12, 13, 14
 N_MEMORY = 15
 
 _ONE = 1 << 12  # a count in the law's fixed point
-_TERM, _INTEGRAL = 1 << 28, 1 << 27  # where the firmware limits its terms
+_TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
 _MASKS = np.array([0, 0, 0, 0x3, 0x3, 0x5, 0x3, 0x3, 0x1D, 0x11, 0x9, 0x5, 0x53, 0x1B, 0x443, 0x3], dtype=np.int64)
 
 
@@ -115,8 +115,8 @@ def ordered(position: int, current: int, excitation: int, settings: Integers, me
     if memory[FRESH] == 0:
         derivative -= settings[KD] * (position - memory[LAST])
     memory[DERIVATIVE], memory[LAST], memory[FRESH] = within(derivative, _TERM), position, 0
-    wanted = (settings[BIAS] + excitation) * _ONE + within(settings[KP] * error, _TERM) + (memory[INTEGRAL] >> 4)
-    wanted += memory[DERIVATIVE] - within(settings[KC] * (current - settings[REST]), _TERM)
+    wanted = settings[KP] * error + (memory[INTEGRAL] >> 4) + memory[DERIVATIVE]
+    wanted = within(wanted - settings[KC] * (current - settings[REST]), _SUM) + (settings[BIAS] + excitation) * _ONE
     duty, beyond = (wanted + _ONE // 2) >> 12, 0
     if wanted > high * _ONE:
         duty, beyond = high, 1

@@ -87,6 +87,9 @@ class PlayedDevice(ABC):
     def _tested(self) -> SelfTest:
         """Look at itself."""
 
+    def _clears(self) -> None:  # noqa: B027 - a record has no fault
+        """Refuse while the cause of a fault is there."""
+
     # The contract.
     @property
     def state(self) -> State:
@@ -250,6 +253,7 @@ class PlayedDevice(ABC):
             self._ready("clear")
             if self._state != "fault":
                 self._refuse("clear", "there is no fault to clear. Leave it out")
+            self._clears()
             self._flowing = False
             self._enter_state("idle")
             self._lock.notify_all()

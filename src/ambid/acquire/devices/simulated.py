@@ -30,7 +30,7 @@ from ambid.track.stream.block import Block
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_SETTLE_S = 1.0  # before the first start: a rotor without current falls to where it lies
+_SETTLE_S = 0.5  # before a start: a rotor without current falls to where it lies
 _SUBSTEPS = 8  # Runge-Kutta steps in each part of a sample
 _ROLES = ("position", "current", "voltage", "excitation", "reference")  # in the order of a tick's counts
 _PLACES = (  # of the settings that are passed on as they are, in the order of the compiled loop
@@ -118,9 +118,8 @@ class SimulatedDevice(PlayedDevice):
         self._memory = np.zeros(k.N_MEMORY, dtype=np.int64)
         self._x, self._room_x = self._plant.centre.copy(), np.empty(self._plant.centre.size)
         self._line = np.zeros(whole + 2)
-        self._base = 0
-        self._advance(round(_SETTLE_S * self._rate))
-        self._memory[:] = 0
+        self._base = self._current = 0
+        self._rest()
 
     def _begin(self, mode: Mode) -> None:
         from ambid.acquire.devices import _kernels as k
@@ -131,11 +130,23 @@ class SimulatedDevice(PlayedDevice):
             )
         memory = self._memory
         if self._state == "idle":
+            self._rest()
             self._base = self._next
             memory[k.TICK] = 0
         memory[k.STATE] = table().value("state", {"sample": "sampling", "drive": "driving"}.get(mode, "levitating"))
         memory[k.CAUSE] = memory[k.INTEGRAL] = memory[k.DERIVATIVE] = memory[k.PLAYING] = 0
         memory[k.FRESH], memory[k.LIFTED] = 1, memory[k.TICK]
+
+    def _rest(self) -> None:
+        """Let time pass with the output off, unseen."""
+        self._memory[:] = 0
+        self._advance(round(_SETTLE_S * self._rate))
+        self._memory[:] = 0
+
+    def _clears(self) -> None:
+        # Time passes while nothing is sampled, and the current goes.
+        if self._flowing and not self._settings.current_low <= self._current <= self._settings.current_high:
+            self._refuse("clear", "the current is still outside its limits. Wait until it is gone")
 
     def _play(self, program: Program | None) -> None:
         from ambid.acquire.devices import _kernels as k
@@ -152,6 +163,7 @@ class SimulatedDevice(PlayedDevice):
         self._memory[k.PLAYING] = int(program.kind != "none")
 
     def _tested(self) -> SelfTest:
+        self._memory[:] = 0
         held = self._x.copy()
         counts = self._advance(16)
         self._x[:] = held
@@ -213,6 +225,7 @@ class SimulatedDevice(PlayedDevice):
                 f"{self._where}: the simulation leaves the finite numbers; a bench without stops falls without end."
                 " Give the bench loop.limits.position"
             )
+        self._current = int(counts[-1, 1]) if n else self._current
         return counts
 
 

@@ -35,7 +35,12 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; one thread at a time. `OSError`: the line is lost."""
+        """Send bytes; one thread at a time. `OSError`: the line is lost.
+
+        Parameters
+        ----------
+        data : bytes
+        """
         ...
 
     def close(self) -> None:
