@@ -1,4 +1,4 @@
-"""``ambid init``: a first rig file, guessed from the columns of a record."""
+"""``ambid init``: a first rig file, guessed from the columns of a record, or that of a bench with a controller."""
 
 from __future__ import annotations
 
@@ -7,36 +7,72 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli.options import Gaps, Rate, RecordFile
+from ambid.cli.options import Gaps, Rate
 from ambid.cli.output import Outputs
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, nearest
+
+_PRESETS = ("prototype",)  # those whose rig is among the package's data
 
 
 def command(
-    record: RecordFile,
+    record: Annotated[
+        Path | None, typer.Argument(metavar="RECORD", help="Record: .csv, .csv.gz, .h5 or .mat.", show_default=False)
+    ] = None,
     rig: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="RIG", help="Rig file to write.", show_default="standard output"),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            "--preset",
+            metavar="NAME",
+            help="Instead of a record: the rig of a bench with a controller (prototype).",
+            show_default=False,
+        ),
     ] = None,
     rate: Rate = None,
     gaps: Gaps = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a rig file that exists.")] = False,
 ) -> None:
-    """Write a commented rig file, guessed from the record's columns, to be checked and edited."""
-    from ambid.record import read_record
-    from ambid.rig import draft_rig
-
+    """Write a commented rig file, guessed from a record's columns, or that of a preset bench, to be checked and edited."""
+    if (record is None) == (preset is None):
+        given = "both a record and --preset were given" if record is not None else "neither a record nor --preset given"
+        raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_PRESETS[0]}")
     with Outputs(record) as outputs:
         outputs.claim(rig, "-o")
         if rig is not None and rig.exists() and not force:
             raise AmbidError(f"-o {rig} exists already; it may hold your changes. Choose another name, or give --force")
-        text = draft_rig(read_record(record, rate_hz=rate, gaps=gaps or "error"))
+        text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps)
         if rig is not None:
             outputs.stage_text(rig, text)
     if rig is None:
         typer.echo(text, nl=False)
-        return
-    open_points = [
-        line for line in text.splitlines() if "CHECK" in line.partition("#")[2] and not line.startswith("# G")
-    ]
-    typer.echo(f"{rig} written; {len(open_points)} lines are marked CHECK. Then: ambid identify {record} --rig {rig}")
+    elif record is None:
+        typer.echo(f"{rig} written; change what differs on your bench. Then: ambid commission --rig {rig} --port PORT")
+    else:
+        open_points = [
+            line for line in text.splitlines() if "CHECK" in line.partition("#")[2] and not line.startswith("# G")
+        ]
+        typer.echo(
+            f"{rig} written; {len(open_points)} lines are marked CHECK. Then: ambid identify {record} --rig {rig}"
+        )
+
+
+def _of_record(record: Path | None, rate: Rate, gaps: Gaps) -> str:
+    from ambid.record import read_record
+    from ambid.rig import draft_rig
+
+    assert record is not None
+    return draft_rig(read_record(record, rate_hz=rate, gaps=gaps or "error"))
+
+
+def _of_preset(name: str) -> str:
+    from importlib.resources import files
+
+    if name not in _PRESETS:
+        raise AmbidError(
+            f"--preset {name!r} has no rig file; there is one of {', '.join(_PRESETS)}.{nearest(name, _PRESETS)}"
+            f" Give --preset {_PRESETS[0]}, or RECORD"
+        )
+    return files("ambid").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")

@@ -148,7 +148,7 @@ def command(
                 kept = f"; {path} holds the track" if path else ""
                 print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                 raise typer.Exit(INTERRUPTED) from None
-    _finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict, flags=flags)
+    finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict, flags=flags)
 
 
 def _check(every: float, limit: float, start: Path | None, start_seconds: float | None) -> None:
@@ -304,7 +304,7 @@ def _may_hold_truth(record: Path) -> bool:
         return False
 
 
-def _finish(
+def finish(
     follower: Follower,
     summary: TrackSummary | None,
     written: list[str],
@@ -313,7 +313,28 @@ def _finish(
     strict: bool,
     flags: Sequence[tuple[float, Flag]],
 ) -> None:
-    """Print the table, say what was interrupted or not reached, and end with the exit code."""
+    """Print the table, say what was interrupted or not reached, and end with the exit code.
+
+    Parameters
+    ----------
+    follower : Follower
+        That followed the run.
+    summary : TrackSummary or None
+        None where the run ended before its first line.
+    written : list of str
+        Files that hold the track.
+    table, strict : bool
+        Whether to print the table; whether troubles end with exit code 3.
+    flags : sequence of (float, str)
+        As given.
+
+    Raises
+    ------
+    Exit
+        With the exit code, where it is not 0.
+    AmbidError
+        If no line was reached.
+    """
     header, last = follower.header, follower.last
     if summary is None or header is None or last is None:
         if follower.code:
