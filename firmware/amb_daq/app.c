@@ -55,6 +55,7 @@ static void show(uint16_t beats)
 void amb_loop(void)
 {
     show(board_alive());
+    board_rx_lost();
     report_pending();
     listen();
     board_sleep(pending);

@@ -147,8 +147,11 @@ def test_elements_of_the_table(console):
     assert [code(line) for line in lines] == [(DONE, 0), (RANGE, 2), (RANGE, 3), (RANGE, 3)]
 
 
-@pytest.mark.parametrize(("period", "mode", "wanted"), [(21, 2, RANGE), (21, 3, RANGE), (21, 1, DONE), (20, 3, DONE)])
-def test_no_output_below_one_kilohertz(console, period, mode, wanted):
+@pytest.mark.parametrize(
+    ("period", "mode", "wanted"),
+    [(21, 2, RANGE), (21, 3, RANGE), (21, 1, DONE), (20, 3, DONE), (7, 2, DONE), (6, 3, RANGE), (5, 1, DONE)],
+)
+def test_output_only_at_rates_that_are_safe(console, period, mode, wanted):
     lines = console([*ready(period=period), command("start", 9, mode=mode)])
     assert code(lines[-1])[0] == wanted
 
