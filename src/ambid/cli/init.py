@@ -35,10 +35,12 @@ def command(
     gaps: Gaps = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a rig file that exists.")] = False,
 ) -> None:
-    """Write a commented rig file, guessed from a record's columns, or that of a preset bench, to be checked and edited."""
+    """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
     if (record is None) == (preset is None):
         given = "both a record and --preset were given" if record is not None else "neither a record nor --preset given"
         raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_PRESETS[0]}")
+    if preset is not None and (rate is not None or gaps is not None):
+        raise AmbidError("--rate and --gaps are for reading a record; with --preset none is read. Leave them out")
     with Outputs(record) as outputs:
         outputs.claim(rig, "-o")
         if rig is not None and rig.exists() and not force:
