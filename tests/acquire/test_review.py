@@ -52,6 +52,15 @@ def test_what_is_rough_is_said(sound, changed, words):
     assert any(words in line for line in found), found
 
 
+def test_the_plant_may_be_another_than_the_rigs():
+    rig = bench(('L = { value = 80.3, unit = "mH" }\n', ""))
+    plant = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 80.3e-3, "c": 0.0}
+    s = controller_settings(rig)
+    assert review(rig, s, parameters=plant) == ()
+    heavier = review(rig, s, parameters=plant | {"k_x": -20_000.0})
+    assert any("the loop is unstable" in line for line in heavier), heavier
+
+
 def test_tables_are_told_where_they_end_and_where_they_bend(tmp_path):
     (tmp_path / "gap.csv").write_text("counts [1],gap [mm]\n20,2\n500,0.1\n600,-0.3\n1023,-1.2\n")
     change = ("gain = 2.44140625e-6\noffset = -1.25e-3", 'table = "gap.csv"')

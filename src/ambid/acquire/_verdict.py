@@ -74,8 +74,8 @@ def _range(column: ColumnQuality) -> Iterator[str]:
         )
     elif column.used is not None and 0.0 < column.used < _USED:
         yield (
-            f"{column.name} uses {column.used:.1%} of the converter's range: rounding drowns it. Raise the sensor's"
-            " gain, or excite more"
+            f"{column.name} uses {column.used:.1%} of the converter's range: its steps are coarse. Raise the"
+            " sensor's gain, or excite more"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,7 +22,7 @@ _COARSE = 64  # counts between the trips
 _SLOW_PERIODS = 2000.0  # ticks in which a mode of the loop should have settled
 
 
-def review(rig: Rig, settings: ControllerSettings) -> tuple[str, ...]:
+def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] | None = None) -> tuple[str, ...]:
     """Say what a rig's controller will do only roughly, or what speaks against closing its loop.
 
     Parameters
@@ -30,6 +31,8 @@ def review(rig: Rig, settings: ControllerSettings) -> tuple[str, ...]:
         The rig.
     settings : ControllerSettings
         Made from it by `ambid.acquire.settings.controller_settings`.
+    parameters : Mapping of str to float, optional
+        Plant on which the loop has to be stable, SI; default: the values that the rig gives.
 
     Returns
     -------
@@ -43,7 +46,7 @@ def review(rig: Rig, settings: ControllerSettings) -> tuple[str, ...]:
             " Raise daq.rate_hz to drive or levitate"
         )
     if settings.closed:
-        lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings)]
+        lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings, parameters)]
     elif has_position(rig):
         lines.append("the rig has no [loop] with a gain: it can sample and drive, not levitate. Add [loop]")
     return tuple(lines)
@@ -127,13 +130,14 @@ def _slopes(rig: Rig, settings: ControllerSettings) -> list[str]:
     return lines
 
 
-def _stability(rig: Rig, settings: ControllerSettings) -> list[str]:
+def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float] | None) -> list[str]:
     """Say where the loop as the controller closes it does not hold the plant that the rig knows."""
     from ambid.simulate import closed_loop_poles
 
-    values = {p.name: p.value for p in rig.parameters if p.value is not None}
+    known = {p.name: p.value for p in rig.parameters if p.value is not None}
+    values = known if parameters is None else parameters
     if len(values) < len(rig.parameters):
-        missing = ", ".join(p.name for p in rig.parameters if p.value is None)
+        missing = ", ".join(p.name for p in rig.parameters if p.name not in values)
         return [f"the loop was not checked on the plant: {missing} has no value. Give what is known of it"]
     loop = realised(settings, rig)
     largest = float(np.abs(closed_loop_poles(values, loop, settings.rate_hz, of=rig.model)[0]))
