@@ -222,7 +222,7 @@ def test_a_disk_that_is_nearly_full_is_told_once(tmp_path, monkeypatch):
 
 
 def test_a_stalled_disk_is_counted_told_at_once_and_marked(tmp_path):
-    told, disks = [], []
+    told, disks, troubles = [], [], []
 
     def disk(path):
         disks.append(StalledDisk(path))
@@ -230,7 +230,12 @@ def test_a_stalled_disk_is_counted_told_at_once_and_marked(tmp_path):
 
     room = 10  # blocks
     with Recorder(
-        tmp_path / "run.h5", header(), queue_s=room * ROWS / 2000, on_event=told.append, open_file=disk
+        tmp_path / "run.h5",
+        header(),
+        queue_s=room * ROWS / 2000,
+        on_event=told.append,
+        on_trouble=troubles.append,
+        open_file=disk,
     ) as recorder:
         recorder.append(block(0))
         assert recorder.flush()
@@ -241,6 +246,8 @@ def test_a_stalled_disk_is_counted_told_at_once_and_marked(tmp_path):
         assert recorder.overruns == 30 - room == len(told)  # told while the disk still stands
         assert recorder.lost_samples == (30 - room) * ROWS
         assert [(e.kind, e.sample, e.count) for e in told] == [("lost", k * ROWS, ROWS) for k in range(room + 1, 31)]
+        assert len(troubles) == 1  # once, not for each block
+        assert f"too slow: samples are lost from number {(room + 1) * ROWS} on" in str(troubles[0])
         disks[0].free.set()
         assert recorder.flush()
         assert recorder.append(block(31))

@@ -210,6 +210,12 @@ def test_a_block_of_other_columns_is_refused(tmp_path):
     assert recorder.result.survey.blocks == 1
 
 
+@pytest.mark.parametrize("first", [1.5, float("nan"), 2**63])
+def test_a_block_of_no_number_is_refused(tmp_path, first):
+    with Recorder(tmp_path / "run.h5", header()) as recorder, pytest.raises(DeviceError, match="numbers of samples"):
+        recorder.append(Block(first=first, time_s=0.0, values=values_at(0, ROWS)))
+
+
 def test_a_disk_without_room_is_refused_before(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "free_bytes", lambda folder: 100 << 20)
     with pytest.raises(DeviceError, match=r"100|105 MB left"), Recorder(tmp_path / "run.h5", header(), seconds=36000):
@@ -223,7 +229,7 @@ def test_numbers_that_go_back_are_stored_and_told(tmp_path):
     with Recorder(tmp_path / "run.h5", header(), on_event=told.append) as recorder:
         for k in (0, 1, 2, 1, 2, 3):
             recorder.append(block(k))
-    assert [(e.kind, e.sample) for e in told] == [("lost", ROWS)]
+    assert [(e.kind, e.sample) for e in told] == [("note", ROWS)]
     assert recorder.result.survey.misplaced == 2 * ROWS
     assert same_bits(columns_of(tmp_path / "run.h5"), values_at(0, 4 * ROWS))
     assert len(contents(recorder.journal)[0]) == 6  # kept: it holds more than the record

@@ -190,7 +190,7 @@ class JournalWriter:
         with contextlib.suppress(OSError):
             free = free_bytes(self._open.path.parent)
             if free < self._least_free:
-                self._trouble("disk", f"the disk of {self._open.path} is nearly full: {free / 1e6:.0f} MB left."
+                self.trouble("disk", f"the disk of {self._open.path} is nearly full: {free / 1e6:.0f} MB left."
                               " Make room, or end the recording")  # fmt: skip
 
     def _look_at_file(self) -> None:
@@ -199,16 +199,20 @@ class JournalWriter:
             with self._wake:
                 self.removed = True
                 self._wake.notify_all()
-            self._trouble(fault, f"journal {self._open.path} {fault}; the recording goes on in the open file, and is"
+            self.trouble(fault, f"journal {self._open.path} {fault}; the recording goes on in the open file, and is"
                           " lost if this program is killed. End it in order: it is then saved as a record")  # fmt: skip
         elif fault:
-            self._trouble(fault, f"journal {self._open.path} {fault}. Put it right before the recording ends")
+            self.trouble(fault, f"journal {self._open.path} {fault}. Put it right before the recording ends")
 
-    def _trouble(self, kind: str, message: str) -> None:
-        """Tell of trouble, once for each kind."""
+    def trouble(self, kind: str, message: str) -> None:
+        """Tell of trouble, once for each kind until `over`."""
         if kind not in self._told:
             self._told.add(kind)
             self._tell(DeviceError(message))
+
+    def over(self, kind: str) -> None:
+        """Let trouble of this kind be told again."""
+        self._told.discard(kind)
 
     def _fail(self, error: DeviceError) -> None:
         with self._wake:

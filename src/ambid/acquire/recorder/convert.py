@@ -115,6 +115,8 @@ def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
         raise DeviceError(f"{path}: a recording is written as {', '.join(FORMATS)}. Name it so")
     if path.is_dir():
         raise DeviceError(f"{path} is a folder; a file is wanted. Name a file inside it")
+    if not path.parent.is_dir():
+        raise DeviceError(f"{path}: there is no folder {path.parent}. Make it first, or correct the path")
     if path.exists() and not force:
         raise DeviceError(f"{path} exists already. Choose another name, remove it, or give --force")
     if ".csv" in path.name.lower():
@@ -199,7 +201,8 @@ def recorded_from(
     check_target(path, reader.header, force=force)
     record = _record(reader.header, found, extra)
     acquisition = {"header": reader.header.as_json(), "events": [asdict(e) for e in found.events]}
-    beside = path.with_name(f".{os.getpid()}-{path.name}")
+    # Named after the journal, which is locked: what a killed conversion leaves is written over by the next one.
+    beside = path.with_name(f".{reader.path.name}-{path.name}")
     try:
         rows = _rows(reader, found, progress)
         check = write_chunks(record, found.rows, rows, beside, {"acquisition": json.dumps(acquisition)})

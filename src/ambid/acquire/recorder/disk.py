@@ -169,7 +169,9 @@ def lock(fd: int, path: Path) -> None:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(fd)
-        raise DeviceError(f"{path} is being written by a recorder. Wait until it ends, or end it") from None
+        raise DeviceError(
+            f"{path} is being written by a recorder, or recovered by another program. Wait until it ends, or end it"
+        ) from None
     except OSError:  # a file system without locks
         return
 

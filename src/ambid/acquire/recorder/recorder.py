@@ -167,7 +167,7 @@ class Recorder:
         if n == 0:
             return True
         if self._next is not None and block.first < self._next:
-            self._own_event("lost", f"numbers of samples went back from {self._next} to {block.first}", block.first)
+            self._own_event("note", f"numbers of samples went back from {self._next} to {block.first}", block.first)
         self._next = block.first + n
         if self._writer.failed or self._closed:
             self._queue.count_lost(n)
@@ -175,9 +175,12 @@ class Recorder:
         if not self._queue.has_room(n):
             self._queue.overrun(block.first, n)
             self._tell(
-                Event(kind="lost", what="the disk is too slow: no room in the queue", sample=block.first, count=n)
+                Event(kind="lost", what="no room in the queue: the disk is too slow", sample=block.first, count=n)
             )
+            self._writer.trouble("slow", f"the disk of {self.journal} is too slow: samples are lost from number"
+                                 f" {block.first} on. They are counted; end what else uses the disk")  # fmt: skip
             return False
+        self._writer.over("slow")
         code, payload = packed_values(values, self._dtype)
         self._queue.put(Item(BLOCK, int(block.first), float(block.time_s), n, values.shape[1], code, payload))
         return True
@@ -252,6 +255,8 @@ class Recorder:
                 f"block at sample {block.first} has shape {values.shape}; this recording takes (n_samples, {columns})"
                 f" of at most {LARGEST >> 20} MB. Give the columns of the header"
             )
+        if not isinstance(block.first, int | np.integer) or not -(2**62) < block.first < 2**62:
+            raise DeviceError(f"a block begins at sample {block.first}; numbers of samples are whole and below 2^62")
         return values
 
     def _own_event(self, kind: str, what: str, sample: int) -> None:
