@@ -6,6 +6,7 @@ import pytest
 from ambid.acquire.recorder import JournalReader, Recorder, journal_path, recorded_from
 from ambid.acquire.recorder.disk import JournalFile
 from ambid.record.hdf5_format import read_hdf5
+from ambid.track.stream.block import Block
 from tests.acquire.recorder.signals import ROWS, block, contents, header, same_bits, values_at
 
 CASES = 200
@@ -68,8 +69,9 @@ def test_nothing_acknowledged_is_lost_by_a_power_cut(tmp_path, journal):
     data, syncs = journal
     rng = np.random.default_rng(6)
     with Recorder(tmp_path / "other.h5", header()) as other_recorder:
-        for k in range(40, 80):
-            other_recorder.append(block(k))
+        for k in range(80):
+            first = block(k).first
+            other_recorder.append(Block(first=first, time_s=0.0, values=values_at(first, ROWS) + 1.0))
         assert other_recorder.flush()
         other = other_recorder.journal.read_bytes()
     tails = 0
