@@ -199,7 +199,7 @@ def _prototype() -> Preset:
                 "position_resolution, current_resolution": "10 bits over 2.5 mm and 2.5 A, chosen",
                 "voltage_resolution": "800 counts of pulse width over +-12 V",
                 "turns, area, bias, gap, leakage, m, R": "chosen",
-                "limits.voltage": "pulse width of 5 to 95 %",
+                "limits.voltage": "pulse width of 2.5 to 97.5 %: a bridge with a charge pump needs its pause",
                 "limits.current": "the bias: neither coil reverses",
                 "loop, noise, limits.position, rate_hz": "chosen",
             }

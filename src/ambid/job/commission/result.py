@@ -40,7 +40,7 @@ def record(name: str, done: Acquired) -> Step:
     reasons += [
         f"{column.name} is at the end of its range in {100 * column.saturated:.1f} % of the {name}'s samples"
         for column in done.quality.columns
-        if column.saturated > _SATURATED
+        if column.role in ("position", "current") and column.saturated > _SATURATED
     ]
     cautions = [line for line in done.quality.verdict if line not in reasons]
     return Step(name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions))
