@@ -1,5 +1,7 @@
 """The firmware's binary through the ordinary driver: what happens at the bench is told to the host."""
 
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +67,17 @@ def test_a_line_that_damages_frames_is_counted_and_survived():
         assert 5 < c.lost <= 2 * c.damaged + 1  # a zero that is damaged joins two frames
         assert c.samples + c.lost >= 6000
         assert device.state == "idle"
+
+
+def test_an_emulator_that_dies_is_a_lost_line():
+    device = EmulatedDevice(PROTOTYPE)
+    with pytest.raises(DeviceError, match="was lost"), device:  # noqa: PT012 - what came before is read first
+        device.start("levitate")
+        assert device.read(60.0) is not None
+        os.kill(device.emulator.pid, signal.SIGKILL)
+        while True:
+            device.read(60.0)
+    assert device.emulator is None
 
 
 def test_a_rig_without_instruments_gets_si_columns():

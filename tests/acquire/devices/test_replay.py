@@ -57,6 +57,17 @@ def test_gaps_of_the_record_are_gaps_of_the_stream(record):
         assert device.read(60.0).block.first == 1000
 
 
+def test_columns_that_the_rig_does_not_know_come_after_its_own(tmp_path):
+    rows = [f"{row(k)},{k % 3},{k}" for k in range(100)]
+    header = "time [s],duty [1],current [1],position [1],excitation [1],hall [V]"
+    with ReplayDevice(written(tmp_path / "more.csv", rows, header), PROTOTYPE, pace="fastest") as device:
+        seen = [(c.name, c.role, c.unit) for c in device.info.columns]
+        assert seen[3:] == [("excitation", "excitation", "1"), ("hall", "extra", "V")]
+        device.start("sample")
+        values = np.concatenate([f.block.values for f in everything(device)])
+        np.testing.assert_array_equal(values[:, 4], np.arange(100))
+
+
 def test_in_real_time_it_takes_its_time(record):
     with ReplayDevice(record, PROTOTYPE, pace="real") as device:
         began = time.perf_counter()

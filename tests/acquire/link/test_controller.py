@@ -91,6 +91,15 @@ def test_a_refusal_names_the_field_and_the_reason(answer, words):
         assert "'limits'" in text
 
 
+def test_a_mode_that_does_not_go_with_the_rate_is_not_blamed_on_its_number():
+    board = FakeController()
+    with Session(board) as s:
+        board.refuse["start"] = ("range", 2)
+        text = refused(s.controller.ask, "start", {"mode": 3})
+        assert "'levitate'" in text
+        assert "daq.rate_hz" in text
+
+
 def test_another_version_is_refused_at_once():
     with Session(FakeController(version=2), answer_s=20.0) as s:
         assert "version 2" in refused(s.controller.identify)

@@ -305,7 +305,7 @@ class PlayedDevice(ABC):
             self._events.append(
                 DeviceEvent(kind="lost", sample=self._next, what="gap in the numbers", count=block.first - self._next)
             )
-        self._next = block.first + n
+        self._next = max(self._next, block.first + n)  # a torn record may run back
         if self._held + n > self._room:
             self._overruns += 1
             self._lost += n

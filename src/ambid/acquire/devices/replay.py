@@ -30,7 +30,7 @@ class ReplayDevice(PlayedDevice):
     path : str or Path
         ``.csv``, ``.csv.gz``, ``.h5``.
     rig : Rig
-        Whose columns are played.
+        Its columns are played first, then all others of the record.
     pace : {"real", "fastest"}
     block_samples : int, optional
         Samples of a block at most; default those of 10 ms.
@@ -51,12 +51,15 @@ class ReplayDevice(PlayedDevice):
                 " Correct the rig, or take another record"
             )
         super().__init__(record.rate_hz, pace, block_samples)
-        names = tuple(c.column for c in rig.channels)
+        roles = {c.column: c.role for c in rig.channels}
+        others = {name: name if name == "excitation" else "extra" for name in record.names if name not in roles}
         try:
-            self._replay: Replay = blocks_of(record, self._size, channels=names, time_s=rows.time_s)
+            self._replay: Replay = blocks_of(record, self._size, channels=(*roles, *others), time_s=rows.time_s)
         except RecordError as failure:
             raise DeviceError(str(failure)) from None
-        columns = tuple(Column(name=c.column, role=c.role, unit=record.channel(c.column).unit) for c in rig.channels)
+        columns = tuple(
+            Column(name=name, role=role, unit=record.channel(name).unit) for name, role in (roles | others).items()
+        )
         self._info = DeviceInfo(kind="replay", port=str(path), rate_hz=record.rate_hz, columns=columns)
         self._row = self._base = 0
 

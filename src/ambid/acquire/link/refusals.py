@@ -41,6 +41,11 @@ def refusal(asked: Message, answer: Message) -> str:
 
 def _why(asked: Message, code: str, detail: int, about: str) -> str:
     known = table()
+    if code == "range" and asked.name == "start":
+        return (
+            f"mode {known.name('mode', asked['mode'])!r} does not go with what it was told: with the output on, a tick"
+            " is neither very short nor very long (daq.rate_hz), and set point and bias are within the limits"
+        )
     if code == "range":
         fields = known.messages[asked.name].fields
         if 1 <= detail <= len(fields):
