@@ -149,6 +149,27 @@ def test_the_lock_holds_against_another_process(tmp_path):
     assert "is being written" in done.stderr
 
 
+FORKED = """
+import os, sys
+from ambid.acquire.recorder import Recorder
+from tests.acquire.recorder.signals import block, header
+recorder = Recorder(sys.argv[1], header())
+recorder.__enter__()
+recorder.append(block(0))
+recorder.flush()
+if os.fork() == 0:
+    sys.stdin.read()
+os._exit(0)
+"""
+
+
+def test_a_process_that_was_forked_off_does_not_hold_the_journal_of_a_dead_recorder(tmp_path):
+    code = [sys.executable, "-c", FORKED, str(tmp_path / "run.h5")]
+    with subprocess.Popen(code, stdin=subprocess.PIPE) as parent:  # on leaving, the child's input is closed: it ends
+        assert parent.wait(60) == 0
+        assert len(contents(tmp_path / "run.h5.journal")[0]) == 1
+
+
 @pytest.mark.parametrize("name", ["run.mat", "run", "missing/run.h5"])
 def test_a_record_that_could_not_be_written_is_refused_before(tmp_path, name):
     with pytest.raises(DeviceError), Recorder(tmp_path / name, header()):

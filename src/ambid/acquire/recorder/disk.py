@@ -9,6 +9,7 @@ import contextlib
 import errno
 import os
 from pathlib import Path
+from weakref import WeakSet
 
 from ambid.errors import DeviceError
 
@@ -76,6 +77,7 @@ class JournalFile:
         except OSError as failure:
             raise disk_error(f"{path} cannot be made", failure) from None
         lock(self._fd, path)
+        _OPEN.add(self)
         sync_folder(path)
 
     def write(self, data: bytes) -> None:
@@ -144,6 +146,17 @@ class JournalFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+def _let_go() -> None:
+    """Close the journals in a process that was forked off: it would hold their locks after the recorder's death."""
+    for file in list(_OPEN):
+        file.close()
+
+
+_OPEN: WeakSet[JournalFile] = WeakSet()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
 
 
 def lock(fd: int, path: Path) -> None:
