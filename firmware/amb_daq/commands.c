@@ -239,7 +239,7 @@ static uint8_t on_start(struct request *r)
     if ((daq.ready & needs) != needs)
         return unready(r);
     if (mode != MODE_SAMPLE) {
-        if (daq.period < CAP_OUTPUT_SHORTEST || daq.period > CAP_OUTPUT_PERIOD)
+        if (daq.period < CAP_OUTPUT_FASTEST || daq.period > CAP_OUTPUT_PERIOD)
             return out_of_range(r, 2);
         if (mode == MODE_LEVITATE && (position_outside(daq.control.gains.setpoint) || duty_outside(daq.control.gains.duty_bias)))
             return out_of_range(r, 2); /* limits that came after the gains leave these out */
