@@ -1,21 +1,27 @@
 """One run of a device: started, settled, excited, listened to for a time, stopped; nothing is lost uncounted.
 
 Blocks go to taps (recorder, quality, ring to a tracker) in the order in which they came. A fault of the device ends the
-run: what came before it has been passed on.
+run: what was sampled before it has been passed on. What an earlier run left unread is not of this one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+
 from ambid.acquire.device import Device, DeviceEvent, Mode, Program
+from ambid.acquire.playing import period_ticks
 from ambid.errors import DeviceError
 from ambid.track.stream.block import Block, Frame
 
 _LOOK_S = 0.1  # how often a wait looks whether the run should end
 _SILENT_LOOKS = 50  # without a sample: the line is dead. Looks, not seconds: a host that slept has not listened
+_LONGEST_LEAD_S = 1.0  # of excitation before samples are passed on
+_LONGEST_WAIT_S = 10.0  # of samples until an excitation shows
 _ENDING = ("fault",)  # kinds of events that end a run
 
 
@@ -45,7 +51,8 @@ class Course:
     settle_s : float
         Time after the start that is not passed on: lift-off and its transient, s.
     program : Program or None
-        Excitation; it begins with the part that is passed on.
+        Excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
+        periodic from its first sample.
     """
 
     mode: Mode
@@ -128,6 +135,7 @@ def run(
         made.settle(stopped)
         if made.going and course.program is not None:
             device.excite(course.program)
+            made.lead_in(course.program)
         made.listen(stopped)
     finally:
         device.stop()
@@ -141,11 +149,15 @@ class _Run:
     def __init__(
         self, device: Device, course: Course, taps: Sequence[Tap], on_event: Callable[[DeviceEvent], object] | None
     ) -> None:
-        rate_hz = device.info.rate_hz
+        self._rate_hz = rate_hz = device.info.rate_hz
         self._device, self._taps, self._on_event = device, taps, on_event
         self._wanted = max(1, round(course.seconds * rate_hz))
         self._settling = round(course.settle_s * rate_hz)
         self._origin: int | None = None  # number of the first sample that came at all
+        self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
+        self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
+        self._unheard = 0
+        self._from: int | None = None  # number from which samples are passed on, once that is known
         self._first: int | None = None
         self._after = 0
         self._samples = 0
@@ -157,6 +169,11 @@ class _Run:
     def going(self) -> bool:
         """Whether nothing has ended the run yet."""
         return self._fault is None and not self._interrupted
+
+    def forget(self) -> None:
+        """Throw away what an earlier run left unread: its samples are of another course."""
+        while self._device.read(0.0) is not None:
+            pass
 
     def settle(self, stopped: Callable[[], bool]) -> None:
         """Let the first samples pass."""
@@ -170,9 +187,10 @@ class _Run:
         if not self.going:
             return
         for frame in self._frames(stopped):
-            block = frame.block
+            block = self._after_lead(frame.block)
+            if block is None:
+                continue
             if self._first is None:
-                # after a pause in the middle of a block: from the next whole one
                 self._first = self._after = block.first
             end = self._first + self._wanted
             if block.first >= end:
@@ -184,6 +202,35 @@ class _Run:
             self._after = kept.first + len(kept.values)
             if self._after >= end:
                 return
+
+    def lead_in(self, program: Program) -> None:
+        """Let the excitation settle before samples are passed on."""
+        if self._excited is not None:
+            self._lead = min(period_ticks(program), round(_LONGEST_LEAD_S * self._rate_hz))
+
+    def _after_lead(self, block: Block) -> Block | None:
+        """Return what of a block comes after the lead; what was under way when the excitation was ordered does not."""
+        if self._lead is None:
+            return block
+        if self._from is None:
+            assert self._excited is not None
+            plays = np.flatnonzero(block.values[:, self._excited])
+            if not plays.size:
+                self._unheard += len(block.values)
+                if self._unheard > _LONGEST_WAIT_S * self._rate_hz:
+                    raise DeviceError(
+                        f"{self._device.info.port}: the excitation was ordered and does not show in"
+                        f" {_LONGEST_WAIT_S:g} s of samples. Give a larger amplitude"
+                    )
+                return None
+            self._from = block.first + int(plays[0]) + self._lead
+        passed = self._from - block.first
+        if passed >= len(block.values):
+            return None
+        if passed <= 0:
+            return block
+        later = block.time_s + passed / self._rate_hz
+        return Block(first=self._from, time_s=later, values=block.values[passed:])
 
     def hear(self) -> None:
         """Take what the device tells."""
@@ -223,13 +270,11 @@ class _Run:
             self.hear()
             if frame is not None:
                 silent = 0
-                block, fault = frame.block, self._fault
-                if fault is not None and fault.sample is not None and fault.sample < block.first + len(block.values):
-                    # What was sampled before the fault is sound; after it the bench is another one.
-                    if fault.sample > block.first:
-                        yield replace(frame, block=_cut(block, fault.sample - block.first))
+                sound = _before(frame, self._fault)
+                if sound is not None:
+                    yield sound
+                if sound is not frame:
                     return
-                yield frame
                 continue
             if self._fault is not None or self._device.ended:
                 return
@@ -239,6 +284,16 @@ class _Run:
                     f"{self._device.info.port}: no sample came for {_SILENT_LOOKS * _LOOK_S:g} s; the device should"
                     f" send {self._device.info.rate_hz:g} in a second. Look at cable and supply, and start again"
                 )
+
+
+def _before(frame: Frame, fault: DeviceEvent | None) -> Frame | None:
+    """Return what of a block was sampled before a fault: that is sound; after it the bench is another one."""
+    block = frame.block
+    if fault is None or (fault.sample is not None and fault.sample >= block.first + len(block.values)):
+        return frame
+    if fault.sample is None or fault.sample <= block.first:
+        return None
+    return replace(frame, block=_cut(block, fault.sample - block.first))
 
 
 def _cut(block: Block, n: int) -> Block:
