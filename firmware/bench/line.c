@@ -92,6 +92,7 @@ static void see_who_is_there(struct line *line)
     if (poll(&here, 1, 0) < 0)
         return;
     line->heard = !(here.revents & POLLHUP);
+    line->opened |= line->heard;
     if (!line->heard && held(&line->to_host) > 0) {
         line->unheard += held(&line->to_host);
         line->sent -= held(&line->to_host);
@@ -122,6 +123,6 @@ int line_move(struct line *line)
         came += (int)n;
     }
     if (came > 0)
-        line->heard = line->spoke = 1; /* opened since we looked: the answer may be quicker than the next look */
+        line->heard = line->opened = line->spoke = 1; /* opened since we looked: the answer may be quicker than the next look */
     return came;
 }

@@ -19,6 +19,7 @@ struct line {
     int terminal;       /* our end */
     char name[128];     /* the host's end */
     int heard;          /* a host has it open */
+    int opened;         /* a host had it open at some time */
     int spoke;          /* the host has sent something */
     enum cable cable;
     double damage;      /* chance per byte */

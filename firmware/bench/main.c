@@ -105,7 +105,8 @@ static void listen_to_line(void)
         heard_at = controller.avr->cycle;
 }
 
-/* Emulated time stands until the host has taken what it was sent, and, once it spoke, has spoken again. */
+/* Emulated time stands until the host has taken what it was sent; until there is one at all; and, once it spoke, until it
+ * has spoken again. */
 static void wait_for_host(const struct options *o)
 {
     const uint64_t patience = (uint64_t)(o->lockstep_ms * TICKS_PER_MS);
@@ -113,7 +114,7 @@ static void wait_for_host(const struct options *o)
         rest(POLLOUT | POLLIN, 100);
         listen_to_line();
     }
-    while (!over() && patience > 0 && line.spoke && controller.avr->cycle - heard_at > patience) {
+    while (!over() && patience > 0 && (line.spoke || !line.opened) && controller.avr->cycle - heard_at > patience) {
         rest(POLLIN, 100);
         listen_to_line();
     }

@@ -28,6 +28,12 @@ def probe(emulated, probe_elf, tmp_path):
         line.close()
 
 
+def worked(pid):
+    """Processor time of a process, in the system's ticks."""
+    with open(f"/proc/{pid}/stat") as file:
+        return int(file.read().rpartition(")")[2].split()[11])
+
+
 def ticks_of(stream):
     return np.frombuffer(stream[: len(stream) // 6 * 6], "<u2").reshape(-1, 3)[:, 0].astype(int)
 
@@ -75,10 +81,12 @@ def test_what_nobody_hears_is_counted(probe):
     line.write(b"s\x01")
     line.read(600)
     line.close()
-    line.wait_for(lambda: len(bench.events("host")) >= 2)
-    time.sleep(0.2)
+    line.wait_for(lambda: [e["open"] for e in bench.events("host")] == [1, 0])
+    before = worked(bench.pid)
+    line.wait_for(lambda: worked(bench.pid) > before + 10)
     with Line(bench.port) as again:
         first = ticks_of(again.read(12))
+        line.wait_for(lambda: len(bench.events("host")) >= 3)
         again.write(b"s\x00")
         again.read_until_quiet(0.2)
     bench.close(keep=True)
@@ -115,12 +123,12 @@ def test_a_damaged_line_turns_one_bit_of_a_byte(probe):
 
 
 def test_a_line_may_be_damaged_now_and_then(probe):
-    bench, line = probe(script="+0 line damage 0.02")
+    bench, line = probe(script="+0.01 line damage 0.02")
     line.write(b"e\x01s\x01")
-    stream = line.read_until_quiet(0.5)
-    line.write(b"s\x00" * 30)
-    line.read_until_quiet(0.2)
+    stream = line.read(900)
     bench.close(keep=True)
     end = bench.events("end")[0]
     assert 0 < end["damaged"] < 0.05 * (end["to_host"] + end["to_controller"])
-    assert len(stream) > 600
+    steps = np.diff(ticks_of(stream[1:]))
+    assert np.count_nonzero(steps[:15] != 1) == 0
+    assert np.count_nonzero(steps != 1) > 0

@@ -115,6 +115,15 @@ def test_emulated_time_waits_for_a_host_that_spoke(emulated, probe_elf, plant):
             assert line.ticks() - before <= 104
 
 
+def test_emulated_time_waits_for_the_first_host(emulated, probe_elf, plant):
+    bench = emulated(plant, firmware=probe_elf, lockstep_ms=20)
+    time.sleep(0.3)
+    with Line(bench.port) as line:
+        line.greet()
+    bench.close(keep=True)
+    assert bench.events("host")[0]["t"] <= 0.0205
+
+
 def test_a_script_lets_emulated_time_run_without_the_host(emulated, probe_elf, plant):
     bench = emulated(plant, firmware=probe_elf, lockstep_ms=50, script="+0.01 lockstep 0")
     with Line(bench.port) as line:
