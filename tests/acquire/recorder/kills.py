@@ -47,15 +47,13 @@ def killed(folder, cases, seed):
 
 
 def one_kill(server, path, rng):
-    # Most are killed while they record, from the first microsecond on; the others while the record is made, or after.
-    seconds, delay = (10.0, rng.uniform(0.0, 0.06)) if rng.random() < 0.8 else (0.03, rng.uniform(0.03, 0.08))
-    server.stdin.write(f"{path} {seconds} {delay}\n")
+    # Most after a number of blocks that is drawn, some from the first microsecond on, some while the record is made.
+    moment = rng.random()
+    blocks = rng.randint(1, 1500) if moment < 0.7 else 0 if moment < 0.85 else -1
+    delay = rng.uniform(0.0, 0.005 if blocks > 0 else 0.03)
+    server.stdin.write(f"{path} {blocks} {delay}\n")
     server.stdin.flush()
-    acknowledged = 0
-    while (line := server.stdout.readline()) != "end\n":
-        assert line, "the server is gone"
-        acknowledged = int(line.split()[1])
-    return judged(path, acknowledged)
+    return judged(path, int(server.stdout.readline()))
 
 
 def judged(path, acknowledged):
@@ -67,7 +65,7 @@ def judged(path, acknowledged):
             with JournalReader.open(journal) as reader:
                 made = recorded_from(reader, path, force=True)
         except Exception as failure:
-            made, when = None, f"before anything: {type(failure).__name__}"
+            made, when = None, f"while the journal was made ({type(failure).__name__})"
         if made is None:
             return Kill(acknowledged, 0, when, "lost all" if acknowledged else "")
         if made.survey.damage.frames or made.survey.gap_samples:
