@@ -34,6 +34,12 @@ def worked(pid):
         return int(file.read().rpartition(")")[2].split()[11])
 
 
+def stands_still(pid):
+    before = worked(pid)
+    time.sleep(0.3)
+    return worked(pid) == before
+
+
 def ticks_of(stream):
     return np.frombuffer(stream[: len(stream) // 6 * 6], "<u2").reshape(-1, 3)[:, 0].astype(int)
 
@@ -42,9 +48,9 @@ def test_a_host_that_does_not_read_is_waited_for(probe):
     bench, line = probe(lockstep_ms=0)
     line.write(b"s\x01")
     stream = line.read(6000)
-    time.sleep(0.5)
+    line.wait_for(lambda: stands_still(bench.pid))
     stood = line.read(60000)
-    time.sleep(0.2)
+    line.wait_for(lambda: stands_still(bench.pid))
     ticks = ticks_of(stream + stood + line.read(120000))
     assert ticks.size == 31000
     assert np.array_equal(np.diff(ticks) % 65536, np.ones(ticks.size - 1))
