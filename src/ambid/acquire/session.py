@@ -131,15 +131,20 @@ def run(
     """
     made = _Run(device, course, taps, on_event)
     try:
+        made.forget()
         device.start(course.mode)
         made.settle(stopped)
         if made.going and course.program is not None:
             device.excite(course.program)
             made.lead_in(course.program)
         made.listen(stopped)
-    finally:
-        device.stop()
+    except BaseException:
+        with suppress(DeviceError):  # a line that is lost cannot be told to stop; what went wrong first is raised
+            device.stop()
         made.hear()
+        raise
+    device.stop()
+    made.hear()
     return made.report()
 
 

@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.acquire.causes import fault_words
 from ambid.acquire.device import Device
 from ambid.acquire.session import Course, RunReport, run
 from ambid.acquire.view import BenchView
@@ -160,8 +161,9 @@ def ended(report: RunReport, what: str) -> tuple[str, ...]:
         Empty where it is whole.
     """
     if report.fault is not None:
-        at = "" if report.fault.sample is None else f" at sample {report.fault.sample}"
-        return (f"the controller went to its safe state during {what}{at}: {report.fault.what}",)
+        return (f"the controller went to its safe state during {what}: {fault_words(report.fault)}",)
+    if report.interrupted:
+        return (f"{what} was interrupted after {report.samples} of {report.wanted} samples",)
     if report.lost:
         return (f"{report.lost} of {report.wanted} samples were lost during {what}: look at cable, baud rate and load",)
     if not report.complete:

@@ -1,0 +1,42 @@
+"""Why a controller went to its safe state, in words, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from ambid.acquire.device import DeviceEvent
+from ambid.acquire.protocol.table import table
+
+_REMEDY: Mapping[str, str] = MappingProxyType(
+    {
+        "overrun": "Lower daq.rate_hz",
+        "host_silent": "Free the machine, or raise daq.host_ms",
+        "over_current": "Excite less, look at the coil, or widen daq.trip.current if the coil bears it",
+        "out_of_gap": "Excite less, change the gains of [loop], or look at sensor and daq.trip.position",
+        "interlock": "Close the loop: cable, emergency stop",
+        "line_break": "Look at the cable",
+        "self_test": "See what the self-test names",
+        "watchdog": "Look at the supply, and at the firmware's build",
+    }
+)
+"""What to do about each cause of `messages.toml`."""
+
+
+def fault_words(fault: DeviceEvent) -> str:
+    """Write a fault for people: cause, what it means, where, and what to do.
+
+    Parameters
+    ----------
+    fault : DeviceEvent
+        Of kind ``fault``.
+
+    Returns
+    -------
+    str
+        One sentence with its remedy, without a full stop.
+    """
+    about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
+    at = "" if fault.sample is None else f" at sample {fault.sample}"
+    meaning = "" if about is None else f", {about}"
+    return f"{fault.what}{meaning}{at}. {_REMEDY.get(fault.what, 'See to the cause')}"
