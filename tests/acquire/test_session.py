@@ -1,4 +1,4 @@
-"""A run of a device: exactly what was wanted is passed on, whatever happens meanwhile, and the output is off after it."""
+"""A run of a device: exactly what was wanted is passed on, whatever happens, and the output is off after it."""
 
 import pytest
 

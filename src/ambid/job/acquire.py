@@ -53,7 +53,9 @@ class Acquired:
     recorded : Recorded or None
         The record's file; None where no sample came.
     troubles : tuple of DeviceError
-        What the recorder told; where the disk failed, the rest of the samples is not stored.
+        What the recorder told: a disk that is slow, nearly full, or failed.
+    not_stored : int
+        Samples that came and are not in the record, because the disk was too slow or failed.
     """
 
     info: DeviceInfo
@@ -62,6 +64,7 @@ class Acquired:
     counters: Counters
     recorded: Recorded | None
     troubles: tuple[DeviceError, ...]
+    not_stored: int = 0
 
 
 def acquire(
@@ -75,6 +78,7 @@ def acquire(
     every_s: float = 0.25,
     on_progress: Callable[[Progress], object] | None = None,
     on_event: Callable[[DeviceEvent], object] | None = None,
+    on_trouble: Callable[[DeviceError], object] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Acquired:
     """Record what a device samples during a course.
@@ -97,8 +101,10 @@ def acquire(
         How often `on_progress` is called, s of the device's clock.
     on_progress, on_event : callable, optional
         Told how far it is, and what the device tells.
+    on_trouble : callable, optional
+        Told at once when the disk is slow, nearly full, or fails; in the thread that sees it.
     stopped : callable, optional
-        Asked between blocks; True ends the run in an orderly way, with what came so far.
+        Asked between blocks; True ends the run in an orderly way, with what came so far. So does a disk that failed.
 
     Returns
     -------
@@ -111,9 +117,12 @@ def acquire(
         If device or disk refuse, or the line is lost; samples that came before are in the record, or in its journal.
     """
     with recording(
-        device, rig, path, course, force=force, every_s=every_s, on_progress=on_progress, on_event=on_event
-    ) as tap:
-        report = run(device, course, taps=[tap, *taps], on_event=tap.tell, stopped=stopped)
+        device, rig, path, course, force=force, every_s=every_s, on_progress=on_progress, on_event=on_event,
+        on_trouble=on_trouble,
+    ) as tap:  # fmt: skip
+        report = run(
+            device, course, taps=[tap, *taps], on_event=tap.tell, stopped=lambda: stopped() or tap.failed is not None
+        )
     return tap.acquired(report)
 
 
@@ -128,12 +137,13 @@ def recording(
     every_s: float = 0.25,
     on_progress: Callable[[Progress], object] | None = None,
     on_event: Callable[[DeviceEvent], object] | None = None,
+    on_trouble: Callable[[DeviceError], object] | None = None,
 ) -> Iterator[Recording]:
     """Record what a run passes on, whoever runs it.
 
     Parameters
     ----------
-    device, rig, path, course, force, every_s, on_progress, on_event
+    device, rig, path, course, force, every_s, on_progress, on_event, on_trouble
         As `acquire`.
 
     Yields
@@ -144,16 +154,29 @@ def recording(
     Raises
     ------
     DeviceError
-        If the record exists, or cannot be written.
+        If the record exists, or cannot be written; what goes wrong meanwhile is raised with what the record holds.
     """
     troubles: list[DeviceError] = []
+
+    def trouble(what: DeviceError) -> None:
+        troubles.append(what)
+        if on_trouble is not None:
+            on_trouble(what)
+
     recorder = Recorder(
-        path, JournalHeader.of(device.info, _text(rig)), seconds=course.seconds, force=force, on_trouble=troubles.append
+        path, JournalHeader.of(device.info, _text(rig)), seconds=course.seconds, force=force, on_trouble=trouble
     )
-    with recorder:
-        if course.program is not None:
-            recorder.event(Event(kind="excitation", what=str(course.program)))
-        yield Recording(recorder, device, course, every_s, on_progress, on_event, troubles)
+    try:
+        with recorder:
+            if course.program is not None:
+                recorder.event(Event(kind="excitation", what=str(course.program)))
+            yield Recording(recorder, device, course, every_s, on_progress, on_event, troubles)
+    except DeviceError as failure:
+        if recorder.result is None:
+            raise
+        raise DeviceError(
+            f"{failure}; {path} holds the {recorder.result.survey.samples} samples before it"
+        ) from failure
 
 
 def _text(rig: Rig) -> str:
@@ -198,6 +221,11 @@ class Recording:
         self._on_progress, self._on_event = on_progress, on_event
         self._every, self._wanted = max(1, round(every_s * rate_hz)), round(course.seconds * rate_hz)
         self._samples = self._told = 0
+
+    @property
+    def failed(self) -> DeviceError | None:
+        """Why nothing more is stored; None as long as all is well."""
+        return self._recorder.failed
 
     def take(self, frame: Frame) -> None:
         """Take a block.
@@ -253,4 +281,5 @@ class Recording:
             counters=self._device.counters(),
             recorded=self._recorder.result,
             troubles=tuple(self._troubles),
+            not_stored=self._recorder.lost_samples,
         )

@@ -17,10 +17,11 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.acquire.causes import fault_words
 from ambid.acquire.device import Device, DeviceEvent
 from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.acquire.view import BenchView
-from ambid.errors import DeviceError
+from ambid.errors import AmbidError, DeviceError
 from ambid.identify.estimate import Estimate
 from ambid.job.bench_rows import BenchRows
 from ambid.job.follow import Flag, follow
@@ -73,9 +74,11 @@ def track_live(
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
+    on_trouble: Callable[[AmbidError], object] | None = None,
     on_header: Callable[[TrackHeader], None] | None = None,
     on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
     keep: bool = True,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> LiveTrack:
     """Let a device do a course, and follow the physical parameters of its bench meanwhile.
 
@@ -99,6 +102,11 @@ def track_live(
         Told of the device's events, in the thread of the run.
     on_run : callable, optional
         Given what came of the run, also where tracking was interrupted.
+    on_trouble : callable, optional
+        Told why tracking cannot go on. The run does, to its end, where others listen: a recorder is not cut off by a
+        tracker. The error is raised after it.
+    stopped : callable, optional
+        Asked between blocks, in the thread of the run; True ends the run in an orderly way.
 
     Returns
     -------
@@ -112,13 +120,19 @@ def track_live(
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
+    wanted_s = _wanted_s(start, start_s, view.rate_hz)
+    if course.seconds <= wanted_s:
+        raise DeviceError(
+            f"tracking wants {wanted_s:g} s to begin with, and the run has {course.seconds:g} s. Run longer"
+            + ("" if start is not None else ", or give a start")
+        )
     slots = max(64, ceil(4.0 * _QUEUE_S * view.rate_hz / _BLOCK_SAMPLES))
     with BlockRing.create(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
-        runner = _Runner(device, course, [_RingTap(ring, view), *taps], on_event, on_run, ring)
+        ring_tap = _RingTap(ring, view, waits=device.info.kind != "serial")
+        runner = _Runner(device, course, ring_tap, taps, on_event, on_run, on_trouble, stopped, ring)
         with runner:
-            wanted_s = _wanted_s(start, start_s, view.rate_hz)
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
             begin = start_of(
                 lead.source, rig, given=start, start_s=None if start is not None else wanted_s, rig_speaks=True
@@ -137,16 +151,23 @@ def _wanted_s(start: object, start_s: float | None, rate_hz: float) -> float:
 
 
 class _RingTap:
-    """Puts what a device samples into the ring, seen through the rig, numbered from its first sample."""
+    """Puts what a device samples into the ring, seen through the rig, numbered from its first sample.
 
-    def __init__(self, ring: BlockRing, view: BenchView) -> None:
-        self._ring, self._view = ring, view
+    A bench of this world waits for nobody: blocks that find the ring full are counted. One that is only played runs
+    ahead of the tracker, and is held up instead.
+    """
+
+    def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
+        self._ring, self._view, self._waits = ring, view, waits
         self._origin: int | None = None
+        self.over = Signal()  # nobody reads the ring any more
 
     def take(self, frame: Frame) -> None:
         block = self._view.block(frame.block)
         if self._origin is None:
             self._origin = block.first
+        while self._waits and not self.over.is_set() and not self._ring.wait_for_room(_LOOK_S):
+            pass
         self._ring.put(replace(block, first=block.first - self._origin), frame.arrived_s)
 
 
@@ -157,13 +178,17 @@ class _Runner:
         self,
         device: Device,
         course: Course,
+        ring_tap: _RingTap,
         taps: Sequence[Tap],
         on_event: Callable[[DeviceEvent], object] | None,
         on_run: Callable[[RunReport], object] | None,
+        on_trouble: Callable[[AmbidError], object] | None,
+        stopped: Callable[[], bool],
         ring: BlockRing,
     ) -> None:
-        self._job = (device, course, taps, on_event)
-        self._on_run = on_run
+        self._job = (device, course, (ring_tap, *taps), on_event)
+        self._ring_tap = ring_tap
+        self._on_run, self._on_trouble, self._stopped = on_run, on_trouble, stopped
         self._ring, self._stop = ring, Signal()
         self._report: RunReport | None = None
         self._failure: BaseException | None = None
@@ -174,11 +199,20 @@ class _Runner:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        if self._on_run is not None and self._report is not None:
-            self._on_run(self._report)
-            self._on_run = None
+        _, _, taps, _ = self._job
+        self._ring_tap.over.set()
+        try:
+            if isinstance(error, AmbidError) and len(taps) > 1 and self._thread.is_alive():
+                if self._on_trouble is not None:
+                    self._on_trouble(error)
+                while self._thread.is_alive():  # a wait that Ctrl-C can end
+                    self._thread.join(_LOOK_S)
+        finally:
+            self._stop.set()
+            self._thread.join()
+            if self._on_run is not None and self._report is not None:
+                self._on_run(self._report)
+                self._on_run = None
 
     def report(self) -> RunReport:
         """Return what came of the run; raise what ended it."""
@@ -190,7 +224,9 @@ class _Runner:
     def _run(self) -> None:
         device, course, taps, on_event = self._job
         try:
-            self._report = run(device, course, taps=taps, on_event=on_event, stopped=self._stop.is_set)
+            self._report = run(
+                device, course, taps=taps, on_event=on_event, stopped=lambda: self._stop.is_set() or self._stopped()
+            )
         except BaseException as failure:
             self._failure = failure
         finally:
@@ -241,7 +277,7 @@ class _Lead:
     def _too_short(self, runner: _Runner, wanted_s: float, rate_hz: float) -> None:
         runner.__exit__(None, None, None)
         report = runner.report()
-        why = "" if report.fault is None else f" ({report.fault.what})"
+        why = "" if report.fault is None else f" ({fault_words(report.fault)})"
         raise DeviceError(
             f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin"
             " with. Run longer, or see to what ended it"
