@@ -1,7 +1,6 @@
 """The firmware's own binary on the emulated bench: self-test, flow, levitation, and the safe state within 2 ms."""
 
 import binascii
-import math
 import subprocess
 
 import pytest
@@ -106,7 +105,8 @@ def test_the_unstable_rotor_is_held(bench):
     host.done("start", mode=3)
     host.flow(1000)
     quiet = [s.values[0] for s in host.samples[600:1000]]
-    assert max(abs(x - 512) for x in quiet) < 10
+    assert abs(sum(quiet) / len(quiet) - 512) < 5
+    assert max(abs(x - 512) for x in quiet) < 60  # of 410 counts to either stop
     host.done("excite", on=1)
     host.flow(3000)
     played = [s.values[4] for s in host.samples if s.values[4]]
@@ -142,14 +142,14 @@ def test_safe_state_within_two_milliseconds(bench, period, event, cause):
 
 
 def test_silent_host(bench):
-    emulator, host = bench(script="+0.05 lockstep 0\n+0.05 cable cut\n+0.5 cable mend\n")
-    host.make_ready(limits={"position_low": 60, "host_ms": 40})
+    emulator, host = bench(script="+0.05 lockstep 0\n+0.05 cable cut\n+1.0 cable mend\n")
+    host.make_ready(limits={"position_low": 60, "host_ms": 250})
     host.done("start", mode=2)
     host.wait(lambda: host.samples and host.samples[-1]["state"] & 15 == FAULT)
     assert host.samples[-1]["state"] >> 4 == SILENT
     up, down = (e["t"] for e in emulator.events("enable"))
-    assert math.isclose(down - up, 0.09, abs_tol=0.04)
-    assert down < up + 0.05 + 0.040 + 0.002
+    # Its last frame came at most 100 ms, for which emulated time waits, before the cut, and at the latest with it.
+    assert 0.05 + 0.250 - 0.1 < down - up < 0.05 + 0.250 + 0.002
 
 
 HANG = """

@@ -51,13 +51,19 @@ class Stand:
     ticks: int
 
 
+_BUILT = {}
+
+
 def build(compiler, folder):
-    """Build the console; returns its path."""
+    """Build the console, once for all tests of a process; returns its path."""
+    if compiler in _BUILT:
+        return _BUILT[compiler]
     program = folder / "console"
     sources = [str(p) for p in sorted(FIRMWARE.glob("*.c")) if p.name != "main.c"]
     sources += [str(p) for p in sorted(HERE.glob("*.c"))]
     paths = [f"-I{FIRMWARE}", f"-I{HERE}"]
     subprocess.run([compiler, *FLAGS, *SANITIZERS, *paths, "-o", str(program), *sources], check=True)
+    _BUILT[compiler] = program
     return program
 
 
