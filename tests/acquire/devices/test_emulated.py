@@ -2,12 +2,16 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ambid.acquire.device import Program
 from ambid.acquire.devices.emulated import EmulatedDevice
+from ambid.acquire.devices.simulated import SimulatedDevice
+from ambid.acquire.program import program
 from ambid.errors import DeviceError
 from ambid.rig import load_rig
 from tests.acquire.devices.bare import bare_rig
@@ -67,6 +71,41 @@ def test_a_line_that_damages_frames_is_counted_and_survived():
         assert 5 < c.lost <= 2 * c.damaged + 1  # a zero that is damaged joins two frames
         assert c.samples + c.lost >= 6000
         assert device.state == "idle"
+
+
+def test_the_simulated_bench_moves_as_the_emulated_one():
+    spread = []
+    for device in (EmulatedDevice(PROTOTYPE, seed=2), SimulatedDevice(PROTOTYPE, seed=2)):
+        with device:
+            device.start("levitate")
+            device.read(60.0)
+            device.excite(program("prbs", amplitude_v=1.5, rate_hz=2000.0, seconds=4.0))
+            blocks = []
+            while sum(map(len, blocks)) < 10_000:
+                blocks.append(device.read(60.0).block.values)
+        spread.append(np.concatenate(blocks)[2000:].std(axis=0))
+    np.testing.assert_allclose(spread[0], spread[1], rtol=0.08)  # position, current, pulse width, excitation
+
+
+def test_emulated_time_waits_for_its_reader():
+    with EmulatedDevice(PROTOTYPE) as device:
+        device.start("levitate")
+        frame = device.read(60.0)
+        last = -1
+        while device.counters().samples != last:  # until nothing more comes: nobody reads
+            last = device.counters().samples
+            time.sleep(0.5)
+        assert 500 < last < 2000
+        device.excite(Program(kind="step", amplitude=0.9, hold=10, length=2))  # commands get through all the same
+        n = len(frame.block.values)
+        while n < 6000:
+            frame = device.read(60.0)
+            assert frame is not None, (device.state, device.events())
+            n += len(frame.block.values)
+        assert device.state == "levitating"
+        assert np.abs(frame.block.values[:, 3]).max() == 30
+        device.stop()
+        assert device.counters().lost == device.counters().overruns == 0
 
 
 def test_an_emulator_that_dies_is_a_lost_line():

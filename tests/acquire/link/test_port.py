@@ -79,6 +79,27 @@ def test_bytes_from_before_are_discarded_and_a_pulled_cable_is_an_os_error():
     port.close()
 
 
+def test_a_board_that_resets_when_its_port_is_opened_is_waited_for_in_silence(monkeypatch):
+    board = PtyBoard(FakeController())
+    slept = []
+
+    def sleep(seconds):
+        if not slept:
+            os.write(board.master, b"boot loader noise")
+        slept.append(seconds)
+
+    monkeypatch.setattr(ports.time, "sleep", sleep)
+    port = open_port(board.port, baud=1_000_000, boot_s=0.01)
+    monkeypatch.undo()
+    assert slept
+    assert port.read() == b""
+    with pytest.raises(BlockingIOError):
+        os.read(board.master, 1)  # nothing was said to the boot loader
+    port.close()
+    board.thread.start()
+    board.pull()
+
+
 def test_a_closed_port_raises_what_a_lost_one_does():
     with PtyBoard(FakeController()) as board:
         port = open_port(board.port, baud=1_000_000)

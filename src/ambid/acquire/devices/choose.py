@@ -19,7 +19,7 @@ def open_device(
     rig: Rig,
     *,
     bench: Preset | Rig | None = None,
-    pace: Pace | None = None,
+    pace: Pace = "fastest",
     seed: int = 0,
     script: Path | None = None,
 ) -> Device:
@@ -32,9 +32,9 @@ def open_device(
     rig : Rig
         Of the bench.
     bench : Preset or Rig, optional
-        The plant behind what is emulated or simulated; default what the rig's ``daq.bench`` names, or its own values.
-    pace : {"real", "fastest"}, optional
-        Of what is no hardware; default as fast as possible, a replay in real time.
+        The truth behind what is emulated or simulated; default what daq.bench names, else the rig's own numbers.
+    pace : {"fastest", "real"}
+        Of what is no hardware, which has its own.
     seed : int
         Of the noise of what is emulated or simulated.
     script : Path, optional
@@ -53,25 +53,23 @@ def open_device(
         If the rig does not say what the device needs.
     """
     if script is not None and port != "emulated":
-        raise DeviceError(f"a script is for --port emulated; {port!r} has none. Leave it out")
+        raise DeviceError(f"a script is for port emulated; {port!r} has none. Leave it out")
     if bench is not None and port not in ("emulated", "simulated"):
-        raise DeviceError(f"a bench is chosen for --port emulated or simulated; {port!r} has its own. Leave it out")
+        raise DeviceError(
+            f"a bench is chosen for ports emulated and simulated; behind {port!r} stands its own. Leave it out"
+        )
     if port == "emulated":
         from ambid.acquire.devices.emulated import EmulatedDevice
 
-        return EmulatedDevice(rig, bench=bench, pace=pace or "fastest", seed=seed, script=script)
+        return EmulatedDevice(rig, bench=bench, pace=pace, seed=seed, script=script)
     if port == "simulated":
         from ambid.acquire.devices.simulated import SimulatedDevice
 
-        return SimulatedDevice(rig, bench=bench, pace=pace or "fastest", seed=seed)
+        return SimulatedDevice(rig, bench=bench, pace=pace, seed=seed)
     if port.startswith(REPLAY):
         from ambid.acquire.devices.replay import ReplayDevice
 
-        return ReplayDevice(port.removeprefix(REPLAY), rig, pace=pace or "real")
-    if pace is not None:
-        raise DeviceError(
-            f"port {port} has its own pace; one is chosen for emulated, simulated or replay. Leave it out"
-        )
+        return ReplayDevice(port.removeprefix(REPLAY), rig, pace=pace)
     from ambid.acquire.devices.serial_device import SerialDevice
 
     return SerialDevice(port, rig)

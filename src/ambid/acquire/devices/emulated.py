@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from ambid.acquire.default_daq import with_default_daq
@@ -18,12 +20,38 @@ from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 
 _ANSWER_S = 2.0  # a busy machine may hold the emulator up
+_UNREAD_S = 0.25  # of the controller's time
+_LOOK_S = 0.001
+
+
+class _WaitingPort:
+    """A port from which nothing is taken while nobody wants it."""
+
+    def __init__(self, port: Port, paused: Callable[[], bool]) -> None:
+        self._port, self._paused = port, paused
+
+    @property
+    def name(self) -> str:
+        return self._port.name
+
+    def read(self) -> bytes:
+        if self._paused():
+            time.sleep(_LOOK_S)
+            return b""
+        return self._port.read()
+
+    def write(self, data: bytes) -> None:
+        self._port.write(data)
+
+    def close(self) -> None:
+        self._port.close()
 
 
 class EmulatedDevice(LineDevice):
     """The firmware in an emulated controller. Everything but the copper is real: binary, converter, line, protocol.
 
-    As fast as possible, its time is not the host's: it waits for a host that says nothing, and no drift is told.
+    As fast as possible, its time is not the host's: it waits for a host that says nothing, and for a reader who left a
+    quarter of a second unread, and no drift is told.
 
     Parameters
     ----------
@@ -94,7 +122,14 @@ class EmulatedDevice(LineDevice):
             trajectory=self._trajectory,
         )
         self._emulator.start()
-        return open_port(self._emulator.port, baud=self._baud, boot_s=0.0)
+        port = open_port(self._emulator.port, baud=self._baud, boot_s=0.0)
+        return port if self._real else _WaitingPort(port, self._paused)
+
+    def _paused(self) -> bool:
+        # Bytes that are not taken hold the emulator up. An answer that is waited for may stand behind them.
+        controller = self._controller
+        full = self._stream.frames.held > _UNREAD_S * self._info.rate_hz
+        return not self._real and full and controller is not None and not controller.asking
 
     @property
     def _baud(self) -> int:

@@ -109,6 +109,11 @@ class FrameQueue:
             return None
 
     @property
+    def held(self) -> int:
+        """Samples that wait."""
+        return self._held
+
+    @property
     def ended(self) -> bool:
         """Whether all was read and nothing more will come."""
         with self._changed:

@@ -82,6 +82,10 @@ class LineDevice(ABC):
     def _open(self) -> Port:
         """Return the open port."""
 
+    def _paused(self) -> bool:
+        """Whether the controller's time stands still."""
+        return False
+
     def _let_go(self) -> None:  # noqa: B027 - most lines have nothing behind the port
         """End whatever stands behind the port."""
 
@@ -102,7 +106,12 @@ class LineDevice(ABC):
         try:
             port = self._open()
             self._controller = Controller(
-                port, samples=self._heard, told=self._told, lost=self._lost, answer_s=self._answer_s
+                port,
+                samples=self._heard,
+                told=self._told,
+                lost=self._lost,
+                paused=self._paused,
+                answer_s=self._answer_s,
             )
             self._prepare(self._controller, port.name)
         except BaseException:
@@ -243,21 +252,7 @@ class LineDevice(ABC):
 
     def counters(self) -> Counters:
         """Return what was counted so far."""
-        c = self._controller
-        if c is None:
-            return self._last
-        line, kept, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
-        return Counters(
-            samples=kept.samples - frames.overrun_samples,
-            lost=kept.lost + frames.overrun_samples,
-            damaged=line.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0],
-            discarded_bytes=line.discarded_bytes + c.overrun_bytes - self._before[1],
-            overruns=frames.overruns + c.overruns,
-            resent=c.resent,
-            controller=MappingProxyType(dict(self._status)),
-            drift=drift.drift,
-            drift_sd=drift.drift_sd,
-        )
+        return self._last if self._controller is None else self._counted(self._controller)
 
     def stop(self) -> None:
         """Output off, no more samples; those on their way can still be read.
@@ -350,14 +345,26 @@ class LineDevice(ABC):
         self._before = (line.damaged + controller.odd, line.discarded_bytes)
         self._stream.live = True
 
+    def _counted(self, c: Controller) -> Counters:
+        line, kept, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
+        return Counters(
+            samples=kept.samples - frames.overrun_samples,
+            lost=kept.lost + frames.overrun_samples,
+            damaged=line.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0],
+            discarded_bytes=line.discarded_bytes + c.overrun_bytes - self._before[1],
+            overruns=frames.overruns + c.overruns,
+            resent=c.resent,
+            controller=MappingProxyType(dict(self._status)),
+            drift=drift.drift,
+            drift_sd=drift.drift_sd,
+        )
+
     def _end(self) -> None:
         controller, self._controller = self._controller, None
         try:
             if controller is not None:
                 controller.close()
                 self._stream.frames.end()
-                self._controller = controller
-                self._last = self.counters()
-                self._controller = None
+                self._last = self._counted(controller)
         finally:
             self._let_go()

@@ -49,6 +49,8 @@ class Controller:
         Given messages that nobody asked for, and statuses, from the listener's thread.
     lost : callable
         Given the error, once, when the line is lost, from whichever thread sees it.
+    paused : callable
+        Tells whether the controller's time stands still: then it is not pinged.
     answer_s : float
         How long to wait for an answer before a command is sent again, s.
     tries : int
@@ -69,11 +71,12 @@ class Controller:
         samples: Callable[[list[bytes], float], None],
         told: Callable[[Message], None],
         lost: Callable[[DeviceError], None],
+        paused: Callable[[], bool] = lambda: False,
         answer_s: float = 0.3,
         tries: int = 5,
     ) -> None:
         self._port, self._samples, self._told, self._lost = port, samples, told, lost
-        self._answer_s, self._tries = answer_s, tries
+        self._answer_s, self._tries, self._paused = answer_s, tries, paused
         self._id = 0
         self.resent = self.odd = 0
         self._failure: DeviceError | None = None
@@ -105,6 +108,11 @@ class Controller:
     def overrun_bytes(self) -> int:
         """Bytes in them."""
         return self._listener.overruns[1]
+
+    @property
+    def asking(self) -> bool:
+        """Whether an answer is waited for."""
+        return bool(self._waiting)
 
     @property
     def failure(self) -> DeviceError | None:
@@ -239,7 +247,8 @@ class Controller:
                 self._unpinged = 0
                 silent = time.monotonic() - self._heard_s > _SILENT_S
             # A controller that was reset still answers pings: only its status tells.
-            self._send(encode(message("ask_status" if silent else "ping", id=self._next_id())))
+            if not self._paused():
+                self._send(encode(message("ask_status" if silent else "ping", id=self._next_id())))
             due = time.monotonic() + _PING_S
 
     def _ping_is_due(self) -> bool:
