@@ -84,7 +84,8 @@ def test_the_simulated_bench_moves_as_the_emulated_one():
             while sum(map(len, blocks)) < 10_000:
                 blocks.append(device.read(60.0).block.values)
         spread.append(np.concatenate(blocks)[2000:].std(axis=0))
-    np.testing.assert_allclose(spread[0], spread[1], rtol=0.08)  # position, current, pulse width, excitation
+    # Position, current, pulse width, excitation; much of what moves the rotor is noise, other noise in each.
+    assert (np.abs(spread[0] / spread[1] - 1.0) < [0.25, 0.12, 0.03, 0.001]).all()
 
 
 def test_emulated_time_waits_for_its_reader():
