@@ -28,10 +28,10 @@
 #ifndef CAP_CURRENT_HIGH
 #define CAP_CURRENT_HIGH BOARD_ADC_TOP
 #endif
-/* Periods of a tick with which the output may be on: from 1 kHz, below which a fault would be seen too late, to 2.86 kHz,
+/* Periods of a tick with which the output may be on: from 1 kHz, below which a fault would be seen too late, to 2.5 kHz,
  * at which a tick's work is done in time even while commands fill the line. */
 #define CAP_OUTPUT_PERIOD 20
-#define CAP_OUTPUT_FASTEST 7
+#define CAP_OUTPUT_FASTEST 8
 #define HOST_MS_LEAST 20
 #define HOST_MS_MOST 2000
 #define LIFT_MS_MOST 2000

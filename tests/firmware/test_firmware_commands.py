@@ -149,7 +149,7 @@ def test_elements_of_the_table(console):
 
 @pytest.mark.parametrize(
     ("period", "mode", "wanted"),
-    [(21, 2, RANGE), (21, 3, RANGE), (21, 1, DONE), (20, 3, DONE), (7, 2, DONE), (6, 3, RANGE), (5, 1, DONE)],
+    [(21, 2, RANGE), (21, 3, RANGE), (21, 1, DONE), (20, 3, DONE), (8, 2, DONE), (7, 3, RANGE), (5, 1, DONE)],
 )
 def test_output_only_at_rates_that_are_safe(console, period, mode, wanted):
     lines = console([*ready(period=period), command("start", 9, mode=mode)])

@@ -119,7 +119,7 @@ def test_the_unstable_rotor_is_held(bench):
     assert [e["level"] for e in emulator.events("enable")] == [1, 0]
 
 
-@pytest.mark.parametrize("period", [20, 11, 10, 7])
+@pytest.mark.parametrize("period", [20, 11, 10, 8])
 @pytest.mark.parametrize(
     ("event", "cause"),
     [
