@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from ambid.cli import INTERRUPTED
+from ambid.cli.acquire_wish import Wish, start_of_track, told
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, course_mode, opened
 from ambid.cli.interrupts import Stop, signals
 from ambid.cli.options import FAILED_CHECK, band_of, json_path
@@ -20,11 +18,10 @@ from ambid.cli.watch import watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquire.device import Device, Mode, Program
-    from ambid.acquire.session import Course, RunReport
+    from ambid.acquire.device import Device, Program
+    from ambid.acquire.session import Course
     from ambid.cli.watch import Watch
     from ambid.job.acquire import Acquired, Progress
-    from ambid.rig import Rig
 
 _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
 _TRIAL_S = 2.0  # of each trial of an amplitude
@@ -107,72 +104,39 @@ def command(
     """
     from ambid.rig import load_rig
 
-    _check(seconds, amplitude, settle)
-    _check_track(track, json)
-    start = None if track in (None, "auto") else Path(str(track))
+    if json is not None and track is None:
+        raise AmbidError("--json writes a track, and none is wanted. Give --track too, or leave it out")
     wanted_band = band_of(band)
-    with Outputs(rig, start) as outputs:
+    with Outputs(rig, None if track in (None, "auto") else Path(str(track))) as outputs:
         outputs.claim(record, "-o", _ENDINGS)
         outputs.claim(json_path(json), "--json")
     known = load_rig(rig)
     chosen = course_mode(known, mode, excitation)
-    wish = _Wish(
+    wish = Wish(
         port=port, rig=known, record=record, mode=chosen, seconds=seconds, name=excitation, amplitude=amplitude,
         settle_s=(1.0 if chosen == "levitate" else 0.0) if settle is None else settle, band=wanted_band, seed=seed,
         force=force,
     )  # fmt: skip
-    stop, follow = Stop(), track is not None
-    with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
-        course = _course(wish, device, stop, watch)
-        if follow:
-            done, ending = _followed(wish, device, course, start, json, live=not quiet)
-        else:
-            done, ending = _record(wish, device, course, stop, watch), None
-    if done.recorded is None and done.run.fault is None and stop.number is None:
-        raise AmbidError(f"{port}: no sample came. Look at cable and supply")
-    if done.recorded is not None and json != "-":
-        from ambid.report.acquire_text import acquired_text
+    start, stop = start_of_track(track), Stop()
+    try:
+        with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
+            course = _course(wish, device, stop, watch)
+            if track is None:
+                done, track_end = _record(wish, device, course, stop, watch), None
+            else:
+                from ambid.cli.acquire_track import followed
 
-        typer.echo(acquired_text(done, record, paint=painter()))
-    if ending is not None:
-        ending()
+                done, track_end = followed(wish, device, course, start, json, stop, live=not quiet)
+    except KeyboardInterrupt:
+        typer.echo(f"ambid: interrupted{_left(record)}", err=True)
+        raise typer.Exit(stop.code or INTERRUPTED) from None
+    _tell(done, wish, table=json != "-")
+    if track_end is not None:
+        track_end()
     _finish(done, wish, stop, strict=strict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Wish:
-    """What the user asks for, checked."""
-
-    port: str
-    rig: Rig
-    record: Path
-    mode: Mode
-    seconds: float
-    settle_s: float
-    name: str | None
-    amplitude: float | None
-    band: tuple[float, float] | None
-    seed: int
-    force: bool
-
-
-def _check(seconds: float, amplitude: float | None, settle: float | None) -> None:
-    for option, x, zero in (
-        ("--seconds", seconds, False),
-        ("--amplitude", amplitude, False),
-        ("--settle", settle, True),
-    ):
-        if x is not None and not (math.isfinite(x) and (x > 0 or (zero and x == 0))):
-            raise AmbidError(f"{option} is {x:g}; it must be a {'number, 0 or more' if zero else 'positive number'}."
-                             " Correct it")  # fmt: skip
-
-
-def _check_track(track: str | None, json: str | None) -> None:
-    if json is not None and track is None:
-        raise AmbidError("--json writes a track, and none is wanted. Give --track too, or leave it out")
-
-
-def _course(wish: _Wish, device: Device, stop: Stop, watch: Watch) -> Course:
+def _course(wish: Wish, device: Device, stop: Stop, watch: Watch) -> Course:
     """Say what the device is to do; find the amplitude of its excitation where none is given."""
     from ambid.acquire.session import Course
 
@@ -181,82 +145,104 @@ def _course(wish: _Wish, device: Device, stop: Stop, watch: Watch) -> Course:
     )
 
 
-def _wave(wish: _Wish, device: Device, stop: Stop, watch: Watch) -> Program | None:
+def _wave(wish: Wish, device: Device, stop: Stop, watch: Watch) -> Program | None:
     if wish.name is None:
-        for option, x in (("--amplitude", wish.amplitude), ("--band", wish.band)):
-            if x is not None:
-                raise AmbidError(f"{option} is of an excitation, and none is named. Give --excitation, or leave it out")
         return None
-    if wish.mode == "sample":
-        raise AmbidError("--mode sample has its output off: nothing can be excited. Leave --excitation out, or drive")
+    if wish.amplitude is not None:
+        return _played(wish, device, wish.amplitude, wish.seconds)
+    _played(wish, device, 1.0, wish.seconds)  # so that what cannot be played is refused before anything moves
+    return _played(wish, device, _found_amplitude(wish, device, stop, watch), wish.seconds)
+
+
+def _played(wish: Wish, device: Device, amplitude_v: float, seconds: float) -> Program:
     from ambid.acquire.program import program
+
+    return program(
+        str(wish.name), amplitude_v=amplitude_v, band=wish.band, rate_hz=device.info.rate_hz, seconds=seconds,
+        seed=wish.seed,
+    )  # fmt: skip
+
+
+def _found_amplitude(wish: Wish, device: Device, stop: Stop, watch: Watch) -> float:
+    """Try small excitations first, and say which one was taken."""
     from ambid.job.amplitude import Trial, fitting_amplitude
 
-    rate_hz, amplitude = device.info.rate_hz, wish.amplitude
-    if amplitude is None:
-        watch.show("amplitude", 0.0, "trials, small first")
-        trial = Trial(
-            name=wish.name, band=wish.band, mode=wish.mode, settle_s=wish.settle_s, seconds=_TRIAL_S, seed=wish.seed
-        )
-        amplitude = fitting_amplitude(device, wish.rig, trial, stopped=stop.wished)
-    return program(
-        wish.name, amplitude_v=amplitude, band=wish.band, rate_hz=rate_hz, seconds=wish.seconds, seed=wish.seed
-    )
+    watch.show("amplitude", 0.0, "trials, small first")
+    trial = Trial(
+        name=str(wish.name), band=wish.band, mode=wish.mode, settle_s=wish.settle_s, seconds=_trial_s(wish, device),
+        seed=wish.seed,
+    )  # fmt: skip
+    try:
+        found = fitting_amplitude(device, wish.rig, trial, stopped=stop.wished)
+    except AmbidError:
+        if stop.wished():
+            raise KeyboardInterrupt from None
+        raise
+    watch.clear()
+    typer.echo(f"ambid: note: amplitude {found:.3g} V, found by trials", err=True)
+    return found
 
 
-def _record(wish: _Wish, device: Device, course: Course, stop: Stop, watch: Watch) -> Acquired:
+def _trial_s(wish: Wish, device: Device) -> float:
+    """Return the length of a trial, s: short, but an excitation of slow periods takes the whole record's."""
+    try:
+        _played(wish, device, 1.0, _TRIAL_S)
+    except AmbidError:
+        return wish.seconds
+    return _TRIAL_S
+
+
+def _record(wish: Wish, device: Device, course: Course, stop: Stop, watch: Watch) -> Acquired:
     from ambid.job.acquire import acquire
     from ambid.report.acquire_text import progress_line
 
     def show(now: Progress) -> None:
         watch.show("record", now.samples / max(now.wanted, 1), progress_line(now))
 
-    return acquire(device, wish.rig, wish.record, course, force=wish.force, on_progress=show, stopped=stop.wished)
+    return acquire(
+        device, wish.rig, wish.record, course, force=wish.force, on_progress=show, on_trouble=told,
+        stopped=stop.wished,
+    )  # fmt: skip
 
 
-def _followed(
-    wish: _Wish, device: Device, course: Course, start: Path | None, json: str | None, *, live: bool
-) -> tuple[Acquired, Callable[[], None]]:
-    """Record, and track what is recorded; the second value prints the track and ends with its exit code."""
-    from ambid.cli.live import Follower
-    from ambid.cli.track import finish
-    from ambid.job.acquire import recording
-    from ambid.job.track_live import track_live
-    from ambid.track.lines_json import TrackWriter
+def _tell(done: Acquired, wish: Wish, *, table: bool) -> None:
+    """Say what was recorded; where standard output is of the track, only what is not good of it."""
+    if done.recorded is None:
+        return
+    if table:
+        from ambid.report.acquire_text import acquired_text
 
-    path = json_path(json)
-    writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None
-    shown = live and sys.stderr.isatty() and not (json == "-" and sys.stdout.isatty())
-    follower = Follower(writer, keep=False, live=shown, real_time=device.info.kind == "serial")
-    runs: list[RunReport] = []
-    with recording(device, wish.rig, wish.record, course, force=wish.force) as tap:
-        summary = follower.run(
-            lambda: track_live(
-                device, wish.rig, course, start=start, taps=[tap], on_event=tap.tell, on_run=runs.append,
-                on_header=follower.on_header, on_line=follower.on_line, keep=False,
-            ).track
-        )  # fmt: skip
-    if not runs:
-        raise AmbidError(f"{wish.port}: the run ended before it began; {wish.record} may hold what came. Start again")
-    written = [str(p) for p in (path,) if p]
-
-    def ending() -> None:
-        finish(follower, summary, written, table=json != "-", strict=False, flags=())
-
-    return tap.acquired(runs[0]), ending
+        typer.echo(acquired_text(done, wish.record, paint=painter()))
+    else:
+        for line in done.quality.verdict:
+            typer.echo(f"ambid: note: {line}", err=True)
 
 
-def _finish(done: Acquired, wish: _Wish, stop: Stop, *, strict: bool) -> None:
+def _finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
     """Tell what ended the run early, and end with the exit code."""
-    kept = f"{wish.record} holds the {done.run.samples} samples before it" if done.recorded else "nothing was recorded"
+    stored = done.run.samples - done.not_stored
+    kept = f"{wish.record} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
     if done.run.fault is not None:
-        raise AmbidError(
-            f"{wish.port}: the controller went to its safe state: {done.run.fault.what}; {kept}. See to the cause"
-        )
-    if done.troubles:
-        raise AmbidError(str(done.troubles[0]))
+        from ambid.acquire.causes import fault_words
+
+        raise AmbidError(f"{wish.port}: the controller went to its safe state: {fault_words(done.run.fault)}; {kept}")
+    if done.not_stored:
+        why = str(done.troubles[0]) if done.troubles else "the disk took too long"
+        raise AmbidError(f"{done.not_stored} samples are not in {wish.record}: {why}")
     if stop.number is not None:
         typer.echo(f"ambid: interrupted; {kept}", err=True)
         raise typer.Exit(stop.code)
-    if strict and (done.run.lost or done.quality.verdict):
+    if done.recorded is None:
+        raise AmbidError(f"{wish.port}: no sample came. Look at cable and supply")
+    if not done.run.complete and not done.run.lost:
+        typer.echo(f"ambid: note: {wish.port} ended after {done.run.samples} of {done.run.wanted} samples", err=True)
+    if strict and (not done.run.complete or done.quality.verdict):
         raise typer.Exit(FAILED_CHECK)
+
+
+def _left(record: Path) -> str:
+    """Say where what was recorded is, after a second signal tore the run off."""
+    from ambid.acquire.recorder.header import journal_path
+
+    journal = journal_path(record)
+    return f"; get what came with 'ambid recover {journal}'" if journal.exists() else "; nothing was recorded"

@@ -244,6 +244,7 @@ class Follower:
     def _signalled(self, number: int) -> None:
         """Stop after the present line; at once where there is none yet, or when asked a second time."""
         if self.header is None or self._stop is not None:
+            self.code = 128 + number
             raise KeyboardInterrupt
         self._stop = 128 + number
 

@@ -74,10 +74,10 @@ def track_live(
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
-    on_trouble: Callable[[AmbidError], object] | None = None,
     on_header: Callable[[TrackHeader], None] | None = None,
     on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
     keep: bool = True,
+    on_trouble: Callable[[AmbidError], object] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> LiveTrack:
     """Let a device do a course, and follow the physical parameters of its bench meanwhile.
@@ -115,8 +115,10 @@ def track_live(
 
     Raises
     ------
+    DeviceError
+        If the device refuses, the line is lost, or the course is too short to begin tracking in it.
     AmbidError
-        If the device, the rig or the start break a rule.
+        If the rig or the start break a rule.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ambid.acquire.quality import ColumnQuality, QualityReport
     from ambid.acquire.session import RunReport
 
-_SHOWN = ("position", "current", "voltage")  # roles whose signal-to-noise ratio is worth a place on the line
+_SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
+_ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
 
 
 class Under(Protocol):
@@ -55,6 +56,11 @@ class Finished(Protocol):
         """Of the line."""
         ...
 
+    @property
+    def not_stored(self) -> int:
+        """Samples that came and are not in the record."""
+        ...
+
 
 def progress_line(now: Under) -> str:
     """Write how an acquisition goes: time, rate, gaps, signal-to-noise ratio, saturation.
@@ -74,7 +80,7 @@ def progress_line(now: Under) -> str:
     parts = [f"{q.seconds:.1f} s", rate, f"{q.lost} lost"]
     if now.counters.damaged:
         parts.append(f"{now.counters.damaged} damaged")
-    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in q.columns if c.role in _SHOWN[:2] and c.snr_db is not None]
+    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in q.columns if c.role in _SHOWN and c.snr_db is not None]
     saturated = max((c.saturated for c in q.columns), default=0.0)
     if saturated > 0.0:
         parts.append(f"saturated {100.0 * saturated:.1f} %")
@@ -101,11 +107,14 @@ def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Pain
         Lines without the last line's end.
     """
     q, counters = done.quality, done.counters
+    stored = done.run.samples - done.not_stored
+    whole = "" if stored == done.run.wanted else f" of {done.run.wanted} wanted"
     head = (
-        f"{path}: {done.run.samples} samples at {q.rate_hz:g} Hz ({done.run.samples / q.rate_hz:.4g} s) from"
+        f"{path}: {stored} samples{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from"
         f" {done.info.kind} {done.info.port}"
     )
-    lines = [*textwrap.wrap(head, width), "", *_table(q.columns, paint), ""]
+    lines = [*textwrap.wrap(head, width), "", *_table(q, paint), ""]
+    lines += [paint(line, "dim") for line in textwrap.wrap(_noise_words(q), width)]
     lines += textwrap.wrap(_line_words(done.run, counters), width)
     if q.verdict:
         lines += ["", *(paint(x, "bad") for v in q.verdict for x in textwrap.wrap(v, width, subsequent_indent="  "))]
@@ -114,6 +123,8 @@ def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Pain
 
 def _line_words(run: RunReport, counters: Counters) -> str:
     words = f"{run.lost} samples lost, {counters.damaged} frames damaged, {counters.overruns} blocks overrun"
+    if run.lost:
+        words += "; read it with --gaps"
     busy = counters.controller.get("busy_us")
     if busy is not None:
         words += f"; the controller worked {busy:.0f} us in its longest tick"
@@ -122,24 +133,39 @@ def _line_words(run: RunReport, counters: Counters) -> str:
     return words
 
 
-def _table(columns: tuple[ColumnQuality, ...], paint: Paint) -> list[str]:
-    """Write one row for each column, in its own unit."""
+def _noise_words(q: QualityReport) -> str:
+    """Say what the column of noise is: neither way of telling it knows what the sensor's own noise is."""
+    if q.columns and q.columns[0].noise_by == "periods":
+        return (
+            "noise is what does not repeat with the excitation: the sensor's, and how the bench and its loop answer to"
+            " disturbance; SNR is what repeats over it"
+        )
+    return "noise is what changes from sample to sample, at most: fast motion counts as noise too"
+
+
+def _table(q: QualityReport, paint: Paint) -> list[str]:
+    """Write one row for each column, in its own unit; SNR only where an excitation tells signal from noise."""
     rows = [("column", "mean", "rms about it", "noise", "SNR", "range used", "saturated")]
-    for c in columns:
+    for c in q.columns:
         unit = "" if c.unit == "1" else f" {c.unit}"
-        used = "-" if c.used is None else f"{100.0 * c.used:.0f} %"
-        snr = "-" if c.snr_db is None else f"{c.snr_db:.1f} dB"
+        sensed = c.role not in _ORDERED
         rows.append(
             (
                 c.name,
                 f"{c.mean:.4g}{unit}",
                 f"{c.sd:.3g}{unit}",
-                f"{c.noise_sd:.2g}{unit}",
-                snr,
-                used,
+                f"{c.noise_sd:.2g}{unit}" if sensed else "-",
+                _decibels(c) if sensed and q.excited else "-",
+                "-" if c.used is None else f"{100.0 * c.used:.0f} %",
                 f"{100.0 * c.saturated:.2g} %",
             )
         )
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
     return [paint(lines[0], "dim"), *lines[1:]]
+
+
+def _decibels(c: ColumnQuality) -> str:
+    if c.snr_db is None:
+        return "-"
+    return f"{c.snr_db:.1f} dB" if math.isfinite(c.snr_db) else "no noise"

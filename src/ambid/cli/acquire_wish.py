@@ -1,0 +1,115 @@
+"""What the user of ``ambid acquire`` asks for, and what is refused before a device is opened."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from ambid.errors import AmbidError
+
+if TYPE_CHECKING:
+    from ambid.acquire.device import Mode
+    from ambid.identify.estimate import Estimate
+    from ambid.rig import Rig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """What the user asks for; refused when it is made, where it does not go together.
+
+    Attributes
+    ----------
+    port : str
+    rig : Rig
+    record : Path
+    mode : {"sample", "drive", "levitate"}
+    seconds, settle_s : float
+        Length of the record, and time before it, s.
+    name : str or None
+        Of the excitation.
+    amplitude : float or None
+        Peak in V; None: found by trials.
+    band : (float, float) or None
+        In Hz.
+    seed : int
+    force : bool
+        Whether a record that exists may be written over.
+    """
+
+    port: str
+    rig: Rig
+    record: Path
+    mode: Mode
+    seconds: float
+    settle_s: float
+    name: str | None
+    amplitude: float | None
+    band: tuple[float, float] | None
+    seed: int
+    force: bool
+
+    def __post_init__(self) -> None:
+        """Refuse what does not go together."""
+        for option, x in (("--seconds", self.seconds), ("--amplitude", self.amplitude)):
+            if x is not None and not (math.isfinite(x) and x > 0):
+                raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
+        if not (math.isfinite(self.settle_s) and self.settle_s >= 0):
+            raise AmbidError(f"--settle is {self.settle_s:g}; it must be a number, 0 or more. Correct it")
+        if self.name is None:
+            for option, y in (("--amplitude", self.amplitude), ("--band", self.band)):
+                if y is not None:
+                    raise AmbidError(
+                        f"{option} is of an excitation, and none is named. Give --excitation, or leave it out"
+                    )
+        elif self.mode == "sample":
+            raise AmbidError(
+                "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"
+            )
+        if self.record.exists() and not self.force:
+            raise AmbidError(f"-o {self.record} exists already. Choose another name, or give --force")
+
+
+def start_of_track(track: str | None) -> Estimate | None:
+    """Read the estimate that tracking is to begin with.
+
+    Parameters
+    ----------
+    track : str or None
+        As given: None, ``auto``, or a file.
+
+    Returns
+    -------
+    Estimate or None
+        None where none is named.
+
+    Raises
+    ------
+    AmbidError
+        If it is not the file of an estimate.
+    """
+    if track in (None, "auto"):
+        return None
+    from ambid.identify.estimate import Estimate
+    from ambid.job.estimates import read_estimate
+
+    found = read_estimate(str(track))
+    if not isinstance(found, Estimate):
+        raise AmbidError(
+            f"--track {track} is a black-box fit; tracking follows physical parameters. Give an estimate of"
+            " 'ambid identify --json'"
+        )
+    return found
+
+
+def told(what: AmbidError) -> None:
+    """Say on standard error what goes wrong while a recording goes on.
+
+    Parameters
+    ----------
+    what : AmbidError
+    """
+    typer.echo(f"ambid: {what}", err=True)
