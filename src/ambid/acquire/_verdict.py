@@ -104,7 +104,8 @@ def _content(column: ColumnQuality, report: QualityReport) -> Iterator[str]:
         )
     told = report.excited and column.noise_by == "periods" and column.role != "extra"
     if told and column.snr_db is not None and column.snr_db < _SNR_DB:
+        rest = 1.0 / (1.0 + 10.0 ** (column.snr_db / 10.0))
         yield (
-            f"{column.name}: signal over noise is {column.snr_db:.0f} dB, under {_SNR_DB:.0f}: most of it does not come"
-            " from the excitation. Excite more, or in a band that the plant follows"
+            f"{column.name}: signal over noise is {column.snr_db:.0f} dB, under {_SNR_DB:.0f}: {rest:.0%} of its power"
+            " does not come from the excitation. Excite more, or in a band that the plant follows"
         )

@@ -58,7 +58,7 @@ def command(
         typer.Option(
             "--mode",
             help="Output off; excitation without feedback; position loop on the controller.",
-            show_default="levitate where the rig has a loop",
+            show_default="levitate where the rig has a loop; sample a replay",
         ),
     ] = None,
     settle: Annotated[
@@ -111,7 +111,7 @@ def command(
         outputs.claim(record, "-o", _ENDINGS)
         outputs.claim(json_path(json), "--json")
     known = load_rig(rig)
-    chosen = course_mode(known, mode, excitation)
+    chosen = course_mode(port, known, mode, excitation)
     wish = Wish(
         port=port, rig=known, record=record, mode=chosen, seconds=seconds, name=excitation, amplitude=amplitude,
         settle_s=(1.0 if chosen == "levitate" else 0.0) if settle is None else settle, band=wanted_band, seed=seed,

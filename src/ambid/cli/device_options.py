@@ -48,11 +48,13 @@ Pace = Annotated[
 Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and simulated noise.", min=0)]
 
 
-def course_mode(rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
+def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
     """Choose what a device does where the user does not say.
 
     Parameters
     ----------
+    port : str
+        See ``--port``.
     rig : Rig
         Of the device.
     mode : str or None
@@ -63,10 +65,13 @@ def course_mode(rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
     Returns
     -------
     {"sample", "drive", "levitate"}
-        Levitate where the rig has a loop and does not say ``open_loop``; else drive, if there is something to play.
+        Of a replay, sample. Levitate where the rig has a loop and does not say ``open_loop``; else drive, if there is
+        something to play.
     """
     if mode is not None:
         return mode
+    if port.startswith("replay:"):
+        return "sample"
     if rig.loop is not None and rig.loop.closed and not rig.open_loop:
         return "levitate"
     return "sample" if excitation is None else "drive"

@@ -28,7 +28,7 @@ class Room:
     Attributes
     ----------
     trips : Mapping of str to (float, float)
-        Of position and current: the controller's limits.
+        Of position and current, those of them that the bench has: the controller's limits.
     voltage : (float, float)
         Of the power stage.
     """
@@ -51,7 +51,8 @@ class Room:
             Infinite where the rig knows no limit.
         """
         unlimited = (-math.inf, math.inf)
-        trips = {role: rig.trip(role) or unlimited for role in ("position", "current")}
+        roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
+        trips = {role: rig.trip(role) or unlimited for role in roles}
         return cls(trips=MappingProxyType(trips), voltage=rig.limits.voltage if rig.limits else unlimited)
 
     def used(self, role: str, values: Array, rest: float) -> float:
