@@ -173,8 +173,8 @@ current = 1.0
     rig = bench(text=text)
     s = controller_settings(rig)
     assert (s.position_low, s.position_high, s.closed) == (0, 1023, False)
-    assert next((c.name, c.role) for c in columns(rig, s)) == ("position", "extra")
-    assert columns(rig, s, si=True)[0].unit == "1"
+    assert [c.role for c in columns(rig, s)] == ["current", "voltage", "excitation"]
+    assert [c.unit for c in columns(rig, s, si=True)] == ["A", "V", "V"]
 
 
 def test_slow_ticks_only_sample():

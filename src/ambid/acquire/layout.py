@@ -81,7 +81,7 @@ def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
 
 
 def stream_of(rig: Rig, daq: Daq) -> int:
-    """Return the stream mask: inputs, pulse width and excitation always, the rest where the rig asks for it.
+    """Return the stream mask: current, pulse width and excitation always, the rest where the rig has it.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def stream_of(rig: Rig, daq: Daq) -> int:
     int
         One bit for each of `STREAM`.
     """
-    wanted = {"position", "current", "voltage", "excitation"}
+    wanted = {"current", "voltage", "excitation"} | ({"position"} if has_position(rig) else set())
     wanted |= {"third"} if daq.third is not None else set()
     wanted |= {"reference"} & {c.role for c in rig.channels}
     return sum(1 << bit for bit, role in enumerate(STREAM) if role in wanted)
@@ -147,8 +147,6 @@ def _column(rig: Rig, settings: ControllerSettings, role: str) -> tuple[str, str
         return rig.daq.third or "third", "extra", analog
     if role == "excitation":
         return "excitation", role, (-float(PWM_TOP), float(PWM_TOP))
-    if role == "position" and not has_position(rig):
-        return "position", "extra", analog
     span = (float(settings.duty_low), float(settings.duty_high)) if role == "voltage" else analog
     return rig.channel(role).column, role, span
 
@@ -158,8 +156,6 @@ def _si_scale(rig: Rig, settings: ControllerSettings, role: str) -> Scale | None
     if role == "third":
         of = _third_role(rig)
         return scale_of(rig, of) if of is not None and rig.channel(of).calibration is not None else None
-    if role == "position" and not has_position(rig):
-        return None
     if role == "excitation":
         slope = scale_of(rig, "voltage").slope(settings.duty_bias)
         ends = np.array([0.0, float(PWM_TOP)])

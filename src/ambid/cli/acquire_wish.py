@@ -65,6 +65,8 @@ class Wish:
                     raise AmbidError(
                         f"{option} is of an excitation, and none is named. Give --excitation, or leave it out"
                     )
+        elif self.port.startswith("replay:"):
+            raise AmbidError("--excitation cannot be played to a record that is replayed. Leave it out")
         elif self.mode == "sample":
             raise AmbidError(
                 "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"

@@ -128,6 +128,11 @@ class SimulatedDevice(PlayedDevice):
             raise DeviceError(
                 f"{self._where} refuses mode 'levitate'; the rig has no loop with a gain. Give the rig a [loop]"
             )
+        if mode != "sample" and not self._settings.drives:
+            raise DeviceError(
+                f"{self._where} refuses mode {mode!r}; at {self._rate:g} Hz the controller only samples. Raise"
+                " daq.rate_hz"
+            )
         memory = self._memory
         if self._state == "idle":
             self._rest()
