@@ -66,6 +66,7 @@ def write_plant_file(
         If a channel has no calibration from counts.
     """
     truth = bench_of(rig, bench)
+    body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name
     position, current, voltage = (scale_of(rig, role) for role in ("position", "current", "voltage"))
     if voltage.raw.size > 2:
         raise DeviceError(
@@ -76,7 +77,7 @@ def write_plant_file(
     stage = {"high_voltage": high, "low_voltage": low}
     lines = [
         f"# {truth.name}",
-        *_plant(truth),
+        *body,
         *_numbers(stage),
         *_numbers(_noise(truth, noise) | {"pin_noise": pin_noise}),
     ]
