@@ -49,6 +49,9 @@ uint8_t board_begin(void);
 
 void board_output(uint8_t on);
 void board_duty(uint16_t duty);
+
+/* Waits, at most 19 us, while a pulse width might still act in this period or only in the next: then it is the next. */
+void board_await_period(void);
 void board_lamp(uint8_t on);
 
 /* Ticks of `period` periods of the pulse width, each of which converts `inputs` inputs and calls tick_work. */

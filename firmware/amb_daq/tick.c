@@ -42,6 +42,7 @@ static int16_t bias(void)
 /* Orders the pulse width; a fault that came meanwhile wins. */
 static uint16_t order(uint16_t duty)
 {
+    board_await_period();
     ATOMICALLY
     {
         if (daq_output_on()) {

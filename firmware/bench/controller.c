@@ -17,7 +17,8 @@
 #define SLICE 400 /* ticks of the longest run between two looks at the bench; also the mark by which a reset is seen */
 
 /* Addresses in data space. */
-enum { DDRB = 0x24, PORTB = 0x25, ADMUX = 0x7c, TCCR1A = 0x80, TCCR1B = 0x81, TCNT1L = 0x84, ICR1L = 0x86, OCR1AL = 0x88 };
+enum { DDRB = 0x24, PORTB = 0x25, ADCSRA = 0x7a, ADMUX = 0x7c };
+enum { TCCR1A = 0x80, TCCR1B = 0x81, TCNT1L = 0x84, ICR1L = 0x86, OCR1AL = 0x88 };
 enum { ENABLE = 1 << 0, PULSE = 1 << 1, LAMP = 1 << 5 };
 
 double controller_seconds(const struct controller *c) { return (double)c->avr->cycle / CLOCK_HZ; }
@@ -127,23 +128,27 @@ static uint32_t millivolts_for(double volts, uint32_t reference)
     return ((uint32_t)count * reference + 1022) / 1023;
 }
 
-static void converting(struct avr_irq_t *irq, uint32_t value, void *param)
+/* The input is held one and a half clocks of the converter after the conversion has begun (data sheet). */
+static avr_cycle_count_t hold_cycles(const struct controller *c)
+{
+    const unsigned prescaler = c->avr->data[ADCSRA] & 7u;
+    return ((avr_cycle_count_t)3 << (prescaler ? prescaler : 1u)) / 2;
+}
+
+static avr_cycle_count_t held(struct avr_t *avr, avr_cycle_count_t when, void *param)
 {
     struct controller *c = param;
-    union {
-        uint32_t value;
-        avr_adc_mux_t mux;
-    } of = {.value = value};
-    if (of.mux.kind != ADC_MUX_SINGLE)
-        return;
+    avr_irq_t *inputs = avr_io_getirq(avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0);
+    const unsigned source = c->converted;
+    (void)when;
     controller_carry(c);
     double volts = 0.0;
-    if (of.mux.src < PLANT_SENSORS) {
-        volts = plant_pin(c->plant, (enum plant_sensor)of.mux.src);
-        if (!isnan(c->override[of.mux.src]))
-            volts = c->override[of.mux.src];
+    if (source < PLANT_SENSORS) {
+        volts = plant_pin(c->plant, (enum plant_sensor)source);
+        if (!isnan(c->override[source]))
+            volts = c->override[source];
     }
-    if (of.mux.src == 0) {
+    if (source == 0) {
         const uint64_t ticks = c->at - c->volt_from;
         if (c->trajectory != NULL)
             fprintf(c->trajectory, "%.8f,%.12g,%.12g,%.12g,%.9g,%u\n", controller_seconds(c), c->plant->x, c->plant->v,
@@ -155,7 +160,22 @@ static void converting(struct avr_irq_t *irq, uint32_t value, void *param)
     const uint32_t reference = c->avr->data[ADMUX] >> 6 == 3 ? 1100 : SUPPLY_MV;
     /* At every input: the emulator looks at the multiplexer again when the result is read. */
     for (int channel = 0; channel < 8; channel++)
-        avr_raise_irq(irq - ADC_IRQ_OUT_TRIGGER + ADC_IRQ_ADC0 + channel, millivolts_for(volts, reference));
+        avr_raise_irq(inputs + channel, millivolts_for(volts, reference));
+    return 0;
+}
+
+static void converting(struct avr_irq_t *irq, uint32_t value, void *param)
+{
+    struct controller *c = param;
+    union {
+        uint32_t value;
+        avr_adc_mux_t mux;
+    } of = {.value = value};
+    (void)irq;
+    if (of.mux.kind != ADC_MUX_SINGLE)
+        return;
+    c->converted = of.mux.src;
+    avr_cycle_timer_register(c->avr, hold_cycles(c), held, c);
 }
 
 static void wire_pin(struct controller *c, int pin, int level)

@@ -27,6 +27,7 @@ struct controller {
     double override[PLANT_SENSORS];   /* V at the pin, NaN: none */
     uint64_t first_enable;            /* tick, UINT64_MAX: not yet */
     uint64_t conversions, resets, late; /* late: received bytes that a real receiver would have lost */
+    unsigned converted; /* input of the conversion under way */
 };
 
 /* Returns 0, or -1 after one line on standard error. */

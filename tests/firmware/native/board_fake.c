@@ -11,6 +11,8 @@ struct fake fake;
 
 uint8_t board_begin(void) { return fake.by_watchdog; }
 void board_output(uint8_t on) { fake.output = on; }
+void board_await_period(void) {}
+
 void board_duty(uint16_t duty)
 {
     fake.duty = duty;
