@@ -13,7 +13,7 @@ _REMEDY: Mapping[str, str] = MappingProxyType(
         "overrun": "Lower daq.rate_hz",
         "host_silent": "Free the machine, or raise daq.host_ms",
         "over_current": "Excite less, look at the coil, or widen daq.trip.current if the coil bears it",
-        "out_of_gap": "Excite less, change the gains of [loop], or look at sensor and daq.trip.position",
+        "out_of_gap": "Change the gains of [loop], excite less, or look at sensor and daq.trip.position",
         "interlock": "Close the loop: cable, emergency stop",
         "line_break": "Look at the cable",
         "self_test": "See what the self-test names",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ambid.cli import INTERRUPTED
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
 from ambid.cli.interrupts import Stop, signals
 from ambid.cli.options import FAILED_CHECK, band_of
@@ -55,11 +57,11 @@ def command(
     """Commission a bench: self-test, rest, levitate, excite, record, identify, validate, report, then track.
 
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
-    what was found up to there stays in the folder.
+    what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
     """
-    from ambid.job.commission import STEPS, Wishes, commission
+    from ambid.job.commission import STEPS, Wishes, check_folder, commission
     from ambid.report.acquire_text import progress_line
-    from ambid.report.commission_text import step_text
+    from ambid.report.commission_text import next_text, step_text
     from ambid.rig import load_rig
 
     _check({"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest})
@@ -67,8 +69,13 @@ def command(
         record_s=seconds, track_s=track_seconds, amplitude_v=amplitude, band_hz=band_of(band), widest=widest, seed=seed
     )
     known, paint, stop = load_rig(rig), painter(), Stop()
-    _make(folder)
+    _check_port(port, yes=yes)
+    _check_place(folder)
+    if folder.exists():
+        check_folder(folder)
+    last: list[Step] = []
     with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
+        _make(folder)
 
         def begin(name: StepName) -> None:
             watch.show(name, STEPS.index(name) / len(STEPS), "")
@@ -77,6 +84,7 @@ def command(
             watch.show("record", now.samples / max(now.wanted, 1), progress_line(now))
 
         def tell(step: Step) -> None:
+            last.append(step)
             watch.clear()
             typer.echo(step_text(step, STEPS.index(step.name) + 1, len(STEPS), paint=paint))
 
@@ -84,30 +92,51 @@ def command(
             watch.clear()
             return _agreed(name, device, yes=yes)
 
-        done = commission(
-            device,
-            known,
-            folder,
-            wishes=wishes,
-            on_begin=begin,
-            on_step=tell,
-            on_progress=show,
-            confirm=agreed,
-            stopped=stop.wished,
-        )
+        def alive(stage: str) -> None:
+            watch.show("identify", STEPS.index("identify") / len(STEPS), stage)
+
+        try:
+            passed = commission(
+                device, known, folder, wishes=wishes, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
+                stopped=stop.wished, tick=alive,
+            ).passed  # fmt: skip
+        except AmbidError:
+            with suppress(OSError):
+                folder.rmdir()  # where nothing was found, nothing is left
+            raise
+        except KeyboardInterrupt:
+            stop.number = stop.number or INTERRUPTED - 128
     if stop.number is not None:
-        typer.echo(f"ambid: interrupted; {folder} holds what was found before", err=True)
+        typer.echo(f"ambid: interrupted; the output is off, and {folder} holds what was found before", err=True)
         raise typer.Exit(stop.code)
-    if not done.passed:
-        typer.echo(paint(f"stopped at {done.steps[-1].name}; {folder} holds what was found before", "bad"))
+    name = last[-1].name
+    typer.echo(next_text(passed, name, STEPS.index(name) + 1, len(STEPS), str(folder)))
+    if not passed:
         raise typer.Exit(FAILED_CHECK)
-    typer.echo(f"{folder}: rig, records, estimate, report and track")
 
 
 def _check(given: dict[str, float | None]) -> None:
     for option, x in given.items():
         if x is not None and not (math.isfinite(x) and x > 0):
             raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
+
+
+def _check_port(port: str, *, yes: bool) -> None:
+    """Refuse what cannot be commissioned, before it is opened."""
+    if port.startswith("replay:"):
+        raise AmbidError(f"{port} is a record that is replayed: nothing can be levitated. Give a bench")
+    if port not in ("emulated", "simulated") and not yes and not sys.stdin.isatty():
+        raise AmbidError(
+            f"{port}: the controller is to switch its output on, and nobody can be asked. Clear the bench, and give"
+            " --yes"
+        )
+
+
+def _check_place(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise AmbidError(f"-o {folder} is a file; a folder is wanted. Name one")
+    if not folder.parent.is_dir():
+        raise AmbidError(f"-o {folder}: there is no folder {folder.parent}. Make it first, or correct the path")
 
 
 def _make(folder: Path) -> None:
@@ -122,11 +151,6 @@ def _agreed(name: StepName, device: Device, *, yes: bool) -> bool:
     del name
     if yes or device.info.kind != "serial":
         return True
-    if not sys.stdin.isatty():
-        raise AmbidError(
-            f"{device.info.port}: the controller is to switch its output on, and nobody can be asked. Clear the bench"
-            " and give --yes"
-        )
     return typer.confirm(
         "The controller will switch its output on and lift the rotor. Is the bench clear, the emergency stop at hand?"
     )

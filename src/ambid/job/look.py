@@ -52,7 +52,7 @@ class Room:
         """
         unlimited = (-math.inf, math.inf)
         roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
-        trips = {role: rig.trip(role) or unlimited for role in roles}
+        trips: dict[str, tuple[float, float]] = {role: rig.trip(role) or unlimited for role in roles}
         return cls(trips=MappingProxyType(trips), voltage=rig.limits.voltage if rig.limits else unlimited)
 
     def used(self, role: str, values: Array, rest: float) -> float:

@@ -9,6 +9,24 @@ from typing import Protocol
 from ambid.report.text import WIDTH, Paint, plain
 
 _INDENT = "  "
+_NEXT = {
+    "self-test": "put right what the self-test names; nothing was switched on",
+    "rest": "put sensors, wiring or calibrations right; nothing was switched on",
+    "levitate": "put the bench right, or [loop], [daq.trip] and the calibrations of the rig",
+    "excite": "give a smaller --amplitude or another --band, or put the bench right",
+    "record": "see to what spoilt the record; {folder}/record.h5 holds what came",
+    "identify": (
+        "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig;"
+        " 'ambid identify {folder}/record.h5 --rig RIG' tries a corrected rig without the bench"
+    ),
+    "validate": (
+        "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for what"
+        " changed between the two"
+    ),
+    "report": "see to the folder and its disk",
+    "track": "look for what changed since the record: load, temperature, supply; {folder}/track.jsonl shows when",
+}
+"""What to do after a step that was not good enough."""
 
 
 class StepLike(Protocol):
@@ -60,6 +78,42 @@ def step_text(step: StepLike, number: int, of: int, *, width: int = WIDTH, paint
     lines += [paint(line, "dim") for line in _wrapped([f"note: {c}" for c in step.cautions], width)]
     lines += [paint(line, "bad") for line in _wrapped([f"stopped: {r}" for r in step.reasons], width)]
     return "\n".join(lines)
+
+
+def next_text(passed: bool, step: str, number: int, of: int, folder: str, *, width: int = WIDTH) -> str:
+    """Say where a commissioning ended, and what to do next.
+
+    Parameters
+    ----------
+    passed : bool
+        Whether it came to its end.
+    step : str
+        The last one.
+    number, of : int
+        Which of how many it is.
+    folder : str
+        Where the files are.
+    width : int
+        Columns of the terminal.
+
+    Returns
+    -------
+    str
+        Lines without the last line's end.
+    """
+    if passed:
+        said = [
+            f"commissioned; {folder} holds rig, records, estimate, report and track.",
+            f"Next: read {folder}/report.html; follow the running bench with 'ambid acquire --track"
+            f" {folder}/estimate.json'.",
+        ]
+    else:
+        said = [
+            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found.",
+            f"Next: {_NEXT.get(step, 'see the reason above').format(folder=folder)}."
+            " Then commission again, into another folder.",
+        ]
+    return "\n".join(line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False))
 
 
 def _wrapped(texts: Sequence[str], width: int) -> list[str]:

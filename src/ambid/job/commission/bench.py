@@ -9,10 +9,11 @@ import numpy as np
 from ambid.acquire.device import Device
 from ambid.acquire.session import Course
 from ambid.job.amplitude import Trial, find_amplitude
-from ambid.job.commission.step import Step, Wishes
+from ambid.job.commission.step import EXCITATION, Step, Wishes
 from ambid.job.look import Look, Room, ended
 
 _SD_AT_REST = 0.02  # of the trips' width: noise of a sensor with the output off
+_ZERO, _NEAR_ZERO = 0.10, 0.03  # of the trips' width: current that is shown with the output off
 _WANDER = 0.25  # of the trips' width: how far the rotor may stray without excitation
 _NEAR = 0.85  # of the voltage: no room left
 
@@ -56,11 +57,12 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     Returns
     -------
     Step
-        Not passed where a sensor is noisy or dead, or current flows.
+        Not passed where a sensor is noisy, or a current is shown that cannot be.
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
     reasons = list(ended(report, "the look at rest"))
     findings: list[str] = []
+    cautions: list[str] = []
     numbers: dict[str, float] = {}
     for role, unit in (("position", "m"), ("current", "A")):
         if role not in seen or not seen[role].size:
@@ -75,9 +77,16 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
                 f"the {role} sensor's noise is {sd:.2g} {unit} rms with the output off, {100 * sd / width:.0f} % of the"
                 " way between the trips: look at wiring, ground and the filter at the input"
             )
-        if role == "current" and not low < mean < high:
-            reasons.append(f"a current of {mean:.3g} A flows with the output off: look at offset and power stage")
-    return Step(name="rest", findings=tuple(findings), reasons=tuple(reasons), numbers=numbers)
+        if sd == 0.0:
+            cautions.append(f"{role} does not move by one count: a quiet sensor, or none")
+        if role == "current" and math.isfinite(width) and abs(mean) > _NEAR_ZERO * width:
+            (reasons if abs(mean) > _ZERO * width else cautions).append(
+                f"{mean:.3g} A are shown with the output off, {100 * abs(mean) / width:.0f} % of the way between the"
+                " trips: correct the offset of channels.current, or see that the power stage does switch off"
+            )
+    return Step(
+        name="rest", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
+    )
 
 
 def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
@@ -107,6 +116,11 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
         mean, sd = float(seen[role].mean()), float(seen[role].std())
         findings.append(f"{role} {mean:.4g} {unit}, {sd:.2g} {unit} rms")
         numbers |= {f"{role}_mean": mean, f"{role}_sd": sd}
+        if role != "voltage" and sd == 0.0:
+            reasons.append(
+                f"{role} does not move by one count while the rotor hovers: no sensor there? Look at its cable and"
+                " supply"
+            )
     low, high = room.trips["position"]
     stray = float(np.ptp(seen["position"]))
     if math.isfinite(high - low) and stray > _WANDER * (high - low):
@@ -147,8 +161,8 @@ def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) 
     """
     resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
     trial = Trial(
-        name="multisine", band=wishes.band(rate_hz), mode="levitate", settle_s=wishes.settle_s, seconds=wishes.trial_s,
-        seed=wishes.seed,
+        name=EXCITATION, band=wishes.band(rate_hz), mode="levitate", settle_s=wishes.settle_s,
+        seconds=wishes.longest_trial_s(rate_hz), seed=wishes.seed,
     )  # fmt: skip
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from ambid.identify.estimate import Estimate
 from ambid.job._progress import Tick, silent
 from ambid.job.acquire import Acquired, Progress, acquire
 from ambid.job.commission import bench, result
-from ambid.job.commission.step import Step, StepName, Wishes
+from ambid.job.commission.step import EXCITATION, STEPS, Step, StepName, Wishes
 from ambid.job.look import Room, looking
 from ambid.job.physical import identify, load, signals_of
 from ambid.job.track_live import track_live
@@ -56,11 +57,15 @@ class Commissioned:
     @property
     def passed(self) -> bool:
         """Whether every step was done and is good enough."""
-        return self.steps[-1].name == "track" and all(s.passed for s in self.steps)
+        return _passed(self.steps)
 
 
 class Declined(AmbidError):
     """The operator did not agree to the next step."""
+
+
+class _Interrupted(AmbidError):
+    """Somebody asked for the end while numbers were worked out."""
 
 
 def commission(
@@ -82,11 +87,11 @@ def commission(
     Parameters
     ----------
     device : Device
-        Opened, idle. It is idle again, with its output off, when this returns.
+        Opened, idle. Its output is off when this returns: it is idle again, or in its safe state after a fault.
     rig : Rig
         The bench, with ``[loop]`` and ``[daq]``.
     folder : str or Path
-        Where the files go; it has to exist, and none of `FILES` may be in it.
+        Where the files go; it has to exist, and none of `FILES` may be in it: see `check_folder`.
     wishes : Wishes, optional
         What is to be reached.
     on_begin, on_step : callable, optional
@@ -96,26 +101,30 @@ def commission(
     confirm : callable, optional
         Asked before the rotor is lifted; False ends it.
     stopped : callable, optional
-        Asked while samples come; True ends the run.
+        Asked while samples come and numbers are worked out; True ends the commissioning, with that as a reason.
     tick : callable, optional
         Sign of life while computing.
 
     Returns
     -------
     Commissioned
-        Also where a step was not good enough.
+        Also where a step was not good enough, or could not be done: the error is then the step's reason.
 
     Raises
     ------
     AmbidError
-        If device, rig or folder break a rule, or the operator does not agree.
+        If rig, wishes or folder break a rule, which is seen before anything moves; or the operator does not agree.
     """
     place = Path(folder)
-    _check_folder(place)
+    check_folder(place)
     guide = _Guide(device, rig, place, wishes or Wishes(), on_progress, on_event, stopped, tick or silent)
+    guide.check()
+    _write(place / "rig.toml", rig_text(rig, place))
     done: list[Step] = []
-    for name, step in guide.steps(on_begin or silent, confirm or _agreed):
-        del name
+    for name, do in guide.steps(confirm or _agreed):
+        if on_begin is not None:
+            on_begin(name)
+        step = _done(name, do)
         done.append(step)
         _write(place / "commission.json", _summary(done, device, guide.wishes))
         if on_step is not None:
@@ -125,17 +134,46 @@ def commission(
     return Commissioned(steps=tuple(done), estimate=guide.estimate, folder=place)
 
 
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder that holds an earlier commissioning.
+
+    Parameters
+    ----------
+    folder : str or Path
+
+    Raises
+    ------
+    AmbidError
+        If it is no folder, may not be written, or one of `FILES`, or what a killed recording left, is in it.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
+    if not os.access(place, os.W_OK):
+        raise AmbidError(f"folder {place} may not be written. Choose another folder")
+    there = [name for name in FILES if (place / name).exists()]
+    there += sorted(path.name for path in place.glob("*.journal"))
+    if there:
+        raise AmbidError(f"{place} holds {', '.join(there)} of an earlier commissioning. Take an empty folder")
+
+
 def _agreed(name: StepName) -> bool:
     del name
     return True
 
 
-def _check_folder(place: Path) -> None:
-    if not place.is_dir():
-        raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
-    there = [name for name in FILES if (place / name).exists()]
-    if there:
-        raise AmbidError(f"{place} holds {', '.join(there)} of an earlier commissioning. Take an empty folder")
+def _done(name: StepName, do: Callable[[], Step]) -> Step:
+    """Do a step; what makes it impossible is its reason."""
+    try:
+        return do()
+    except Declined:
+        raise
+    except AmbidError as failure:
+        return Step(name=name, reasons=(str(failure),))
+
+
+def _passed(steps: Sequence[Step]) -> bool:
+    return bool(steps) and steps[-1].name == STEPS[-1] and all(s.passed for s in steps)
 
 
 class _Guide:
@@ -153,66 +191,88 @@ class _Guide:
         tick: Tick,
     ) -> None:
         self._device, self._rig, self._place = device, rig, place
-        self._on_progress, self._on_event, self._stopped, self._tick = on_progress, on_event, stopped, tick
+        self._on_progress, self._on_event, self._stopped, self._told = on_progress, on_event, stopped, tick
         self._room = Room.of(rig)
         self.wishes = wishes
         self.estimate: Estimate | None = None
 
-    def steps(
-        self, on_begin: Callable[[StepName], object], confirm: Callable[[StepName], bool]
-    ) -> Iterator[tuple[StepName, Step]]:
-        """Do one step after the other; whoever iterates stops at one that is not passed."""
+    def check(self) -> None:
+        """Refuse what cannot be done, before anything moves."""
+        wishes, rate_hz = self.wishes, self._device.info.rate_hz
+        if self._device.info.kind == "replay":
+            raise AmbidError(f"{self._device.info.port} is a record that is replayed: it cannot be commissioned")
+        if self._rig.loop is None or not self._rig.loop.closed or self._rig.open_loop:
+            raise AmbidError("the rig has no [loop] with a gain: there is nothing to levitate with. Give [loop]")
+        for what, seconds in (
+            ("a trial of the amplitude", wishes.longest_trial_s(rate_hz)),
+            ("the record", wishes.record_s),
+            ("the second record", wishes.second_s),
+            ("tracking", wishes.track_s),
+        ):
+            try:
+                self._course(1.0, seconds, 0)
+            except AmbidError as failure:
+                raise AmbidError(f"{what}: {failure}") from None
+
+    def steps(self, confirm: Callable[[StepName], bool]) -> Iterator[tuple[StepName, Callable[[], Step]]]:
+        """Yield one step after the other; whoever iterates does it, and stops at one that is not passed."""
         device, room, wishes = self._device, self._room, self.wishes
         look = looking(device, self._rig, self._stopped)
-        _write(self._place / "rig.toml", rig_text(self._rig, self._place))
+        found: dict[str, Step] = {}
 
-        def begin(name: StepName) -> StepName:
-            on_begin(name)
-            return name
+        def keep(step: Step) -> Step:
+            found[step.name] = step
+            return step
 
-        yield begin("self-test"), bench.self_test(device)
-        yield begin("rest"), bench.rest(look, room, wishes)
+        def amplitude() -> float:
+            return found["excite"].numbers["amplitude_v"]
+
+        yield "self-test", lambda: bench.self_test(device)
+        yield "rest", lambda: bench.rest(look, room, wishes)
         if not confirm("levitate"):
             raise Declined("levitation was not agreed to; the output stayed off. Begin again when the bench is clear")
-        name = begin("levitate")
-        hover = bench.levitate(look, room, wishes)
-        yield name, hover
-        name = begin("excite")
-        size = bench.excite(look, room, wishes, device.info.rate_hz, hover)
-        yield name, size
-        yield begin("record"), self._record(size.numbers["amplitude_v"])
-        yield begin("identify"), self._identify()
-        assert self.estimate is not None
-        yield begin("validate"), result.validation(self.estimate)
-        yield begin("report"), self._report()
-        yield begin("track"), self._track(size.numbers["amplitude_v"])
+        yield "levitate", lambda: keep(bench.levitate(look, room, wishes))
+        yield "excite", lambda: keep(bench.excite(look, room, wishes, device.info.rate_hz, found["levitate"]))
+        yield "record", lambda: self._record(amplitude())
+        yield "identify", self._identify
+        yield "validate", self._validate
+        yield "report", self._report
+        yield "track", lambda: self._track(amplitude())
 
     def _record(self, amplitude_v: float) -> Step:
         """Take the record, and a second one with another excitation."""
         wishes = self.wishes
-        first = result.record("record", self._acquire("record.h5", "multisine", amplitude_v, wishes.record_s, 0))
+        first = result.record("record", self._acquire("record.h5", amplitude_v, wishes.record_s, 0))
         if not first.passed:
             return first
-        second = result.record(
-            "second record", self._acquire("second.h5", "multisine", 0.8 * amplitude_v, wishes.second_s, 1)
-        )
+        second = result.record("second record", self._acquire("second.h5", 0.8 * amplitude_v, wishes.second_s, 1))
         return replace(
             second, findings=(*first.findings, *second.findings), cautions=(*first.cautions, *second.cautions)
         )
 
-    def _acquire(self, name: str, kind: str, amplitude_v: float, seconds: float, seed: int) -> Acquired:
+    def _acquire(self, name: str, amplitude_v: float, seconds: float, seed: int) -> Acquired:
         return acquire(
-            self._device, self._rig, self._place / name, self._course(kind, amplitude_v, seconds, seed),
+            self._device, self._rig, self._place / name, self._course(amplitude_v, seconds, seed),
             on_progress=self._on_progress, on_event=self._on_event, stopped=self._stopped,
         )  # fmt: skip
 
-    def _course(self, kind: str, amplitude_v: float, seconds: float, seed: int) -> Course:
+    def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
         wishes, rate_hz = self.wishes, self._device.info.rate_hz
         wave = program(
-            kind, amplitude_v=amplitude_v, band=wishes.band(rate_hz), rate_hz=rate_hz, seconds=seconds,
+            EXCITATION, amplitude_v=amplitude_v, band=wishes.band(rate_hz), rate_hz=rate_hz, seconds=seconds,
             seed=wishes.seed + seed,
         )  # fmt: skip
         return Course(mode="levitate", seconds=seconds, settle_s=wishes.settle_s, program=wave)
+
+    def _validate(self) -> Step:
+        assert self.estimate is not None
+        return result.validation(self.estimate)
+
+    def _tick(self, stage: str) -> None:
+        """Take a sign of life from what is worked out, and end it if that is wished."""
+        if self._stopped():
+            raise _Interrupted(f"interrupted while working it out ({stage})")
+        self._told(stage)
 
     def _identify(self) -> Step:
         self.estimate = identify(
@@ -239,17 +299,17 @@ class _Guide:
 
     def _track(self, amplitude_v: float) -> Step:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""
-        course = self._course("multisine", amplitude_v, self.wishes.track_s, 2)
+        course = self._course(amplitude_v, self.wishes.track_s, 2)
         done = track_live(
             self._device, self._rig, course, start=self.estimate, limit=_LIMIT, on_event=self._on_event,
+            stopped=self._stopped,
         )  # fmt: skip
-        writer = TrackWriter(self._place / "track.jsonl")
-        writer.header(done.track.header)
-        for line in done.track.lines:
-            writer.line(line)
-        if done.track.summary is not None:
-            writer.summary(done.track.summary)
-        writer.close()
+        with _whole(self._place / "track.jsonl") as beside, TrackWriter(beside) as writer:
+            writer.header(done.track.header)
+            for line in done.track.lines:
+                writer.line(line)
+            if done.track.summary is not None:
+                writer.summary(done.track.summary)
         return result.tracking(done, _LIMIT)
 
 
@@ -261,17 +321,23 @@ def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
             "device": {"kind": info.kind, "port": info.port, "identity": dict(info.identity), "rate_hz": info.rate_hz},
             "wishes": {name: getattr(wishes, name) for name in wishes.__slots__},
             "steps": [s.as_json() for s in done],
-            "passed": done[-1].name == "track" and all(s.passed for s in done),
+            "passed": _passed(done),
         },
         indent=1,
     )
 
 
 def _write(path: Path, text: str) -> None:
-    """Put a file in place whole."""
+    with _whole(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Let a file be written under another name, and put it in place whole."""
     beside = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        beside.write_text(text, encoding="utf-8")
+        yield beside
         os.replace(beside, path)
     except OSError as failure:
         raise AmbidError(f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk") from None

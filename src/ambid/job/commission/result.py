@@ -30,9 +30,12 @@ def record(name: str, done: Acquired) -> Step:
     Returns
     -------
     Step
-        Not passed where samples were lost or the sensors saturate.
+        Not passed where samples were lost or not stored, or a sensor saturates or stands still. Little signal over
+        noise is a caution: whether it is enough is decided by the intervals of what is identified.
     """
-    reasons = [*ended(done.run, f"the {name}"), *(str(t) for t in done.troubles)]
+    reasons = list(ended(done.run, f"the {name}"))
+    if done.not_stored:
+        reasons += [f"{done.not_stored} samples of the {name} are not stored: {done.troubles[0]}"]
     findings = [
         f"{name}: {done.run.samples} samples at {done.info.rate_hz:g} Hz, {done.run.lost} lost,"
         f" {done.counters.damaged} frames damaged"
@@ -42,7 +45,12 @@ def record(name: str, done: Acquired) -> Step:
         for column in done.quality.columns
         if column.role in ("position", "current") and column.saturated > _SATURATED
     ]
-    cautions = [line for line in done.quality.verdict if line not in reasons]
+    reasons += [
+        f"{column.name} does not move by one count in the {name}: no sensor there? Look at its cable and supply"
+        for column in done.quality.columns
+        if column.role in ("position", "current") and column.sd == 0.0
+    ]
+    cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
     return Step(name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions))
 
 
@@ -104,6 +112,8 @@ def validation(estimate: Estimate) -> Step:
     """
     checks: Mapping[str, Any] = (estimate.validation or {}).get("checks", {})  # type: ignore[assignment]
     findings = tuple(f"{name}: {c['detail']}" for name, c in checks.items() if c["passed"])
+    if not checks:
+        return Step(name="validate", reasons=("nothing was checked on the second record: it cannot be judged",))
     failed = {name: f"{name}: {c['detail']}" for name, c in checks.items() if not c["passed"]}
     reasons = tuple(text for name, text in failed.items() if name not in _RESIDUAL)
     cautions = tuple(text for name, text in failed.items() if name in _RESIDUAL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -21,6 +22,11 @@ STEPS: tuple[StepName, ...] = (
     "track",
 )
 """In their order."""
+
+EXCITATION = "multisine"
+"""What is played."""
+
+_PERIODS = 4.0  # of the lowest line in a trial
 
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
@@ -60,7 +66,7 @@ class Step:
         Returns
         -------
         dict
-            ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``.
+            ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``; what is not known is None.
         """
         return {
             "name": self.name,
@@ -68,7 +74,7 @@ class Step:
             "findings": list(self.findings),
             "reasons": list(self.reasons),
             "cautions": list(self.cautions),
-            "numbers": dict(self.numbers),
+            "numbers": {name: x if math.isfinite(x) else None for name, x in self.numbers.items()},
         }
 
 
@@ -122,3 +128,19 @@ class Wishes:
             As wished, or from the rate.
         """
         return self.band_hz or (rate_hz / 1000.0, rate_hz / 30.0)
+
+    def longest_trial_s(self, rate_hz: float) -> float:
+        """Return the length of a trial in s: as wished, or longer where the band is slow.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the device, Hz.
+
+        Returns
+        -------
+        float
+            Four periods of the lowest line at least.
+        """
+        low = self.band(rate_hz)[0]
+        return max(self.trial_s, _PERIODS / low * (1 + 1e-9)) if low > 0.0 else self.trial_s
