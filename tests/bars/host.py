@@ -1,0 +1,215 @@
+"""A host of one thread on the emulated bench: it keeps what comes in the order of the line, and sends what a test says.
+
+The product's own driver never does what a bar asks for: fall silent, send damage, listen on in the safe state.
+"""
+
+import os
+import struct
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import ambid
+from ambid.acquire.devices.emulator import Emulator
+from ambid.acquire.devices.plant_file import write_plant_file
+from ambid.acquire.link.port import open_port
+from ambid.acquire.protocol.codec import message, unpack
+from ambid.acquire.protocol.framing import FrameDecoder, encode
+from ambid.acquire.protocol.table import table
+from ambid.acquire.settings import controller_settings
+from ambid.rig import load_rig
+
+DATA = Path(ambid.__file__).parent / "data"
+PING_SAMPLES = 50  # 25 ms at 2 kHz
+PING_S = 0.05  # of the wall clock, where no samples come
+HANG_S = 60.0  # only ends a hang
+ANSWER_S = 2.0
+BOOT_S = 0.03  # of processor time: some 0.1 s of the controller's
+_SAMPLE = table().messages["sample"].code
+_HEAD = struct.Struct("<BHB")
+_LEVITATE = table().value("mode", "levitate")
+
+
+def prototype():
+    """Return the rig of the preset."""
+    return load_rig(DATA / "prototype.toml")
+
+
+def _let_it_boot(pid):
+    """Bytes that come before the firmware listens are lost on hardware: give it its time, measured by its own work."""
+    end = time.monotonic() + HANG_S
+    while time.monotonic() < end:
+        worked = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11])
+        if worked / os.sysconf("SC_CLK_TCK") >= BOOT_S:
+            return
+        time.sleep(0.005)
+
+
+class Refused(Exception):
+    """The controller does not do what it was told."""
+
+
+@dataclass
+class Heard:
+    """What came since ticks count from 0."""
+
+    ticks: list = field(default_factory=list)
+    states: list = field(default_factory=list)
+    causes: list = field(default_factory=list)
+    values: list = field(default_factory=list)
+    lost: int = 0
+
+
+class Host:
+    """Emulator and line. A context.
+
+    Rig, script, seed and folder as `Emulator` has them; ``third``: third input as `write_plant_file` has it.
+    """
+
+    def __init__(self, rig, folder, *, script=None, seed=0, trajectory=False, **plant):
+        self.rig, self.settings = rig, controller_settings(rig)
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_plant_file(folder / "plant.txt", rig, **plant)
+        self.bench = Emulator(folder / "plant.txt", script=script, seed=seed, folder=folder, trajectory=trajectory)
+        self.heard, self.answers, self.told = Heard(), {}, deque()
+        self.pings, self.ping_by_clock = True, True
+        self.acked_at = None  # samples that had come when the last answer to a ping did
+        self.unanswered = set()
+        self.resent = self.pinged_at = self.number = 0
+        self.clock = time.monotonic()
+
+    def __enter__(self):
+        self.bench.start()
+        try:
+            self.port = open_port(self.bench.port, baud=table().baud, boot_s=0.0)
+            _let_it_boot(self.bench.pid)
+        except BaseException:
+            self.bench.close(keep=True)
+            raise
+        self.decoder = FrameDecoder("host")
+        return self
+
+    def __exit__(self, *_):
+        self.port.close()
+        self.bench.close(keep=True)
+
+    # ---- what goes -------------------------------------------------------------------------------------------------
+
+    def next_number(self):
+        self.number = self.number % 255 + 1
+        return self.number
+
+    def ping(self):
+        number = self.next_number()
+        self.unanswered.add(number)
+        self.port.write(encode(message("ping", id=number)))
+        self.pinged_at, self.clock = len(self.heard.ticks), time.monotonic()
+
+    def ask(self, name, *, values=(), expect=0, **fields):
+        """Send a command, and again where no answer comes; return the answer."""
+        number = self.next_number()
+        self.answers.pop(number, None)
+        self.unanswered.discard(number)  # a ping of long ago that never arrived
+        data = encode(message(name, values=values, id=number, **fields))
+        end = time.monotonic() + HANG_S
+        while time.monotonic() < end:
+            self.port.write(data)
+            again = time.monotonic() + ANSWER_S
+            while time.monotonic() < again:
+                self.pump()
+                if number in self.answers:
+                    answer = self.answers.pop(number)
+                    if expect is not None and answer.name == "ack" and answer["code"] != expect:
+                        raise Refused(f"{name}: {table().name('code', answer['code'])}, {answer['detail']}")
+                    return answer
+            self.resent += 1
+        raise AssertionError(f"no answer to {name}: {self.bench.said()}")
+
+    def prepare(self, *, stream=None, period=None):
+        """Identify, and tell the settings of the rig."""
+        self.ask("identify")
+        wanted = self.settings.configure() | ({} if stream is None else {"stream": stream})
+        self.stream = wanted["stream"]
+        self.ask("configure", **(wanted | ({} if period is None else {"period": period})))
+        self.ask("limits", **self.settings.limits())
+        self.ask("gains", **self.settings.gains())
+
+    def start(self, mode=_LEVITATE):
+        self.heard = Heard()
+        self.acked_at, self.pinged_at = None, 0
+        self.ask("start", mode=mode)
+
+    # ---- what comes ------------------------------------------------------------------------------------------------
+
+    def pump(self):
+        """Take what has come, and give a sign of life where one is due."""
+        for payload in self.decoder.feed(self.port.read()):
+            if payload[0] == _SAMPLE:
+                self._keep(payload)
+            else:
+                self._told(unpack(payload))
+        due = len(self.heard.ticks) - self.pinged_at >= PING_SAMPLES
+        late = self.ping_by_clock and time.monotonic() - self.clock > PING_S
+        if self.pings and (due or late):
+            self.ping()
+
+    def _keep(self, payload):
+        _, tick, state = _HEAD.unpack_from(payload)
+        heard = self.heard
+        last = heard.ticks[-1] if heard.ticks else -1
+        step = (tick - last) % 65536
+        heard.lost += step - 1
+        heard.ticks.append(last + step)
+        heard.states.append(state & 15)
+        heard.causes.append(state >> 4)
+        heard.values.append(payload[_HEAD.size :])
+
+    def _told(self, what):
+        number = what.fields.get("id", 0)
+        if number in self.unanswered:
+            self.unanswered.discard(number)
+            if self.state != "fault":
+                self.acked_at = len(self.heard.ticks)
+        elif number:
+            self.answers[number] = what
+        self.told.append(what)
+
+    def until(self, ready):
+        """Listen until it is so."""
+        end = time.monotonic() + HANG_S
+        while not ready():
+            assert time.monotonic() < end, (self.state, self.bench.events()[-3:], self.bench.said())
+            self.pump()
+
+    def samples(self, n):
+        """Listen until there are n samples more."""
+        wanted = len(self.heard.ticks) + n
+        self.until(lambda: len(self.heard.ticks) >= wanted)
+
+    @property
+    def state(self):
+        return table().name("state", self.heard.states[-1]) if self.heard.states else "idle"
+
+    def values(self):
+        """Return what samples carry, one row each."""
+        return np.frombuffer(b"".join(self.heard.values), "<u2").reshape(len(self.heard.ticks), -1).astype(int)
+
+    def column(self, name):
+        """Return one of them by its name in the table of messages."""
+        carried = [c.name for c in table().stream if self.stream >> c.bit & 1]
+        return self.values()[:, carried.index(name)]
+
+
+def trajectory(folder):
+    """Read the bench's true motion: columns t, x, v, i, voltage, duty."""
+    return np.loadtxt(Path(folder) / "trajectory.csv", delimiter=",", skiprows=1)
+
+
+def tick_times(rows, rise_s):
+    """Return when each tick's first conversion began, tick 0 first: the last one before ENABLE rises is tick 0."""
+    t = rows[:, 0]
+    return t[np.flatnonzero(t < rise_s)[-1] :]

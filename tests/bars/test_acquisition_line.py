@@ -1,0 +1,49 @@
+"""Nothing is lost on the way from the converter to the record, at the rate that is promised and at the highest one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.acquire.devices.emulated import EmulatedDevice
+from ambid.acquire.program import program
+from ambid.acquire.session import Course
+from ambid.job.acquire import acquire
+from ambid.record import read_record
+from tests.bars.rates import COUNTED, run, stream_of
+
+SECONDS, RATE = 60.0, 2000.0
+
+
+def test_a_minute_of_three_inputs_without_a_loss(rig, tmp_path):
+    """2 kHz, three inputs and the pulse width, 1 Mbaud, excited, through driver, session and recorder."""
+    rig = replace(rig, daq=replace(rig.daq, third="third"))
+    wave = program("multisine", amplitude_v=3.0, band=(2.0, 66.0), rate_hz=RATE, seconds=SECONDS)
+    with EmulatedDevice(rig, seed=1) as device:
+        course = Course(mode="levitate", seconds=SECONDS, settle_s=1.0, program=wave)
+        done = acquire(device, rig, tmp_path / "minute.h5", course)
+    c = done.counters
+    assert done.run.complete
+    assert done.run.samples == SECONDS * RATE
+    assert (done.run.lost, c.lost, c.damaged, c.discarded_bytes, c.overruns) == (0, 0, 0, 0, 0)
+    assert {name: c.controller[name] for name in COUNTED} == dict.fromkeys(COUNTED, 0)
+    assert done.troubles == ()
+    record = read_record(tmp_path / "minute.h5")
+    columns = {channel.name: channel.values for channel in record.channels}
+    assert set(columns) >= {"position", "current", "third", "duty"}
+    assert {len(v) for v in columns.values()} == {SECONDS * RATE}
+    assert np.ptp(columns["position"]) > 10  # counts: it is the excited rotor
+
+
+@pytest.mark.parametrize(("mode", "inputs", "period"), [("sample", 2, 4), ("sample", 3, 4), ("levitate", 3, 8)])
+def test_the_highest_rate_is_clean_under_commands(mode, inputs, period, rig, tmp_path):
+    """The fastest ticks that the controller takes, with 200 commands a second beside the pings."""
+    carried = stream_of(*[f"analog_{k}" for k in range(inputs)], "duty")
+    found = run(rig, tmp_path, seconds=2.0, stream=carried, period=period, mode=mode, commands=200)
+    assert found is not None
+    assert found.clean, found
+
+
+def test_faster_ticks_are_refused(rig, tmp_path):
+    for mode, period in (("sample", 3), ("levitate", 7)):
+        assert run(rig, tmp_path / mode, seconds=0.1, stream=stream_of("analog_0"), period=period, mode=mode) is None
