@@ -75,7 +75,7 @@ def command(
         check_folder(folder)
     last: list[Step] = []
     with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
-        _make(folder)
+        new = _make(folder)
 
         def begin(name: StepName) -> None:
             watch.show(name, STEPS.index(name) / len(STEPS), "")
@@ -102,7 +102,8 @@ def command(
             ).passed  # fmt: skip
         except AmbidError:
             with suppress(OSError):
-                folder.rmdir()  # where nothing was found, nothing is left
+                if new:
+                    folder.rmdir()  # where nothing was found, nothing is left
             raise
         except KeyboardInterrupt:
             stop.number = stop.number or INTERRUPTED - 128
@@ -139,11 +140,14 @@ def _check_place(folder: Path) -> None:
         raise AmbidError(f"-o {folder}: there is no folder {folder.parent}. Make it first, or correct the path")
 
 
-def _make(folder: Path) -> None:
+def _make(folder: Path) -> bool:
+    """Make the folder; whether there was none."""
+    new = not folder.exists()
     try:
         folder.mkdir(exist_ok=True)
     except OSError as failure:
         raise AmbidError(f"-o {folder} cannot be made: {failure.strerror or failure}. Choose another folder") from None
+    return new
 
 
 def _agreed(name: StepName, device: Device, *, yes: bool) -> bool:
