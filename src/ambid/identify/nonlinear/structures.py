@@ -1,0 +1,80 @@
+"""The register of nonlinear structures: what each is called, what it is told, what feedback does to it.
+
+An estimator is a function ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit``: `records` a sequence
+of `IOData` of one bench (same channels, same rate), `tick` called with the name of the stage now and then; it may raise
+KeyboardInterrupt, upon which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers
+that are not finite, end in status ``failed`` with the reason, never in an exception; an exception is a request that
+makes no sense. The estimator leaves `fit`, `criteria` and `checks` to `ambid.validate.nonlinear`. It is imported only
+when it is asked for. `tests/identify/nonlinear/test_conformance.py` runs on every entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Literal
+
+from ambid.errors import EstimationError, nearest
+from ambid.identify.nonlinear.fit import NonlinearFit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NonlinearStructure:
+    """One nonlinear structure.
+
+    Attributes
+    ----------
+    name, summary : str
+        For lists.
+    settings : Mapping[str, str]
+        What it may be told, each with a line that says what it is and what is chosen without it.
+    home : str
+        ``module:function`` of its estimator.
+    feedback : {"consistent", "biased", "with noise model"}
+        What feedback does to it: nothing; bias; nothing as long as its noise model holds the true one.
+    """
+
+    name: str
+    summary: str
+    settings: Mapping[str, str]
+    home: str
+    feedback: Literal["consistent", "biased", "with noise model"]
+
+    @property
+    def estimator(self) -> Callable[..., NonlinearFit]:
+        """The function that fits it."""
+        module, function = self.home.split(":")
+        found: Callable[..., NonlinearFit] = getattr(import_module(module), function)
+        return found
+
+
+_ENTRIES: tuple[NonlinearStructure, ...] = ()
+
+NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _ENTRIES}
+
+
+def nonlinear_structure(name: str) -> NonlinearStructure:
+    """Return a nonlinear structure by name.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"narmax"``.
+
+    Returns
+    -------
+    NonlinearStructure
+        From the register.
+
+    Raises
+    ------
+    EstimationError
+        If there is none; names the nearest.
+    """
+    if name not in NONLINEAR_STRUCTURES:
+        known = ", ".join(NONLINEAR_STRUCTURES)
+        raise EstimationError(
+            f"structure {name!r} is not known; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
+        )
+    return NONLINEAR_STRUCTURES[name]
