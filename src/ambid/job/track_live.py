@@ -279,6 +279,8 @@ class _Lead:
     def _too_short(self, runner: _Runner, wanted_s: float, rate_hz: float) -> None:
         runner.__exit__(None, None, None)
         report = runner.report()
+        if report.interrupted:
+            raise DeviceError(f"the run was interrupted after {report.samples / rate_hz:.3g} s, before tracking began")
         why = "" if report.fault is None else f" ({fault_words(report.fault)})"
         raise DeviceError(
             f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin"

@@ -1,0 +1,120 @@
+"""The right size of an excitation: from small to large, within its part of the room, on any bench that is driven."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from ambid.acquire.session import RunReport
+from ambid.errors import DeviceError
+from ambid.job.amplitude import Trial, find_amplitude, fitting_amplitude
+from ambid.job.look import Room
+from ambid.rig import rig_from_text
+from tests.job.benches import COIL, THESIS, Spoiled, prototype
+
+ROOM = Room(trips={"position": (-1e-3, 1e-3), "current": (-1.0, 1.0)}, voltage=(-10.0, 10.0))
+TRIAL = Trial(name="multisine", band=(2.0, 66.0), mode="levitate", settle_s=0.2, seconds=2.0, seed=0)
+DRIVE = Trial(name="prbs", band=None, mode="drive", settle_s=0.0, seconds=1.0, seed=0)
+REST = {"position": 0.0, "current": 0.0}
+
+
+def linear(slope, *, lose=0, trips_at=math.inf):
+    """A bench that moves in proportion, and the sizes that it was tried with."""
+    sizes = []
+
+    def look(course):
+        size = course.program.amplitude
+        sizes.append(size)
+        n = 100 - lose
+        report = RunReport(
+            samples=n, wanted=100, lost=lose, first=0, after=100, fault=None, interrupted=False, events=()
+        )
+        swing = np.array([-1.0, 1.0])
+        seen = {"position": slope * size * swing, "current": 0.01 * size * swing, "voltage": size * swing}
+        return (report, seen) if size < trips_at else (report.__class__(**{**fields(report), "samples": 50}), seen)
+
+    return look, sizes
+
+
+def fields(report):
+    return {name: getattr(report, name) for name in report.__slots__}
+
+
+def found(look, **options):
+    return find_amplitude(look, ROOM, TRIAL, REST, rate_hz=2000.0, **({"use": 0.3} | options))
+
+
+def test_it_begins_small_grows_and_ends_within_its_part():
+    look, sizes = linear(1e-4)
+    size = found(look)
+    assert size.reasons == ()
+    assert sizes[0] == pytest.approx(0.8)  # 8 % of half the voltage
+    assert sizes == sorted(sizes)
+    assert 0.75 * 0.3 <= size.used <= 0.3
+    assert size.amplitude_v == sizes[-1]
+    assert size.amplitude_v * 1e-4 / 1e-3 == pytest.approx(size.used)
+    assert len(size.findings) == len(sizes)
+
+
+def test_a_step_is_never_larger_than_fourfold():
+    look, sizes = linear(1e-7)
+    size = found(look)
+    assert all(b <= 4.0 * a * (1 + 1e-9) for a, b in pairwise(sizes))
+    assert size.amplitude_v <= 10.0  # the voltage is a limit too
+
+
+def test_a_bench_that_is_far_too_lively_is_not_driven_further():
+    look, sizes = linear(2e-3)
+    size = found(look)
+    assert len(sizes) == 1
+    assert size.reasons == ("an excitation of 0.8 V uses 160 % of the room: give a smaller one",)
+
+
+def test_a_given_size_is_only_tried():
+    look, sizes = linear(1e-4)
+    assert found(look, given=2.0).amplitude_v == 2.0
+    assert sizes == [2.0]
+    assert "give a smaller one" in found(look, given=9.5).reasons[0]
+
+
+def test_a_trial_that_is_not_whole_ends_the_search():
+    look, _ = linear(1e-4, trips_at=1.0)
+    size = found(look)
+    assert "ended after 50 of 100 samples" in size.reasons[0]
+    assert math.isnan(size.used)
+    assert size.findings != ()  # the trial before it
+    look, _ = linear(1e-4, lose=4)
+    assert "4 of 100 samples were lost" in found(look).reasons[0]
+
+
+def test_without_limits_of_the_voltage_a_size_has_to_be_given():
+    room = Room(trips=ROOM.trips, voltage=(-math.inf, math.inf))
+    look, sizes = linear(1e-4)
+    size = find_amplitude(look, room, TRIAL, REST, rate_hz=2000.0, use=0.3)
+    assert "no loop.limits.voltage" in size.reasons[0]
+    assert sizes == []
+    assert find_amplitude(look, room, TRIAL, REST, rate_hz=2000.0, use=0.3, given=1.0).reasons == ()
+
+
+def test_on_the_prototype_a_third_of_the_room_is_used():
+    rig = prototype()
+    with Spoiled(rig) as device:
+        size = fitting_amplitude(device, rig, TRIAL)
+        assert device.state == "idle"
+        assert device.starts <= 4
+    assert 1.0 < size < 2.5
+
+
+@pytest.mark.parametrize("text", [COIL, THESIS], ids=["coil", "thesis"])
+def test_a_bench_without_a_loop_is_driven_by_most_of_its_voltage(text):
+    rig = rig_from_text(text, "rig.toml")
+    with Spoiled(rig) as device:
+        size = fitting_amplitude(device, rig, DRIVE)
+    assert 0.5 < size / rig.limits.voltage[1] < 0.85
+
+
+def test_a_bench_that_does_not_hover_has_no_amplitude():
+    rig = prototype(("kd = 92.57", "kd = 0.0"))
+    with Spoiled(rig) as device, pytest.raises(DeviceError, match=r"no amplitude was found: .*out_of_gap.*--amplitude"):
+        fitting_amplitude(device, rig, TRIAL)

@@ -1,0 +1,364 @@
+"""Guided commissioning: it comes to its end on a good bench, and stops with the right reason on others."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.acquire.devices.simulated import SimulatedDevice
+from ambid.errors import AmbidError, EstimationError
+from ambid.job import commission as room
+from ambid.job.commission import FILES, STEPS, Declined, Wishes, check_folder, commission
+from ambid.job.commission.result import record as judged_record
+from ambid.record import read_record
+from ambid.rig import load_rig
+from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
+
+SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
+TRUTH = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 0.0803}
+
+
+def ran(folder, device, *, rig=None, wishes=SHORT, **options):
+    """What came of it, and what is in the folder; the output is off, nothing is half-written."""
+    with device:
+        done = commission(device, rig or prototype(), folder, wishes=wishes, **options)
+        assert device.state in ("idle", "fault")
+    told = json.loads((folder / "commission.json").read_text(), parse_constant=pytest.fail)
+    assert [s["name"] for s in told["steps"]] == [s.name for s in done.steps] == list(STEPS[: len(done.steps)])
+    assert told["passed"] == done.passed
+    assert told["steps"][-1]["reasons"] == list(done.steps[-1].reasons)
+    assert all(s.passed for s in done.steps[:-1])
+    assert {p.name for p in folder.iterdir()} <= set(FILES)
+    return done
+
+
+def stopped_at(name, done, *words):
+    """It stopped at this step, and one reason has these words."""
+    assert done.steps[-1].name == name
+    assert not done.passed
+    reasons = done.steps[-1].reasons
+    assert any(all(w in r for w in words) for r in reasons), reasons
+
+
+def files(folder):
+    return {p.name for p in folder.iterdir()}
+
+
+@pytest.fixture
+def plain_report(monkeypatch):
+    """A report without its figures, which take seconds."""
+    monkeypatch.setattr("ambid.report.page.report_html", lambda evidence, made: f"<html>{made}</html>")
+
+
+# The way to the end.
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("good")
+    begun, said = [], []
+    done = ran(folder, SimulatedDevice(prototype()), on_begin=begun.append, on_step=said.append)
+    return folder, done, begun, said
+
+
+def test_a_good_bench_comes_to_its_end(finished):
+    folder, done, begun, said = finished
+    assert done.passed
+    assert begun == [s.name for s in said] == list(STEPS)
+    assert files(folder) == set(FILES)
+
+
+def test_what_it_found_is_the_truth(finished):
+    _, done, _, _ = finished
+    for p in done.estimate.parameters:
+        if p.name in TRUTH:
+            assert abs(p.value - TRUTH[p.name]) < 4.0 * p.sd
+            assert abs(p.value / TRUTH[p.name] - 1.0) < 0.05
+
+
+def test_what_it_leaves_can_be_read(finished):
+    folder, _, _, _ = finished
+    rig = load_rig(folder / "rig.toml")
+    assert rig.daq == prototype().daq
+    assert len(read_record(folder / "record.h5").channels[0].values) == 8000
+    assert len(read_record(folder / "second.h5").channels[0].values) == 4000
+    assert json.loads((folder / "estimate.json").read_text())["status"] == "converged"
+    assert "</html>" in (folder / "report.html").read_text()
+    lines = [json.loads(line) for line in (folder / "track.jsonl").read_text().splitlines()]
+    assert lines[0]["schema"] == "ambid.track/1"
+    assert lines[-1]["summary"]["samples"] == 4000
+    assert json.loads((folder / "commission.json").read_text())["device"]["kind"] == "simulated"
+
+
+def test_the_two_records_are_excited_differently(finished):
+    folder, _, _, _ = finished
+    first, second = (read_record(folder / f).channels[3].values for f in ("record.h5", "second.h5"))
+    assert abs(np.corrcoef(first[:4000], second)[0, 1]) < 0.5
+
+
+# Refused before anything moves.
+@pytest.mark.parametrize("name", [*FILES, "record.h5.journal"])
+def test_a_folder_of_an_earlier_one_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("precious")
+    with Spoiled(prototype()) as device:
+        with pytest.raises(AmbidError, match=rf"holds {name} of an earlier commissioning"):
+            commission(device, prototype(), tmp_path)
+        assert device.starts == 0
+    assert files(tmp_path) == {name}
+    assert (tmp_path / name).read_text() == "precious"
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(AmbidError, match="is no folder"):
+        check_folder(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"record_s": 0.5}, "the record: a multisine from 2 Hz needs 2 s for 4 periods"),
+        ({"second_s": 1.0}, "the second record: "),
+        ({"track_s": 1.0}, "tracking: "),
+        ({"band_hz": (2.0, 1500.0)}, "a trial of the amplitude: "),
+    ],
+)
+def test_what_cannot_be_played_is_refused(tmp_path, wishes, said):
+    with Spoiled(prototype()) as device:
+        with pytest.raises(AmbidError, match=said):
+            commission(device, prototype(), tmp_path, wishes=replace(SHORT, **wishes))
+        assert device.starts == 0
+    assert files(tmp_path) == set()
+
+
+def test_a_rig_without_a_loop_is_refused(tmp_path):
+    from ambid.rig import rig_from_text
+
+    rig = rig_from_text(COIL, "coil.toml")
+    with SimulatedDevice(rig) as device, pytest.raises(AmbidError, match=r"no \[loop\] with a gain"):
+        commission(device, rig, tmp_path)
+    assert files(tmp_path) == set()
+
+
+# Each step for its own reason.
+def test_a_self_test_that_fails_stops_it(tmp_path):
+    device = Spoiled(prototype())
+    device.failed = ("supply voltage outside 4.5 to 5.5 V",)
+    stopped_at("self-test", ran(tmp_path, device), "supply voltage")
+    assert device.starts == 0
+
+
+def at_rest(column, change):
+    def spoil(values, device):
+        if device.starts == 1:
+            values[:, column] = change(values[:, column])
+
+    return spoil
+
+
+def test_a_noisy_sensor_stops_it_at_rest(tmp_path):
+    noise = np.random.default_rng(1)
+    spoil = at_rest(POSITION, lambda x: 512 + 60 * noise.standard_normal(len(x)))
+    device = Spoiled(prototype(), spoil=spoil)
+    stopped_at("rest", ran(tmp_path, device), "position sensor's noise", "wiring")
+    assert device.starts == 1
+
+
+def test_current_with_the_output_off_stops_it_at_rest(tmp_path):
+    device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 150))
+    stopped_at("rest", ran(tmp_path, device), "0.36", "output off", "channels.current")
+
+
+def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
+    device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 40))
+    with device:
+        look = room.guide.looking(device, prototype(), lambda: False)
+        step = room.bench.rest(look, room.guide.Room.of(prototype()), SHORT)
+    assert step.passed
+    assert "with the output off" in step.cautions[0]
+
+
+@pytest.mark.parametrize(("column", "name"), [(POSITION, "position"), (CURRENT, "current")])
+def test_a_dead_sensor_stops_it_when_it_hovers(tmp_path, column, name):
+    def dead(values, device):
+        values[:, column] = 512
+
+    stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=dead)), f"{name} does not move", "no sensor there")
+
+
+def test_a_sensor_that_dies_on_the_way_stops_it_at_the_record(tmp_path):
+    def dead(values, device):
+        if device.starts > 2 and device.excited and device._next > 18_000:
+            values[:, CURRENT] = 512
+
+    done = ran(tmp_path, Spoiled(prototype(), spoil=dead))
+    assert done.steps[-1].name in ("record", "identify")
+    assert not done.passed
+
+
+def test_bad_gains_stop_it_when_it_lifts(tmp_path):
+    rig = prototype(("kd = 92.57", "kd = 0.0"))
+    done = ran(tmp_path, SimulatedDevice(rig), rig=rig)
+    stopped_at("levitate", done, "safe state during levitation", "out_of_gap, position outside limits", "gains")
+    assert files(tmp_path) == {"rig.toml", "commission.json"}
+
+
+def test_a_rotor_that_strays_stops_it(tmp_path):
+    def stray(values, device):
+        if device.starts == 2:
+            values[:, POSITION] = 512 + 200 * np.sign(np.sin(device.blocks))
+
+    stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=stray)), "strays", "badly damped")
+
+
+def test_a_voltage_that_is_nearly_used_up_stops_it(tmp_path):
+    def high(values, device):
+        if device.starts == 2:
+            values[:, DUTY] = 770
+
+    stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=high)), "nothing is left to excite with")
+
+
+def test_an_amplitude_that_trips_stops_it(tmp_path):
+    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=11.0))
+    stopped_at("excite", done, "safe state during excitation of 11 V")
+    assert json.loads((tmp_path / "commission.json").read_text())["steps"][-1]["numbers"]["used"] is None
+
+
+def lost_in(start):
+    return lambda device: device.starts == start and device.blocks == 150
+
+
+def test_lost_samples_stop_it_at_the_record(tmp_path):
+    wishes = replace(SHORT, amplitude_v=1.4)  # self-test, rest, hover, one trial: the record is the fourth start
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), wishes=wishes)
+    stopped_at("record", done, "20 of 8000 samples were lost during the record")
+    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5"}
+
+
+def test_lost_samples_of_the_second_record_stop_it_too(tmp_path):
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(5)), wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("record", done, "20 of 4000 samples were lost during the second record")
+    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+
+
+def test_a_sensor_at_its_end_stops_it_at_the_record(tmp_path):
+    def clip(values, device):
+        if device.starts == 4:
+            values[::50, POSITION] = 1023
+
+    done = ran(tmp_path, Spoiled(prototype(), spoil=clip), wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("record", done, "position is at the end of its range")
+
+
+def test_a_line_that_is_lost_stops_it_with_that_reason_and_keeps_the_record(tmp_path):
+    device = Silent(prototype(), after=400 + 250)
+    with device:
+        done = commission(device, prototype(), tmp_path, wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("record", done, "the line is lost", "record.h5 holds the")
+    assert len(read_record(tmp_path / "record.h5").channels[0].values) > 1000
+
+
+def test_a_fixed_value_that_is_wrong_stops_it(tmp_path):
+    rig = prototype(('R   = { unit = "ohm" }', 'R = { value = 9.0, unit = "ohm", role = "fixed" }'))
+    done = ran(tmp_path, SimulatedDevice(rig), rig=rig, wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("identify", done, "speaks against R = 9 ohm", "Check that value, or free it")
+    assert "estimate.json" in files(tmp_path)
+
+
+def test_too_little_excitation_stops_it_by_the_width_of_the_intervals(tmp_path):
+    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=0.05))
+    stopped_at("identify", done, "10 % is wanted", "record longer")
+    # signal over noise alone is a caution of the record: the intervals decide
+    assert any("signal over noise" in c for s in done.steps for c in s.cautions)
+
+
+def test_a_marginal_signal_is_a_caution_where_the_intervals_are_narrow(tmp_path, plain_report):
+    with SimulatedDevice(prototype()) as device:
+        done = commission(device, prototype(), tmp_path, wishes=replace(SHORT, amplitude_v=0.6))
+    snr = [c for s in done.steps if s.name == "record" for c in s.cautions if "signal over noise" in c]
+    assert snr
+    assert done.steps[-1].name == "track"
+
+
+def test_a_wish_that_is_narrower_than_the_record_allows_stops_it(tmp_path):
+    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4, widest=0.001))
+    stopped_at("identify", done, "m is known to", "0.1 % is wanted")
+
+
+def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise EstimationError("the record says nothing. Take another")
+
+    monkeypatch.setattr("ambid.job.commission.guide.identify", refuse)
+    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("identify", done, "the record says nothing. Take another")
+    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+
+
+def change_before(start, *changes):
+    return lambda device, mode: device.starts == start and device.become(*changes)
+
+
+def test_another_bench_in_the_second_record_stops_it_at_validation(tmp_path):
+    device = Spoiled(prototype(), before=change_before(5, ("R", 2.0), ("m", 1.3)))
+    done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
+    stopped_at("validate", done, "innovations")
+    assert "report.html" not in files(tmp_path)
+
+
+def test_another_bench_when_it_tracks_stops_it_there(tmp_path, plain_report):
+    device = Spoiled(prototype(), before=change_before(6, ("R", 1.4), ("m", 1.2)))
+    done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
+    assert done.steps[-1].name == "track"
+    assert done.steps[-1].reasons
+    assert files(tmp_path) == set(FILES)
+
+
+# Ended by people.
+def test_an_operator_who_declines_leaves_the_output_off(tmp_path):
+    asked = []
+    with Spoiled(prototype()) as device:
+        with pytest.raises(Declined, match="output stayed off"):
+            commission(device, prototype(), tmp_path, wishes=SHORT, confirm=lambda name: asked.append(name))
+        assert device.starts == 1  # the look at rest, with the output off
+        assert device.state == "idle"
+    assert asked == ["levitate"]
+    told = json.loads((tmp_path / "commission.json").read_text())
+    assert [s["name"] for s in told["steps"]] == ["self-test", "rest"]
+
+
+@pytest.mark.parametrize("name", ["rest", "levitate", "excite", "record", "track"])
+def test_an_interruption_is_the_reason_of_the_step_under_way(tmp_path, name, plain_report):
+    begun = []
+    done = ran(
+        tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
+        stopped=lambda: begun[-1:] == [name],
+    )  # fmt: skip
+    stopped_at(name, done, "interrupted")
+
+
+def test_an_interruption_while_numbers_are_worked_out(tmp_path):
+    begun = []
+    done = ran(
+        tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
+        stopped=lambda: begun[-1:] == ["identify"],
+    )  # fmt: skip
+    stopped_at("identify", done, "interrupted while working it out")
+    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+
+
+def test_a_disk_that_failed_is_the_reason(finished):
+    from ambid.acquire.quality import Quality
+    from ambid.errors import DeviceError
+    from ambid.job.acquire import Acquired
+    from tests.job.test_look import WHOLE
+
+    info = SimulatedDevice(prototype()).info
+    done = Acquired(
+        info=info, run=WHOLE, quality=Quality(info).report(), counters=SimulatedDevice(prototype()).counters(),
+        recorded=None, troubles=(DeviceError("the disk is full"),), not_stored=40,
+    )  # fmt: skip
+    step = judged_record("record", done)
+    assert step.reasons == ("40 samples of the record are not stored: the disk is full",)
+    slow = judged_record("record", replace(done, not_stored=0))
+    assert slow.passed
+    assert "the disk is full" in slow.cautions

@@ -1,0 +1,190 @@
+"""Live tracking: the stream of a device is followed, and neither the tracker nor its troubles cut off the recording."""
+
+from functools import cache
+
+import pytest
+
+from ambid.acquire.program import program
+from ambid.acquire.session import Course
+from ambid.errors import AmbidError, DeviceError
+from ambid.job.acquire import acquire
+from ambid.job.physical import identify
+from ambid.job.track_live import track_live
+from ambid.record import read_record
+from tests.acquire.scripted import Listener
+from tests.job.benches import Spoiled, prototype
+
+RIG = prototype()
+TRUTH = {"m": 0.3, "R": 6.0}
+
+
+def course(seconds):
+    wave = program("multisine", amplitude_v=1.4, band=(2.0, 66.0), rate_hz=2000.0, seconds=4.0)
+    return Course(mode="levitate", seconds=seconds, settle_s=0.5, program=wave)
+
+
+@cache
+def estimate(folder):
+    with Spoiled(RIG) as device:
+        acquire(device, RIG, folder / "start.h5", course(4.0))
+    return identify(folder / "start.h5", RIG)
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory):
+    return estimate(tmp_path_factory.mktemp("start"))
+
+
+def test_it_follows_the_bench_from_an_estimate(start):
+    heard = Listener()
+    with Spoiled(RIG, seed=3) as device:
+        done = track_live(device, RIG, course(3.0), start=start, taps=[heard])
+        assert device.state == "idle"
+    assert done.run.complete
+    assert len(heard.numbers) == 6000
+    assert done.overruns == 0
+    assert done.track.summary.samples == 6000
+    assert done.track.summary.rejected_samples == 0
+    assert done.track.lines[-1].t == pytest.approx(3.0, abs=0.02)
+    for name, truth in TRUTH.items():
+        value = done.track.lines[-1].parameters[name]
+        assert abs(value.value - truth) < 4.0 * value.sd + 0.01 * truth
+
+
+def test_without_a_start_it_identifies_the_first_part_and_tracks_the_rest():
+    with Spoiled(RIG) as device:
+        done = track_live(device, RIG, course(6.0), start_s=4.0)
+    assert done.run.complete
+    assert done.track.summary.samples == 4000  # what came while it identified is tracked too, from the part's end on
+    assert done.track.lines[-1].t == pytest.approx(6.0, abs=0.02)
+
+
+def test_a_played_bench_waits_for_the_tracker(start, monkeypatch):
+    monkeypatch.setattr("ambid.job.track_live._QUEUE_S", 0.01)  # 64 slots of the ring, 0.64 s of blocks
+    with Spoiled(RIG) as device:
+        done = track_live(device, RIG, course(8.0), start=start)
+    assert done.overruns == 0
+    assert done.track.summary.samples == 16_000
+
+
+def test_a_gap_is_seen_by_the_tracker(start):
+    with Spoiled(RIG, lose=lambda d: d.excited and d.blocks == 300) as device:
+        done = track_live(device, RIG, course(4.0), start=start)
+    assert done.run.lost == 20
+    assert done.track.summary.samples + done.track.summary.rejected_samples >= 7980
+    assert any(e.kind == "rejected" and "20 samples" in e.why for line in done.track.lines for e in line.events)
+
+
+def test_a_bench_that_changes_is_seen(start):
+    def change(values, device):
+        if device.blocks == 300 and device.excited:
+            device.become(("R", 1.5))
+
+    with Spoiled(RIG, spoil=change) as device:
+        done = track_live(device, RIG, course(5.0), start=start)
+    last = done.track.lines[-1]
+    assert done.track.summary.changes or last.error > 1.5 or last.parameters["R"].value > 7.0
+
+
+def test_a_run_that_is_too_short_is_refused_before_anything_moves(start):
+    with Spoiled(RIG) as device:
+        with pytest.raises(DeviceError, match=r"wants 5 s to begin with, and the run has 3 s.*give a start"):
+            track_live(device, RIG, course(3.0))
+        with pytest.raises(DeviceError, match=r"wants 0\.5 s to begin with"):
+            track_live(device, RIG, course(0.4), start=start)
+        assert device.starts == 0
+
+
+def test_a_fault_before_there_is_enough_says_so(start):
+    def trip(values, device):
+        if device.excited and device.blocks > 100:
+            device.become(("m", 0.01))
+
+    with (
+        Spoiled(RIG, spoil=trip) as device,
+        pytest.raises(DeviceError, match=r"stream ended after .* s \(\w+, .*limits"),
+    ):
+        track_live(device, RIG, course(6.0), start_s=5.0)
+
+
+def test_a_fault_while_it_tracks_ends_the_track_in_order(start):
+    def trip(values, device):
+        if device.excited and device.blocks > 400:
+            device.become(("m", 0.01))
+
+    with Spoiled(RIG, spoil=trip) as device:
+        done = track_live(device, RIG, course(60.0), start=start)
+    assert done.run.fault is not None
+    assert done.track.summary is not None
+    assert done.track.lines
+
+
+def test_a_tracker_that_cannot_go_on_does_not_cut_off_who_else_listens(start):
+    heard, told, runs = Listener(), [], []
+
+    def broken(header):
+        raise AmbidError("the tracker gave up")
+
+    with Spoiled(RIG) as device:
+        with pytest.raises(AmbidError, match="gave up"):
+            track_live(
+                device, RIG, course(20.0), start=start, taps=[heard], on_header=broken, on_trouble=told.append,
+                on_run=runs.append,
+            )  # fmt: skip
+        assert device.state == "idle"
+    assert [str(t) for t in told] == ["the tracker gave up"]
+    assert len(heard.numbers) == 40_000
+    assert runs[0].complete
+
+
+def test_where_nobody_else_listens_it_ends_at_once(start):
+    runs = []
+
+    def broken(header):
+        raise AmbidError("the tracker gave up")
+
+    with Spoiled(RIG, pace="real") as device:
+        with pytest.raises(AmbidError, match="gave up"):
+            track_live(device, RIG, course(600.0), start=start, on_header=broken, on_run=runs.append)
+        assert device.state == "idle"
+    assert runs[0].interrupted
+
+
+def test_an_interruption_ends_the_run(start):
+    lines, runs = [], []
+
+    def stop(line):
+        lines.append(line)
+        if len(lines) == 50:
+            raise KeyboardInterrupt
+
+    with Spoiled(RIG) as device:
+        with pytest.raises(KeyboardInterrupt):
+            track_live(device, RIG, course(600.0), start=start, on_line=stop, on_run=runs.append, keep=False)
+        assert device.state == "idle"
+    assert runs[0].interrupted
+
+
+def test_a_wish_to_end_ends_the_track_in_order(start):
+    heard = Listener()
+    with Spoiled(RIG) as device:
+        done = track_live(
+            device, RIG, course(600.0), start=start, taps=[heard], stopped=lambda: len(heard.frames) > 150
+        )
+    assert done.run.interrupted
+    assert done.track.summary.samples == len(heard.numbers) > 3000
+
+
+def test_a_line_that_is_lost_is_raised(start, tmp_path):
+    from tests.job.benches import Silent
+
+    with Silent(RIG, after=200) as device, pytest.raises(DeviceError, match="line is lost"):
+        track_live(device, RIG, course(60.0), start=start)
+
+
+def test_a_record_made_meanwhile_is_whole(start, tmp_path):
+    from ambid.job.acquire import recording
+
+    with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
+        track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)
+    assert len(read_record(tmp_path / "o.h5").channels[0].values) == 4000
