@@ -1,7 +1,7 @@
 """Measure ambid beside straightforward SciPy and beside peers: ``make bench``, or ``make bench BENCH="speed records"``.
 
-Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about half an hour,
-the physical one three minutes.
+Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about three
+quarters of an hour, the physical one three minutes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PARTS = ("physical", "montecarlo", "speed", "records", "tracking")
+PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition")
 
 
 def main(wanted: list[str]) -> None:
@@ -78,6 +78,10 @@ def _measured(part: str) -> Iterator[Any]:
         from tracking import tracking_tables
 
         return tracking_tables()
+    if part == "acquisition":
+        from acquisition import acquisition_tables
+
+        return acquisition_tables()
     from records import record_tables
 
     return record_tables()

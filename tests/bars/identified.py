@@ -29,7 +29,7 @@ class Way:
 
 
 BENCHES = {
-    "prototype": Way(DATA / "prototype.toml", 3.0),
+    "prototype": Way(DATA / "prototype.toml", 1.5),
     "heavy": Way(HERE / "heavy.toml", 4.0),
     "ball": Way(HERE / "ball.toml", 1.5, 60.0),
 }
