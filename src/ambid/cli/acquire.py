@@ -117,7 +117,7 @@ def command(
         settle_s=(1.0 if chosen == "levitate" else 0.0) if settle is None else settle, band=wanted_band, seed=seed,
         force=force,
     )  # fmt: skip
-    start, stop = start_of_track(track), Stop()
+    start, stop, before = start_of_track(track), Stop(), _changed(record)
     try:
         with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
             course = _course(wish, device, stop, watch)
@@ -128,7 +128,7 @@ def command(
 
                 done, track_end = followed(wish, device, course, start, json, stop, live=not quiet)
     except KeyboardInterrupt:
-        typer.echo(f"ambid: interrupted{_left(record)}", err=True)
+        typer.echo(f"ambid: interrupted{_left(record, before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
     _tell(done, wish, table=json != "-")
     if track_end is not None:
@@ -240,9 +240,15 @@ def _finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
         raise typer.Exit(FAILED_CHECK)
 
 
-def _left(record: Path) -> str:
+def _changed(record: Path) -> int | None:
+    return record.stat().st_mtime_ns if record.exists() else None
+
+
+def _left(record: Path, before: int | None) -> str:
     """Say where what was recorded is, after a second signal tore the run off."""
     from ambid.acquire.recorder.header import journal_path
 
     journal = journal_path(record)
+    if _changed(record) != before:
+        return f"; {record} holds what came before it"
     return f"; get what came with 'ambid recover {journal}'" if journal.exists() else "; nothing was recorded"

@@ -66,7 +66,13 @@ def command(
 
     _check({"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest})
     wishes = Wishes(
-        record_s=seconds, track_s=track_seconds, amplitude_v=amplitude, band_hz=band_of(band), widest=widest, seed=seed
+        record_s=seconds,
+        second_s=_second_s(seconds),
+        track_s=track_seconds,
+        amplitude_v=amplitude,
+        band_hz=band_of(band),
+        widest=widest,
+        seed=seed,
     )
     known, paint, stop = load_rig(rig), painter(), Stop()
     _check_port(port, yes=yes)
@@ -114,6 +120,11 @@ def command(
     typer.echo(next_text(passed, name, STEPS.index(name) + 1, len(STEPS), str(folder)))
     if not passed:
         raise typer.Exit(FAILED_CHECK)
+
+
+def _second_s(seconds: float) -> float:
+    """Return the length of the record for validation, s: two fifths, but where the first is short as long as that."""
+    return max(0.4 * seconds, min(seconds, 4.0))
 
 
 def _check(given: dict[str, float | None]) -> None:
