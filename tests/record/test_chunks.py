@@ -167,3 +167,56 @@ def test_ctrl_c_waits_for_the_library(tmp_path, record):
         write_chunks(without_samples(record), N, interrupting(), tmp_path / "a.h5", {})
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     write(record, tmp_path / "b.h5")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_handler_that_raises_waits_for_the_library(tmp_path, record, number):
+    def handler(*_):
+        raise KeyboardInterrupt
+
+    def interrupting():
+        for k, piece in enumerate(pieces(record)):
+            if k == 3:
+                os.kill(os.getpid(), number)
+            yield piece
+
+    usual = signal.signal(number, handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_chunks(without_samples(record), N, interrupting(), tmp_path / "a.h5", {})
+        assert signal.getsignal(number) is handler
+    finally:
+        signal.signal(number, usual)
+
+
+INTERRUPTED = """
+import os, signal, sys
+import numpy as np
+from ambid.record import Channel, Record, _hdf5_file
+from ambid.record.hdf5_format import write_hdf5
+
+def handler(*_):
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGINT, handler)
+write, number = _hdf5_file._Unfailing.write, iter(range(10**9))
+
+def interrupted(self, data):
+    if next(number) == int(sys.argv[2]):
+        os.kill(os.getpid(), signal.SIGINT)
+    return write(self, data)
+
+_hdf5_file._Unfailing.write = interrupted
+record = Record(channels=(Channel(name="a", unit="m", values=np.arange(5000.0)),), rate_hz=1.0)
+try:
+    write_hdf5(record, sys.argv[1])
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@pytest.mark.parametrize("at", [0, 4, 8])
+def test_a_handler_that_raises_inside_the_library_is_not_the_end_of_the_program(tmp_path, at):
+    command = [sys.executable, "-c", INTERRUPTED, str(tmp_path / "a.h5"), str(at)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "interrupted\n")

@@ -2,7 +2,7 @@
 
 The HDF5 library does not survive a write that fails: what it could not flush crashes the program when it ends. So it
 writes through a file of ours, which never fails towards the library and raises afterwards what the disk had said. For
-the same reason Ctrl-C waits until the library has come back.
+the same reason a signal whose handler raises, such as Ctrl-C, waits until the library has come back.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 
@@ -33,16 +34,26 @@ def new_hdf5(path: Path) -> Iterator[tuple[Any, Callable[[], None]]]:
 
 @contextmanager
 def _no_interrupt(file: _Unfailing) -> Iterator[None]:
-    """Take Ctrl-C for a failure of the file, which is raised by the next check."""
-    usual = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or usual is not signal.default_int_handler:
+    """Take what a handler of signals raises for a failure of the file, which is raised by the next check."""
+    usual: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, lambda *_: file.fail(KeyboardInterrupt()))
+
+    def take(number: int, frame: FrameType | None) -> None:
+        try:
+            usual[number](number, frame)
+        except BaseException as failure:
+            file.fail(failure)
+
+    taken = [number for number, handler in usual.items() if callable(handler)]
+    for number in taken:
+        signal.signal(number, take)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual)
+        for number in taken:
+            signal.signal(number, usual[number])
 
 
 class _Unfailing:
