@@ -61,6 +61,18 @@ def test_a_file_is_no_port(tmp_path):
     assert str(path) in refusal(str(path))
 
 
+def test_a_board_that_is_unplugged_while_it_starts(monkeypatch):
+    board = PtyBoard(FakeController())
+    sit_out = ports._sit_out
+
+    def unplugged(line, boot_s):
+        os.close(board.master)
+        sit_out(line, boot_s)
+
+    monkeypatch.setattr(ports, "_sit_out", unplugged)
+    assert "was lost while its board started" in refusal(board.port, boot_s=0.0)
+
+
 def test_bytes_from_before_are_discarded_and_a_pulled_cable_is_an_os_error():
     board = PtyBoard(FakeController())
     os.write(board.master, b"boot loader noise\n")

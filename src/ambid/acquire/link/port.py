@@ -143,14 +143,14 @@ def open_port(name: str, *, baud: int, boot_s: float | None = None) -> SerialPor
         line.port, line.baudrate = name, baud
         line.timeout, line.write_timeout, line.exclusive = _WAIT_S, _WRITE_S, True
         line.open()
-    except (OSError, ValueError) as failure:  # SerialException is an OSError
+    except _lost(ValueError) as failure:  # SerialException is an OSError
         line.close()
         raise DeviceError(_refusal(name, baud, failure)) from None
     try:
         _hurry(line)
         wait = (0.0 if name.startswith(_PSEUDO) else 2.0) if boot_s is None else boot_s
         _sit_out(line, wait)
-    except OSError as failure:
+    except _lost() as failure:
         line.close()
         raise DeviceError(f"port {name} was lost while its board started ({failure}). Plug it in again") from None
     except BaseException:
@@ -174,6 +174,15 @@ def candidate_ports() -> Sequence[str]:
     found = sorted(list_ports.comports(), key=lambda p: (p.vid is None, p.device))
     # A PC announces serial ports that have no connector: they have no hardware id.
     return tuple(f"{p.device} ({p.description})" for p in found if p.vid is not None or p.hwid not in (None, "n/a"))
+
+
+def _lost(*others: type[Exception]) -> tuple[type[Exception], ...]:
+    """What a line that is gone raises: on POSIX also termios.error, which is no OSError."""
+    try:
+        import termios
+    except ImportError:
+        return (OSError, *others)
+    return (OSError, termios.error, *others)
 
 
 def _hurry(line: Any) -> None:
