@@ -1,0 +1,100 @@
+"""What is said of an acquisition and of a commissioning: true in each state, and visible where something is poor."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from ambid.acquire.device import Counters, DeviceInfo
+from ambid.acquire.quality import ColumnQuality, QualityReport
+from ambid.acquire.session import RunReport
+from ambid.job.commission import STEPS, Step
+from ambid.report.acquire_text import acquired_text, progress_line
+from ambid.report.commission_text import next_text, step_text
+
+COLUMN = ColumnQuality(
+    name="gap", role="position", unit="1", mean=512.0, sd=20.0, rms=512.0, least=400.0, most=600.0, saturated=0.0,
+    used=0.2, signal_sd=19.0, noise_sd=4.0, snr_db=13.5, noise_by="periods", still_s=0.0,
+)  # fmt: skip
+DUTY = replace(COLUMN, name="duty", role="voltage", snr_db=7.0)
+QUALITY = QualityReport(
+    samples=1000, lost=0, gaps=0, repeated=0, damaged=0, seconds=0.5, rate_hz=2000.0, measured_hz=2000.4,
+    measured_sd=0.1, excited=True, columns=(COLUMN, DUTY),
+)  # fmt: skip
+RUN = RunReport(samples=1000, wanted=1000, lost=0, first=0, after=1000, fault=None, interrupted=False, events=())
+
+
+@dataclass(frozen=True)
+class Done:
+    info = DeviceInfo(kind="serial", port="/dev/ttyX", rate_hz=2000.0, columns=())
+    run: RunReport = RUN
+    quality: QualityReport = QUALITY
+    counters: Counters = Counters()  # noqa: RUF009 - frozen
+    not_stored: int = 0
+
+
+def said(**changes):
+    return " ".join(acquired_text(Done(**changes), Path("o.h5")).split())
+
+
+def test_a_whole_record_is_told_with_its_columns():
+    text = said()
+    assert text.startswith("o.h5: 1000 samples at 2000 Hz (0.5 s) from serial /dev/ttyX")
+    assert "gap 512 20 4 13.5 dB 20 % 0 %" in text
+    assert "duty 512 20 - - 20 % 0 %" in text
+    assert "what does not repeat with the excitation" in text
+
+
+def test_a_short_record_is_told_as_short():
+    text = said(run=replace(RUN, samples=700), not_stored=100)
+    assert text.startswith("o.h5: 600 samples of 1000 wanted at 2000 Hz (0.3 s)")
+
+
+def test_without_an_excitation_there_is_no_ratio():
+    still = replace(QUALITY, excited=False, columns=(replace(COLUMN, noise_by="differences"),))
+    text = said(quality=still)
+    assert "dB" not in text
+    assert "at most" in text
+    assert "dB" not in progress_line(Done(quality=still))
+
+
+def test_lost_samples_say_how_to_read_the_record():
+    assert "3 samples lost, 0 frames damaged, 0 blocks overrun; read it with --gaps" in said(run=replace(RUN, lost=3))
+
+
+def test_what_is_poor_is_said_at_the_end():
+    assert said(quality=replace(QUALITY, verdict=("gap stands still. Look at it",))).endswith(
+        "gap stands still. Look at it"
+    )
+
+
+def test_the_clock_of_the_controller_is_told_with_its_uncertainty():
+    counters = Counters(drift=12e-6, drift_sd=3e-6, controller={"busy_us": 231.0})
+    text = said(counters=counters)
+    assert "231 us in its longest tick" in text
+    assert "+12.0 ± 3.0 ppm" in text
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [(float("nan"), "2000 Hz,"), (1990.2, "1990 Hz,"), (52_000.0, "2000 Hz at 26 times real time,")],
+)
+def test_the_line_of_progress_tells_the_rate_as_it_comes(measured, words):
+    line = progress_line(Done(quality=replace(QUALITY, measured_hz=measured)))
+    assert line.startswith(f"0.5 s, {words} 0 lost, position 14 dB")
+
+
+def test_a_step_shows_findings_cautions_and_reasons():
+    step = Step(name="rest", findings=("found",), cautions=("beware",), reasons=("broken",))
+    text = step_text(step, 2, 9)
+    assert "2/9 rest" in text
+    assert [line.strip() for line in text.splitlines()[1:]] == ["found", "note: beware", "stopped: broken"]
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_after_each_step_it_is_said_what_to_do(name):
+    text = " ".join(next_text(False, name, 4, 9, "out").split())
+    assert text.startswith(f"stopped at {name}, step 4 of 9; the output is off")
+    assert "Next: " in text
+    assert "see the reason above" not in text
+    assert "{" not in text
