@@ -76,15 +76,24 @@ def progress_line(now: Under) -> str:
         One short line.
     """
     q = now.quality
-    rate = f"{q.measured_hz:.0f} Hz" if math.isfinite(q.measured_hz) else f"{q.rate_hz:g} Hz"
-    parts = [f"{q.seconds:.1f} s", rate, f"{q.lost} lost"]
+    parts = [f"{q.seconds:.1f} s", _rate(q), f"{q.lost} lost"]
     if now.counters.damaged:
         parts.append(f"{now.counters.damaged} damaged")
-    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in q.columns if c.role in _SHOWN and c.snr_db is not None]
+    # before some periods of an excitation are over, nobody knows what is signal
+    told = [c for c in q.columns if c.role in _SHOWN and c.snr_db is not None and c.noise_by == "periods"]
+    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in told]
     saturated = max((c.saturated for c in q.columns), default=0.0)
     if saturated > 0.0:
         parts.append(f"saturated {100.0 * saturated:.1f} %")
     return ", ".join(parts)
+
+
+def _rate(q: QualityReport) -> str:
+    """The rate as it comes; of a bench that is played faster than real, how much faster."""
+    pace = q.measured_hz / q.rate_hz
+    if not math.isfinite(pace):
+        return f"{q.rate_hz:g} Hz"
+    return f"{q.measured_hz:.0f} Hz" if 0.5 < pace < 2.0 else f"{q.rate_hz:g} Hz at {pace:.2g} times real time"
 
 
 def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Paint = plain) -> str:
