@@ -5,14 +5,14 @@ from scipy.stats import norm
 
 from tests.bars.identified import chain
 
-WITHIN = 0.05
+WITHIN, SECONDS = 0.05, 12.0
 SEEDS = {"prototype": (0, 1, 2), "heavy": (0,)}
 
 
 @pytest.mark.parametrize(("bench", "seed"), [(bench, seed) for bench, seeds in SEEDS.items() for seed in seeds])
 def test_identified_through_the_whole_chain(bench, seed, bench_program, firmware_elf, tmp_path):
     """Intervals hold 99.9 % for all parameters of all runs together: a sound build fails once in a thousand times."""
-    found = chain(bench, tmp_path, seed)
+    found = chain(bench, tmp_path, seed, seconds=SECONDS)
     comparisons = sum(len(seeds) for seeds in SEEDS.values()) * len(found.value)
     widest = norm.isf(0.5e-3 / comparisons)
     assert (found.status, found.complete, found.lost, found.damaged) == ("converged", True, 0, 0)
