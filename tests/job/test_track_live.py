@@ -1,5 +1,7 @@
 """Live tracking: the stream of a device is followed, and neither the tracker nor its troubles cut off the recording."""
 
+import time
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -63,6 +65,26 @@ def test_a_played_bench_waits_for_the_tracker(start, monkeypatch):
     monkeypatch.setattr("ambid.job.track_live._QUEUE_S", 0.01)  # 64 slots of the ring, 0.64 s of blocks
     with Spoiled(RIG) as device:
         done = track_live(device, RIG, course(8.0), start=start)
+    assert done.overruns == 0
+    assert done.track.summary.samples == 16_000
+
+
+def test_what_comes_in_many_short_blocks_waits_in_the_ring_while_the_tracker_is_busy(start):
+    class Hardware(Spoiled):
+        """It waits for nobody, and its port gives 250 blocks a second, of 8 samples each."""
+
+        @property
+        def info(self):
+            return replace(super().info, kind="serial")
+
+    heard = Listener()
+
+    def busy(_):
+        while len(heard.frames) < 2000:
+            time.sleep(0.01)
+
+    with Hardware(RIG, block_samples=8) as device:
+        done = track_live(device, RIG, course(8.0), start=start, taps=[heard], on_header=busy)
     assert done.overruns == 0
     assert done.track.summary.samples == 16_000
 

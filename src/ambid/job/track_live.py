@@ -36,6 +36,7 @@ from ambid.track.stream.ring import BlockRing
 
 _BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
 _QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy
+_BLOCKS_PER_S = 250  # that a port gives at most, however few samples each of them holds
 _LOOK_S = 0.1
 _CHECKED_S = 0.5  # of the stream that a given start is checked with
 _IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is to be identified
@@ -128,7 +129,7 @@ def track_live(
             f"tracking wants {wanted_s:g} s to begin with, and the run has {course.seconds:g} s. Run longer"
             + ("" if start is not None else ", or give a start")
         )
-    slots = max(64, ceil(4.0 * _QUEUE_S * view.rate_hz / _BLOCK_SAMPLES))
+    slots = max(64, ceil(_QUEUE_S * (_BLOCKS_PER_S + view.rate_hz / _BLOCK_SAMPLES)))
     with BlockRing.create(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
