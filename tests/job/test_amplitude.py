@@ -106,6 +106,14 @@ def test_on_the_prototype_a_third_of_the_room_is_used():
     assert 1.0 < size < 2.5
 
 
+def test_it_keeps_to_the_pulse_widths_allowed():
+    rig = prototype(("rate_hz = 2000.0", "rate_hz = 2000.0\nduty = [300, 500]"))
+    fast = Trial(name="multisine", band=(200.0, 400.0), mode="levitate", settle_s=0.2, seconds=0.5, seed=0)
+    with Spoiled(rig) as device:
+        size = fitting_amplitude(device, rig, fast)
+    assert 0.3 < size < 3.0  # with all of +-11.4 V a trial of 3.6 V would have been refused
+
+
 @pytest.mark.parametrize("text", [COIL, THESIS], ids=["coil", "thesis"])
 def test_a_bench_without_a_loop_is_driven_by_most_of_its_voltage(text):
     rig = rig_from_text(text, "rig.toml")

@@ -65,6 +65,14 @@ def test_a_rig_without_daq_has_the_trips_that_the_device_makes_up():
 
 
 @pytest.mark.parametrize(
+    ("duty", "volts"), [("[300, 500]", (-3.0, 3.0)), ("[0, 500]", (-11.4, 3.0)), ("[0, 800]", (-11.4, 11.4))]
+)
+def test_the_voltage_is_what_the_pulse_widths_allowed_can_order(duty, volts):
+    room = Room.of(prototype(("rate_hz = 2000.0", f"rate_hz = 2000.0\nduty = {duty}")))
+    assert room.voltage == pytest.approx(volts)
+
+
+@pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({}, None),

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.acquire.causes import fault_words
+from ambid.acquire.default_daq import with_default_daq
 from ambid.acquire.device import Device
+from ambid.acquire.scales import scale_of
 from ambid.acquire.session import Course, RunReport, run
 from ambid.acquire.view import BenchView
 from ambid.physics.models import model
@@ -30,7 +32,7 @@ class Room:
     trips : Mapping of str to (float, float)
         Of position and current, those of them that the bench has: the controller's limits.
     voltage : (float, float)
-        Of the power stage.
+        That may be ordered: inside the limits of the loop and ``daq.duty``.
     """
 
     trips: Mapping[str, tuple[float, float]]
@@ -53,7 +55,9 @@ class Room:
         unlimited = (-math.inf, math.inf)
         roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
         trips: dict[str, tuple[float, float]] = {role: rig.trip(role) or unlimited for role in roles}
-        return cls(trips=MappingProxyType(trips), voltage=rig.limits.voltage if rig.limits else unlimited)
+        return cls(
+            trips=MappingProxyType(trips), voltage=_ordered(rig, rig.limits.voltage if rig.limits else unlimited)
+        )
 
     def used(self, role: str, values: Array, rest: float) -> float:
         """Return which part of the way from rest to the nearer trip is used, 0 to 1 and beyond.
@@ -77,6 +81,14 @@ class Room:
         return max(
             up / (high - rest) if high > rest else math.inf, down / (rest - low) if rest > low else math.inf, 0.0
         )
+
+
+def _ordered(rig: Rig, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return what of the limits of the voltage the pulse widths allowed can order."""
+    if rig.daq is None or rig.daq.duty is None:
+        return limits
+    low, high = sorted(scale_of(with_default_daq(rig), "voltage").to_si(rig.daq.duty).tolist())
+    return max(low, limits[0]), min(high, limits[1])
 
 
 class Kept:
