@@ -2,14 +2,16 @@
  * Pins, timers and the chain of conversions of the ATmega328P. Timer 1 makes the pulse width, timer 2 the ticks: an exact number of periods of it.
  *
  * Timer 2 counts at clock/32: 25 counts a period. Its interrupt comes each `base` periods, at most 10 (0.5 ms), and each
- * `share`-th is a tick; in all of them the interlock and the receive line are looked at. The tick starts the first
- * conversion, each conversion the next, and the last one calls the work of the tick with interrupts enabled.
+ * `share`-th is a tick; in all of them the interlock and the receive line are looked at.
  *
- * Order and phase: current, position, current, third input, some 31 us apart; the current is the mean of its two. They
- * are held 6 us before and 6 us after the begin of a period of 50 us, with the position in the middle between them. So
- * both stand for the same moment, and the ripple of the current, which around the begin of a period does not depend on
- * the pulse width to first order, leaves no error that looks like resistance. A position 26 us off the current, and a
- * current from the middle of the pause, made R 0.15 % too large.
+ * A tick, in us from the begin of a period of 50 us:
+ *   -8 current, 25 position, 58 current are held: interrupts wait for that count of timer 1; at 85 or so the third input
+ *   53 the position is there: with the output on the law begins, with interrupts enabled, and looks itself for the
+ *      inputs that come meanwhile; what is to be sent waits until it is done
+ *   150 to 200 the pulse width is ordered; it acts from 200 on, 175 us after the position was held
+ * The current is the mean of its two, so that both inputs stand for the same moment; and the ripple of the current, which
+ * around the begin of a period does not depend on the pulse width to first order, leaves no error that looks like
+ * resistance. A position 26 us off the current, and a current from the middle of the pause, made R 0.15 % too large.
  */
 #ifdef __AVR__
 #pragma GCC optimize("O2") /* it runs in each tick */
@@ -26,13 +28,20 @@
 #define LONGEST_BASE 10
 #define COUNTS_PER_PERIOD 25 /* of timer 2 */
 #define COUNT_US 2
-#define PHASE 489            /* counts of timer 1 at the tick, less the way to the first conversion */
-#define FIRST_CURRENT 0 /* steps of the conversions of a tick */
+#define PHASE 435        /* counts of timer 1 at the tick: the way to the first conversion, and some 5 us to spare */
+#define FIRST_CURRENT 0  /* steps of the conversions of a tick */
+#define POSITION_STEP 1
 #define SECOND_CURRENT 2
-#define LATE 500 /* counts of timer 1: from here on a pulse width waits for the next period */
+#define START_LEAD 14    /* counts of timer 1 from its reading to the start of the conversion */
+#define HOLD 48          /* and from there until the input is held: 1.5 clocks of the converter */
+#define TIMER_1(us) ((us) * 16 - HOLD - START_LEAD)
+#define ORDER_EARLIEST 87 /* counts of timer 2 from the tick, which is 21 us before the begin of a period: 153 us */
+#define ORDER_LATEST 120  /* later than the begin of the period from which it should act */
 enum { POSITION, CURRENT, THIRD };
 static const uint8_t order_of_inputs[] = {CURRENT, POSITION, CURRENT, THIRD};
+static const uint16_t start_at[] = {TIMER_1(50 - 8), TIMER_1(25), TIMER_1(8)}; /* counts of timer 1 */
 static volatile uint8_t sampling, working, steps_wanted, step;
+static uint8_t awaited; /* step whose conversion the work of the tick looks for, 0: none */
 static uint16_t first_current;
 static volatile uint8_t base = LONGEST_BASE;
 static volatile uint16_t share = 1, share_left = 1;
@@ -113,14 +122,6 @@ void board_duty(uint16_t duty)
     }
 }
 
-/* The law is done some 120 us after the position was held, and a period begins at 126 us. Without this the pulse width
- * acted now in that one and now in the next, 50 us later, as the bytes on the line had it: R came out 0.8 % wrong. */
-void board_await_period(void)
-{
-    while (TCNT1 >= LATE)
-        ;
-}
-
 void board_lamp(uint8_t on)
 {
     if (on)
@@ -161,7 +162,7 @@ void board_ticks_start(uint16_t period, uint8_t inputs)
     {
         share = share_left = period / periods;
         steps_wanted = (uint8_t)(inputs + 1); /* the current twice */
-        working = 0;
+        working = awaited = 0;
         ADCSRA = ADC_RUN | _BV(ADIF);
         begin_base(periods);
         sampling = 1;
@@ -177,17 +178,17 @@ void board_ticks_stop(void)
 /* No stop bits, or low without a byte in several readings: a byte is over in 10 us, readings are 50 us apart or more. */
 static inline uint8_t line_broken(void)
 {
-    return board_bad_bytes >= BAD_BYTES || low_readings >= readings;
+    return (board_bad_bytes >= BAD_BYTES && !(BOARD_FLAGS & SOUND_BYTE)) || low_readings >= readings;
 }
 
 static inline void watch_lines(void)
 {
     uint8_t pins = PIND;
-    if ((pins & _BV(PIND0)) || board_byte_came)
+    if ((pins & _BV(PIND0)) || (BOARD_FLAGS & BYTE_CAME))
         low_readings = 0;
     else if (low_readings < 255)
         low_readings++;
-    board_byte_came = 0;
+    BOARD_FLAGS &= (uint8_t)~BYTE_CAME;
 #if BOARD_INTERLOCK
     if (!(pins & _BV(PIND7)))
         open_readings = 0;
@@ -196,7 +197,20 @@ static inline void watch_lines(void)
 #endif
 }
 
-ISR(TIMER2_COMPA_vect)
+/* Starts the conversion of a step, at its count of timer 1 unless that is over. */
+static inline void start_conversion(uint8_t next, uint8_t interrupt)
+{
+    ADMUX = (uint8_t)(_BV(REFS0) | order_of_inputs[next]);
+    if (next <= SECOND_CURRENT) {
+        uint16_t at = start_at[next], now;
+        do
+            now = TCNT1;
+        while (now < at || now > at + BOARD_PWM_TOP / 2);
+    }
+    ADCSRA = ADC_RUN | _BV(ADSC) | _BV(ADIF) | interrupt;
+}
+
+static inline void watch(void)
 {
     beats++;
     watch_lines();
@@ -204,53 +218,103 @@ ISR(TIMER2_COMPA_vect)
         if (daq_output_on())
             safety_enter(line_broken() ? CAUSE_LINE_BREAK : CAUSE_INTERLOCK);
     }
-    if (!sampling || --share_left)
-        return;
-    share_left = share;
-    if (tick_begin(working)) {
-        working = 1;
-        step = 0;
-        ADMUX = _BV(REFS0) | CURRENT;
-        ADCSRA = ADC_RUN | _BV(ADIE) | _BV(ADSC);
+}
+
+ISR(TIMER2_COMPA_vect)
+{
+    if (sampling && --share_left == 0) {
+        share_left = share;
+        if (tick_begin(working)) {
+            working = 1;
+            step = FIRST_CURRENT;
+            start_conversion(FIRST_CURRENT, _BV(ADIE));
+        }
     }
+    watch();
 }
 
-/* Time since the last tick, by timer 2 and the interrupts since; interrupts are off. */
-static inline void measure_busy(void)
+/* Since the last tick, in counts of timer 2: by it and its interrupts since. Interrupts are off. */
+static inline uint16_t since_tick(void)
 {
-    uint16_t us = (uint16_t)(TCNT2 * COUNT_US);
+    uint16_t counts = TCNT2;
     if (TIFR2 & _BV(OCF2A))
-        us = (uint16_t)(base * BOARD_PERIOD_US);
-    us = (uint16_t)(us + (share - share_left) * base * BOARD_PERIOD_US);
-    if (us > daq.busy_us)
-        daq.busy_us = us;
+        counts = (uint16_t)(TCNT2 + base * COUNTS_PER_PERIOD);
+    return (uint16_t)(counts + (share - share_left) * base * COUNTS_PER_PERIOD);
 }
 
-ISR(ADC_vect)
+/* A pulse width that is ordered in time acts from a fixed period on: not in the one before, as the law may be done early,
+ * so that the order waits. With an order that waits for nothing R came out 0.8 % wrong. */
+void board_await_order(void)
 {
-    uint8_t done = step;
-    uint16_t counts = ADC;
+    uint16_t counts;
+    do {
+        ATOMICALLY { counts = since_tick(); }
+    } while (counts < ORDER_EARLIEST);
+}
+
+uint8_t board_order_late(void)
+{
+    uint16_t counts = since_tick();
+    return counts > ORDER_LATEST || (counts > ORDER_EARLIEST + 12 && TCNT1 < BOARD_PWM_TOP / 2);
+}
+
+static inline void keep_input(uint8_t done, uint16_t counts)
+{
     if (done == FIRST_CURRENT)
         first_current = counts;
     else if (done == SECOND_CURRENT)
         daq.inputs[CURRENT] = (uint16_t)((first_current + counts + 1) / 2);
     else
         daq.inputs[order_of_inputs[done]] = counts;
+}
+
+void board_await_input(uint8_t input)
+{
+    while (awaited && (input == CURRENT ? awaited == SECOND_CURRENT : 1)) {
+        uint8_t done = awaited, next = (uint8_t)(done + 1);
+        while (ADCSRA & _BV(ADSC))
+            ;
+        keep_input(done, ADC);
+        awaited = next < steps_wanted ? next : 0;
+        if (awaited)
+            start_conversion(next, 0);
+    }
+}
+
+static inline void work(void)
+{
+    sei();
+    tick_work();
+    board_await_input(THIRD);
+    board_send();
+    cli();
+    uint16_t us = (uint16_t)(since_tick() * COUNT_US);
+    if (us > daq.busy_us)
+        daq.busy_us = us;
+    working = 0;
+}
+
+/* The next conversion starts before the last one's result is read, which stands until the next one's is there. */
+ISR(ADC_vect)
+{
+    uint8_t done = step, next = (uint8_t)(done + 1), early;
     if (!sampling) {
         working = 0;
         return;
     }
-    if (++done < steps_wanted) {
-        step = done;
-        ADMUX = (uint8_t)(_BV(REFS0) | order_of_inputs[done]);
-        ADCSRA = ADC_RUN | _BV(ADIE) | _BV(ADSC);
-        return;
+    early = done == POSITION_STEP && daq_output_on();
+    if (next < steps_wanted) {
+        start_conversion(next, early ? 0 : _BV(ADIE));
+        step = next;
     }
-    sei();
-    tick_work();
-    cli();
-    measure_busy();
-    working = 0;
+    keep_input(done, ADC);
+    if (early) {
+        awaited = next;
+        board_send_later();
+        work();
+    } else if (next >= steps_wanted) {
+        work();
+    }
 }
 
 uint8_t board_interlock_open(void)

@@ -50,8 +50,12 @@ uint8_t board_begin(void);
 void board_output(uint8_t on);
 void board_duty(uint16_t duty);
 
-/* Waits, at most 19 us, while a pulse width might still act in this period or only in the next: then it is the next. */
-void board_await_period(void);
+/* Waits until a pulse width that is ordered now acts at the fixed time after the tick. */
+void board_await_order(void);
+/* The order came too late for that, it acts a period later; asked with interrupts off, at once after the order. */
+uint8_t board_order_late(void);
+/* Waits until input 1 or 2 of this tick is in daq.inputs; the law begins when input 0 is there. */
+void board_await_input(uint8_t input);
 void board_lamp(uint8_t on);
 
 /* Ticks of `period` periods of the pulse width, each of which converts `inputs` inputs and calls tick_work. */

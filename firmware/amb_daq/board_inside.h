@@ -11,10 +11,15 @@
 #define ADC_RUN (_BV(ADEN) | _BV(ADPS2) | _BV(ADPS0)) /* 500 kHz */
 #define BAD_BYTES 4 /* without stop bit, one after the other: the line is broken */
 
-extern volatile uint8_t board_byte_came; /* a sound byte, since the timer's last interrupt */
-extern volatile uint8_t board_bad_bytes; /* without stop bit, since the last sound one */
+/* Bits in a register that one instruction sets and clears. */
+#define BOARD_FLAGS GPIOR0
+#define SOUND_BYTE _BV(0) /* since the last one without stop bit */
+#define BYTE_CAME _BV(1)  /* a sound one, since the timer's last interrupt */
+
+extern volatile uint8_t board_bad_bytes; /* without stop bit, one after the other, before a SOUND_BYTE */
 extern uint8_t board_reset_cause;        /* MCUSR as the reset left it */
 
 void board_begin_line(void);
+void board_send_later(void); /* sends nothing more until board_send; interrupts are off */
 
 #endif

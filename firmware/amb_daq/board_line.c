@@ -11,7 +11,7 @@
 
 struct tx_ring board_tx;
 struct rx_ring board_rx;
-volatile uint8_t board_byte_came, board_bad_bytes;
+volatile uint8_t board_bad_bytes;
 
 static volatile uint8_t lost; /* bytes, modulo 256 */
 
@@ -25,21 +25,23 @@ void board_begin_line(void)
     UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
 }
 
-/* A byte without stop bit is not passed on. One that overran the hardware is gone, the one that is read is sound. */
+/* A byte without stop bit is not passed on. One that overran the hardware is gone, the one that is read is sound.
+ * With the line full this runs each 10 us: what must be done for a sound byte is done in few registers. */
 ISR(USART_RX_vect)
 {
     uint8_t status = UCSR0A, byte = UDR0;
     if (status & (_BV(DOR0) | _BV(FE0))) {
         lost++;
         if (status & _BV(FE0)) {
-            board_bad_bytes++;
+            board_bad_bytes = BOARD_FLAGS & SOUND_BYTE ? 1 : (uint8_t)(board_bad_bytes + 1);
             if (board_bad_bytes > BAD_BYTES)
                 board_bad_bytes = BAD_BYTES;
+            BOARD_FLAGS &= (uint8_t)~SOUND_BYTE;
             return;
         }
     }
-    board_bad_bytes = 0;
-    board_byte_came = 1;
+    BOARD_FLAGS |= SOUND_BYTE;
+    BOARD_FLAGS |= BYTE_CAME;
     if (!rx_put(&board_rx, byte))
         lost++;
 }
@@ -51,6 +53,11 @@ ISR(USART_UDRE_vect)
     board_tx.tail = tail;
     if (tail == board_tx.head)
         UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
+}
+
+void board_send_later(void)
+{
+    UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
 }
 
 void board_send(void)

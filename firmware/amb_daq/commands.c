@@ -12,6 +12,7 @@
 #include "report.h"
 #include "safety.h"
 #include "selftest.h"
+#include "tick.h"
 
 #define IN(state) (uint8_t)(1 << (state))
 #define ANY 0xff
@@ -221,6 +222,7 @@ static uint8_t on_excite(struct request *r)
         daq.excitation.playing = 0;
         if (wanted.on && daq_output_on()) /* a fault may just have come */
             excitation_begin(&daq.excitation);
+        tick_prepare();
     }
     return CODE_DONE;
 }

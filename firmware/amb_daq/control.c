@@ -77,30 +77,32 @@ static inline int32_t filtered(struct control *control, uint16_t position)
     return control->derivative = within(derivative, DERIVATIVE_LARGEST);
 }
 
-uint16_t control_step(struct control *control, uint16_t position, uint16_t current, int16_t excitation, uint16_t low,
-                      uint16_t high)
+void control_begin(struct control *control, uint16_t position)
 {
     int16_t error = (int16_t)(control->gains.setpoint - position);
-    int32_t growth = product(control->gains.ki, error);
-    int32_t sum = product(control->gains.kp, error) + (control->integral >> 4);
+    control->growth = product(control->gains.ki, error);
+    control->sum = product(control->gains.kp, error) + (control->integral >> 4) + filtered(control, position);
+}
+
+uint16_t control_end(struct control *control, uint16_t current, int16_t excitation, uint16_t low, uint16_t high)
+{
+    int32_t sum = control->sum - product(control->gains.kc, (int16_t)(current - control->gains.current_rest));
     uint16_t fraction; /* of a count, 2^-16 */
     int16_t whole;     /* counts below or at what is wanted */
     uint8_t growing = 1;
-    sum += filtered(control, position);
-    sum -= product(control->gains.kc, (int16_t)(current - control->gains.current_rest));
     sum = within(sum, SUM_LARGEST) * 16;
     whole = (int16_t)((int16_t)(sum >> 16) + (int16_t)control->gains.duty_bias + excitation);
     fraction = (uint16_t)sum;
     if (whole > (int16_t)high || (whole == (int16_t)high && fraction)) {
         whole = (int16_t)high;
-        growing = growth <= 0;
+        growing = control->growth <= 0;
     } else if (whole < (int16_t)low) {
         whole = (int16_t)low;
-        growing = growth >= 0;
+        growing = control->growth >= 0;
     } else if (fraction & 0x8000u) {
         whole++;
     }
     if (growing)
-        control->integral = within(control->integral + growth, INTEGRAL_LARGEST);
+        control->integral = within(control->integral + control->growth, INTEGRAL_LARGEST);
     return (uint16_t)whole;
 }

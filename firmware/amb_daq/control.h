@@ -28,6 +28,7 @@ struct control {
     int32_t derivative; /* 2^-12 counts */
     uint16_t last;      /* position of the last tick */
     uint8_t begun;      /* there was a last tick */
+    int32_t growth, sum; /* of this tick: what the integral would grow by; what the position alone asks for, 2^-12 */
 };
 
 /* Returns 0, or the number of the field (from 1, the id is 1) of a gain that could overflow. */
@@ -36,8 +37,9 @@ uint8_t control_refuses(const struct msg_gains *gains);
 /* Forgets integral and derivative. */
 void control_reset(struct control *control);
 
-/* One tick: returns the pulse width, within low and high. */
-uint16_t control_step(struct control *control, uint16_t position, uint16_t current, int16_t excitation, uint16_t low,
-                      uint16_t high);
+/* One tick, in two steps, as the position is there before the current. The second returns the pulse width, within low and
+ * high; nothing changes the gains between them. */
+void control_begin(struct control *control, uint16_t position);
+uint16_t control_end(struct control *control, uint16_t current, int16_t excitation, uint16_t low, uint16_t high);
 
 #endif

@@ -5,6 +5,8 @@
 
 #include <string.h>
 
+#include "tick.h"
+
 struct daq daq;
 
 void daq_begin(uint8_t by_watchdog)
@@ -37,6 +39,7 @@ void daq_output(uint8_t state)
     {
         control_reset(&daq.control);
         daq.excitation.playing = 0;
+        tick_prepare();
         daq.host_ticks = host;
         daq.lift_ticks = lift;
         daq.silent_ticks = 0;

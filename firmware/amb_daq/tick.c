@@ -13,6 +13,7 @@
 
 static struct sample queue[SAMPLE_QUEUE];
 static volatile uint8_t queue_head, queue_tail;
+static int16_t prepared; /* excitation of the next tick */
 
 uint8_t tick_begin(uint8_t still_working)
 {
@@ -42,12 +43,14 @@ static int16_t bias(void)
 /* Orders the pulse width; a fault that came meanwhile wins. */
 static uint16_t order(uint16_t duty)
 {
-    board_await_period();
+    board_await_order();
     ATOMICALLY
     {
         if (daq_output_on()) {
             board_duty(duty);
             board_output(1);
+            if (board_order_late())
+                daq_count(&daq.overruns);
         } else {
             duty = daq.limits.duty_off;
         }
@@ -83,26 +86,44 @@ static void keep(uint16_t tick, uint16_t duty, int16_t excitation)
     queue_head = next;
 }
 
+void tick_prepare(void)
+{
+    prepared = excitation_next(&daq.excitation, daq.table);
+}
+
+/* What only needs the position comes first: the current is still being converted. */
+static uint16_t law(int16_t *excitation)
+{
+    uint8_t cause, levitating = daq.state == STATE_LEVITATING;
+    uint16_t duty;
+    *excitation = prepared;
+    if (levitating)
+        control_begin(&daq.control, daq.inputs[0]);
+    board_await_input(1);
+    cause = safety_check();
+    if (cause) {
+        safety_enter(cause);
+        *excitation = 0;
+        return daq.limits.duty_off;
+    }
+    if (levitating)
+        duty = control_end(&daq.control, daq.inputs[1], *excitation, daq.limits.duty_low, daq.limits.duty_high);
+    else
+        duty = limited((int16_t)(bias() + *excitation));
+    board_send();
+    duty = order(duty);
+    tick_prepare();
+    return duty;
+}
+
 void tick_work(void)
 {
     uint16_t tick, duty = daq.limits.duty_off;
     int16_t excitation = 0;
-    uint8_t cause;
     ATOMICALLY { tick = (uint16_t)(daq.ticks - 1); }
-    if (daq_output_on()) {
-        cause = safety_check();
-        if (cause) {
-            safety_enter(cause);
-        } else {
-            excitation = excitation_next(&daq.excitation, daq.table);
-            if (daq.state == STATE_LEVITATING)
-                duty = control_step(&daq.control, daq.inputs[0], daq.inputs[1], excitation, daq.limits.duty_low,
-                                    daq.limits.duty_high);
-            else
-                duty = limited((int16_t)(bias() + excitation));
-            duty = order(duty);
-        }
-    }
+    if (daq_output_on())
+        duty = law(&excitation);
+    board_await_input(2);
     keep(tick, duty, excitation);
 }
 

@@ -24,6 +24,10 @@ uint8_t tick_begin(uint8_t still_working);
 /* End of it: daq.inputs are converted. */
 void tick_work(void);
 
+/* Takes the excitation of the next tick: each tick does it for the one after, as it takes 10 us; also to be called, with
+ * no tick in between, when the excitation begins or ends. */
+void tick_prepare(void);
+
 /* The oldest sample that waits, or NULL; it stands until tick_sent. */
 const struct sample *tick_sample(void);
 void tick_sent(void);

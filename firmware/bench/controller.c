@@ -135,6 +135,17 @@ static avr_cycle_count_t hold_cycles(const struct controller *c)
     return ((avr_cycle_count_t)3 << (prescaler ? prescaler : 1u)) / 2;
 }
 
+static void write_row(const struct controller *c)
+{
+    const uint64_t ticks = c->at - c->volt_from, begin = c->at - (c->at - c->pwm.base) % pwm_period(&c->pwm);
+    if (c->trajectory == NULL)
+        return;
+    fprintf(c->trajectory, "%.8f,%.12g,%.12g,%.12g,%.9g,%u,", controller_seconds(c), c->plant->x, c->plant->v,
+            c->plant->i, ticks ? c->volt_ticks / (double)ticks : 0.0, c->enabled ? pwm_width(&c->pwm) : 0);
+    fprintf(c->trajectory, "%.8f,%.8f,%.8f\n", (double)begin / CLOCK_HZ, (double)c->current_held[0] / CLOCK_HZ,
+            (double)c->current_held[1] / CLOCK_HZ);
+}
+
 static avr_cycle_count_t held(struct avr_t *avr, avr_cycle_count_t when, void *param)
 {
     struct controller *c = param;
@@ -148,11 +159,12 @@ static avr_cycle_count_t held(struct avr_t *avr, avr_cycle_count_t when, void *p
         if (!isnan(c->override[source]))
             volts = c->override[source];
     }
-    if (source == 0) {
-        const uint64_t ticks = c->at - c->volt_from;
-        if (c->trajectory != NULL)
-            fprintf(c->trajectory, "%.8f,%.12g,%.12g,%.12g,%.9g,%u\n", controller_seconds(c), c->plant->x, c->plant->v,
-                    c->plant->i, ticks ? c->volt_ticks / (double)ticks : 0.0, c->enabled ? pwm_width(&c->pwm) : 0);
+    if (source == PLANT_CURRENT) {
+        c->current_held[0] = c->current_held[1];
+        c->current_held[1] = c->at;
+    }
+    if (source == PLANT_POSITION) {
+        write_row(c);
         c->volt_ticks = 0.0;
         c->volt_from = c->at;
         c->conversions++;

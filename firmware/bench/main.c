@@ -310,7 +310,7 @@ static int open_files(const struct options *o)
             fprintf(stderr, "amb_bench: --trajectory %s: %s\n", o->trajectory, strerror(errno));
             return -1;
         }
-        fputs("t,x,v,i,voltage,duty\n", controller.trajectory);
+        fputs("t,x,v,i,voltage,duty,begin,current_0,current_1\n", controller.trajectory);
     }
     return 0;
 }

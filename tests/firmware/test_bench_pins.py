@@ -105,10 +105,10 @@ def test_the_pulse_is_as_wide_as_the_data_sheet_says(probe, pwm):
 
 def test_a_new_pulse_width_acts_from_a_bottom_on(probe):
     bench, line = probe({})
-    line.compare(99)
+    line.compare(199)  # the inputs are held within each pulse
     line.wait_ticks(2)
     line.enable(1)
-    values = [699, 99, 599, 99, 499, 99, 699, 99]
+    values = [699, 199, 599, 199, 499, 199, 699, 199]
     for value in values:
         line.wait_ticks(3)
         line.compare(value)
@@ -118,7 +118,7 @@ def test_a_new_pulse_width_acts_from_a_bottom_on(probe):
     rows = trajectory(bench)
     means = rows[rows[:, 0] > on + 5.1e-4][:, 4]
     ticks_high = (means + 24.0) / 48.0 * 8000  # of ten periods
-    whole = [k * (value + 1) + (10 - k) * 100 for value in (699, 599, 499) for k in range(11)]
+    whole = [k * (value + 1) + (10 - k) * 200 for value in (699, 599, 499) for k in range(11)]
     assert np.abs(ticks_high[:, None] - np.array(whole)).min(axis=1) == pytest.approx(0.0, abs=1e-3)
     assert len({round(x) for x in ticks_high}) >= 4
 

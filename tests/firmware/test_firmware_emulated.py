@@ -29,8 +29,8 @@ BENCH = {
 OVER_CURRENT, OUT_OF_GAP, INTERLOCK, LINE_BREAK, SILENT = 3, 4, 5, 6, 2
 
 
-def _gains(rate_hz):
-    """Of the protocol, for a loop with poles at some 30 Hz."""
+def gains_for(rate_hz):
+    """Return those of the protocol for a loop with poles at some 30 Hz."""
     loop = placed_loop(PLANT, (-150, -180, -200 + 100j, -200 - 100j), derivative_cutoff_hz=1000.0)
     count_m, count_a, count_v = 5 / 1024 / 4000, 5 / 1024 / 0.8, 24 / 800
     period, tau = 1 / rate_hz, loop.filter_s
@@ -100,7 +100,7 @@ def test_samples_flow_without_loss(bench, period, stream):
 
 def test_the_unstable_rotor_is_held(bench):
     emulator, host = bench()
-    host.make_ready(gains=_gains(2000.0), stream=0x1F)
+    host.make_ready(gains=gains_for(2000.0), stream=0x1F)
     host.done("excitation", kind=2, amplitude=10, hold=4, length=8, cycles=2, seed=1)
     host.done("start", mode=3)
     host.flow(1000)

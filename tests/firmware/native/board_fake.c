@@ -11,7 +11,9 @@ struct fake fake;
 
 uint8_t board_begin(void) { return fake.by_watchdog; }
 void board_output(uint8_t on) { fake.output = on; }
-void board_await_period(void) {}
+void board_await_order(void) {}
+uint8_t board_order_late(void) { return fake.order_late; }
+void board_await_input(uint8_t input) { (void)input; }
 
 void board_duty(uint16_t duty)
 {

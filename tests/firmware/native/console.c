@@ -102,7 +102,8 @@ static void run_law(const char *rest)
         if (end == begin)
             break;
         long i = strtol(end, &end, 10), e = strtol(end, &end, 10);
-        printf("%u ", control_step(&law, (uint16_t)x, (uint16_t)i, (int16_t)e, low, high));
+        control_begin(&law, (uint16_t)x);
+        printf("%u ", control_end(&law, (uint16_t)i, (int16_t)e, low, high));
     }
     printf("\n");
 }
