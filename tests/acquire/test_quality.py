@@ -92,6 +92,15 @@ def test_noise_by_periods_is_unbiased_over_many_streams():
         assert abs(np.mean(found) - truth) < 3.0 * error
 
 
+def test_a_period_that_has_hardly_come_again_does_not_tell_the_noise():
+    """Noise that hardly changes within 50 samples: their few repetitions are one draw of it, not 50."""
+    wave = Program(kind="table", amplitude=1.0, hold=1, length=1000, cycles=0, table=(1,) * 1000)
+    column = Column(name="gap", role="position", unit="1")
+    x = np.sin(np.arange(2500) * 2e-3 * math.pi)[:, None] + noise(2500, 0.1)
+    assert fed(Quality(info(column), wave), x[:2050]).columns[0].noise_by == "differences"
+    assert fed(Quality(info(column), wave), x).columns[0].noise_by == "periods"
+
+
 def test_the_time_before_the_excitation_settles_is_left_out():
     played = program("multisine", amplitude_v=2.0, rate_hz=RATE, seconds=4.0, seed=1)
     late = 200  # the excitation begins so many ticks after the stream, with a transient of a hundred times its size

@@ -22,7 +22,8 @@ from ambid.track.stream.block import Frame
 Array = NDArray[np.float64]
 
 _LONGEST_PERIOD = 1 << 17  # ticks that are folded: 1 MB a column
-_FREEDOM = 30  # degrees of freedom under which the periods do not tell the noise
+_FREEDOM = 30  # degrees of freedom under which the periods do not tell the noise,
+_FREE_SHARE = 0.5  # and part of a period that has to have come again: noise of neighbouring samples is often the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,9 +211,10 @@ class Quality:
         by: Literal["periods", "differences"] = "differences"
         noise = np.minimum(self._differences.variance, m.variance)
         signal = m.variance - noise
-        if self._periods is not None and self._periods.freedom >= _FREEDOM:
+        periods = self._periods
+        if periods is not None and periods.freedom >= max(_FREEDOM, _FREE_SHARE * periods.period):
             by = "periods"
-            signal, noise = self._periods.variances()
+            signal, noise = periods.variances()
         return tuple(
             ColumnQuality(
                 name=c.name,
