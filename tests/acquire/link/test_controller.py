@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -138,6 +139,25 @@ def test_a_lost_line_is_told_once_and_at_once():
         assert len(s.lost) == 1
         assert "was lost" in str(s.controller.failure)
     assert s.port.closed
+
+
+def test_a_defect_in_who_listens_is_told_and_ends_the_pings():
+    class Broken:
+        def extend(self, payloads):
+            raise ZeroDivisionError("a tap")
+
+    board = FakeController()
+    with Session(board) as s:
+        s.controller.identify()
+        s.samples = Broken()
+        s.controller.ask("configure", {"period": 10, "stream": 15})
+        board.settings |= {"setpoint": 512, "duty_off": 400, "duty_bias": 400}
+        s.controller.pace(2000.0)
+        with suppress(DeviceError):  # the answer may stand behind the first sample
+            s.controller.ask("start", {"mode": 1})
+        until(lambda: s.lost)
+        assert "ZeroDivisionError: a tap" in str(s.lost[0])
+        until(lambda: not any(t.name == "ping a pipe" for t in threading.enumerate()))
 
 
 def test_pings_come_by_samples_and_by_the_clock():

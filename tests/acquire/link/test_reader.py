@@ -56,6 +56,17 @@ def test_nobody_takes_and_the_port_is_read_all_the_same():
     assert not any(t.name == "read flood" for t in threading.enumerate())
 
 
+def test_a_port_that_fails_in_its_own_way_is_lost_too():
+    class Odd(Flood):
+        def read(self):
+            raise RuntimeError("odd")
+
+    reader = Reader(Odd(0))
+    until(lambda: reader.over)
+    assert "RuntimeError: odd" in str(reader.failure)
+    reader.close()
+
+
 def test_what_came_before_the_loss_is_still_there():
     port = Flood(1000)
     reader = Reader(port)

@@ -75,11 +75,15 @@ class Listener:
             self._thread.join(_PATIENCE_S)
 
     def _run(self) -> None:
-        while not self._reader.over:
-            for chunk in self._reader.take(_LOOK_S):
-                self._hear(self._decoder.feed(chunk.data), chunk.arrived_s)
-        if self._reader.failure is not None:
-            self._hearing.lost(self._reader.failure)
+        try:
+            while not self._reader.over:
+                for chunk in self._reader.take(_LOOK_S):
+                    self._hear(self._decoder.feed(chunk.data), chunk.arrived_s)
+            failure = self._reader.failure
+        except Exception as defect:  # nobody hears the controller any more: it must not be pinged on
+            failure = OSError(f"a defect of ambid, {type(defect).__name__}: {defect}")
+        if failure is not None:
+            self._hearing.lost(failure)
 
     def _hear(self, payloads: list[bytes], arrived_s: float) -> None:
         together: list[bytes] = []

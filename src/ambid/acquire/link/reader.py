@@ -106,6 +106,8 @@ class Reader:
                     self._put(data, time.perf_counter())
         except OSError as lost:
             failure = lost
+        except Exception as defect:  # else nobody would learn that nothing is read any more
+            failure = OSError(f"{type(defect).__name__}: {defect}")
         finally:
             with self._news:
                 self.failure = None if self._stopping else failure
