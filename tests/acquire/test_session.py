@@ -205,6 +205,13 @@ def test_what_an_earlier_run_left_unread_is_not_of_this_one():
     assert report.complete
 
 
+def test_nor_where_nothing_is_excited():
+    device = ScriptedDevice(after_stop=2)
+    ran(device, seconds=0.02, mode="sample")
+    _, heard = ran(device, seconds=0.02, mode="sample")
+    assert heard.numbers == list(range(40, 60))
+
+
 def test_events_are_told_as_they_come_and_kept():
     told = []
     report, _ = ran(ScriptedDevice(fault_at=13), seconds=0.05, on_event=told.append)

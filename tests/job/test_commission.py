@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from ambid.errors import AmbidError, EstimationError
 from ambid.job import commission as room
 from ambid.job.commission import FILES, STEPS, Declined, Wishes, check_folder, commission
 from ambid.job.commission.result import record as judged_record
+from ambid.job.commission.result import tracking
 from ambid.record import read_record
 from ambid.rig import load_rig
 from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
+from tests.job.test_look import WHOLE
 
 SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
 TRUTH = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 0.0803}
@@ -313,6 +316,33 @@ def test_another_bench_when_it_tracks_stops_it_there(tmp_path, plain_report):
     assert files(tmp_path) == set(FILES)
 
 
+def followed(**changes):
+    """What live tracking gave, as far as it is judged."""
+    summary = SimpleNamespace(samples=4000, seconds_of_record=2.0, rejected_samples=0, changes=())
+    line = SimpleNamespace(error=1.02, state="tracking")
+    given = {"overruns": 0, "lines": (line,), "summary": summary, "run": WHOLE} | changes
+    track = SimpleNamespace(lines=given["lines"], summary=given["summary"])
+    return SimpleNamespace(run=given["run"], overruns=given["overruns"], track=track)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, None),
+        ({"lines": (SimpleNamespace(error=1.6, state="tracking"),)}, "the model error is 1.6 at the end, beyond 1.5"),
+        ({"lines": (SimpleNamespace(error=float("nan"), state="frozen"),)}, "the model error is nan"),
+        ({"lines": ()}, "no line of the track came"),
+        ({"overruns": 3}, "3 blocks found the ring full"),
+        ({"run": replace(WHOLE, samples=90, lost=10)}, "10 of 100 samples were lost during tracking"),
+    ],
+    ids=["good", "error", "unknown", "empty", "slow", "lost"],
+)
+def test_how_tracking_is_judged(changes, said):
+    step = tracking(followed(**changes), 1.5)
+    assert step.passed == (said is None)
+    assert said is None or said in step.reasons[0]
+
+
 # Ended by people.
 def test_an_operator_who_declines_leaves_the_output_off(tmp_path):
     asked = []
@@ -350,7 +380,6 @@ def test_a_disk_that_failed_is_the_reason(finished):
     from ambid.acquire.quality import Quality
     from ambid.errors import DeviceError
     from ambid.job.acquire import Acquired
-    from tests.job.test_look import WHOLE
 
     info = SimulatedDevice(prototype()).info
     done = Acquired(
