@@ -31,8 +31,8 @@ class NonlinearModel(Protocol):
         All parameters.
     """
 
-    kind: str
-
+    @property
+    def kind(self) -> str: ...  # noqa: D102
     @property
     def dt(self) -> float: ...  # noqa: D102
     @property

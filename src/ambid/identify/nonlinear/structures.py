@@ -49,7 +49,30 @@ class NonlinearStructure:
         return found
 
 
-_ENTRIES: tuple[NonlinearStructure, ...] = ()
+_ENTRIES: tuple[NonlinearStructure, ...] = (
+    NonlinearStructure(
+        name="narmax",
+        summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
+        settings={
+            "ny": "largest lag of the outputs; 2",
+            "nu": "number of lags of each input; 2",
+            "nk": "smallest lag of the inputs; 1",
+            "ne": "largest lag of the innovations, 0 for NARX; 2",
+            "degree": "of the polynomial; 2",
+            "noise_degree": "of the terms with innovations; 1, a linear noise model",
+            "terms": "process terms that are looked at for each output, at most; 30, fewer on a short record",
+            "constant": "1 to let a constant be chosen, 0 for none; 1",
+            "criterion": "what ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic",
+            "pruning": "what decides on terms to leave out again: prediction, simulation, none; prediction",
+            "kind": "polynomial or rational; polynomial",
+            "selection": "frols, simulation (by the error of the free run), all (every candidate); frols",
+            "focus": "prediction or simulation: which errors the coefficients make small at last; prediction",
+            "levels": "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
+        },
+        home="ambid.identify.narmax.estimate:narmax",
+        feedback="with noise model",
+    ),
+)
 
 NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _ENTRIES}
 

@@ -1,0 +1,238 @@
+"""NARMAX from records: terms by orthogonal least squares, coefficients by prediction (or simulation) errors.
+
+Linear start -> process terms -> denominators -> noise terms -> pruning -> Levenberg-Marquardt with exact derivatives.
+Standard deviations are those of the coefficients of the terms chosen; that the terms were chosen from the same data
+makes them too small where a term was a close call (Leeb and Poetscher 2005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.narmax.choose import Draft, process_terms, rational_terms, with_noise_terms
+from ambid.identify.narmax.pruning import pruned_by_prediction, pruned_by_simulation
+from ambid.identify.narmax.result import failed_fit, finished_fit
+from ambid.identify.narmax.scaled import Scaled, scaled_records
+from ambid.identify.narmax.search import Fitted, evaluated, search
+from ambid.identify.narmax.settings import NarmaxSettings, narmax_settings
+from ambid.identify.narmax.simulated_choice import terms_by_simulation
+from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+
+Array = NDArray[np.float64]
+Tick = Callable[[str], object]
+
+DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+
+
+@dataclass(slots=True)
+class Work:
+    """What a fit has come to, so that an interruption loses nothing.
+
+    Attributes
+    ----------
+    draft : Draft
+        The best model so far that runs.
+    curves : list of LearningCurve
+    warnings : list of str
+    timing_s : dict of str to float
+    status : {"converged", "stalled"}
+    focus : {"prediction", "simulation"}
+        Which errors the coefficients of the draft are fitted to.
+    """
+
+    draft: Draft
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+    status: Literal["converged", "stalled"] = "converged"
+    focus: str = "prediction"
+
+
+def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+    """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4).
+
+    Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``.
+
+    Parameters
+    ----------
+    records : sequence of IOData
+        Of one bench.
+    settings : Mapping
+        Described in the register of structures.
+    seed : int, optional
+        Taken for the contract's sake: nothing here is random.
+    tick : callable, optional
+        Called with the stage; may raise KeyboardInterrupt.
+
+    Returns
+    -------
+    NonlinearFit
+
+    Raises
+    ------
+    EstimationError
+        If a setting is not known, records do not belong together, are too short, or a channel does not move.
+    """
+    if not records:
+        raise EstimationError("narmax: no record is given. Pass one at least")
+    s = narmax_settings(settings, n_inputs=records[0].n_inputs)
+    began = perf_counter()
+    scaled = scaled_records("narmax", records, lag=s.lag, levels=s.levels)
+    work = Work(draft=_linear_start(s, scaled))
+    try:
+        _identify(s, scaled, work, tick)
+    except KeyboardInterrupt:
+        work.status = "stalled"
+        work.warnings.insert(0, "interrupted: the best model so far")
+    work.timing_s["all"] = perf_counter() - began
+    one = np.ones(scaled.n_outputs)
+    if not evaluated(work.draft.tables, work.draft.theta, scaled.parts, one, free=False).finite:
+        return failed_fit(records, s, seed, DIVERGED, work.timing_s)
+    return finished_fit(
+        records,
+        s,
+        scaled,
+        work.draft,
+        seed=seed,
+        status=work.status,
+        focus=work.focus,
+        curves=tuple(work.curves),
+        warnings=tuple(work.warnings),
+        timing_s=work.timing_s,
+    )
+
+
+def _linear_start(s: NarmaxSettings, scaled: Scaled) -> Draft:
+    """A linear model: something to hand over when the very next thing is an interruption."""
+    return process_terms(replace(s, degree=1, ne=0, selection="frols"), scaled.parts, None)
+
+
+def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
+    if tick is not None:
+        tick("start")
+    with _Timed(work, "terms"):
+        if s.selection == "simulation":
+            draft = terms_by_simulation(s, scaled.parts, tick)
+        else:
+            draft = process_terms(s, scaled.parts, tick)
+        if s.kind == "rational":
+            draft = rational_terms(s, draft, scaled.parts, tick)
+            draft = _searched(scaled, draft, work, tick, free=False)
+        _keep(work, scaled, draft)
+    with _Timed(work, "noise terms"):
+        if s.ne:
+            draft = with_noise_terms(s, draft, scaled.parts, tick)
+            draft = _searched(scaled, draft, work, tick, free=False)
+    with _Timed(work, "pruning"):
+        draft = _pruned(s, scaled, draft, work, tick)
+    with _Timed(work, "simulation errors"):
+        if s.focus == "simulation":
+            _fit_to_simulation(scaled, draft, work, tick)
+
+
+class _Timed:
+    """Add what a stage takes to the timings, also where it is interrupted."""
+
+    def __init__(self, work: Work, name: str) -> None:
+        self.work, self.name, self.began = work, name, 0.0
+
+    def __enter__(self) -> None:
+        self.began = perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.work.timing_s[self.name] = self.work.timing_s.get(self.name, 0.0) + perf_counter() - self.began
+
+
+def _weight(scaled: Scaled, draft: Draft, *, free: bool) -> Array:
+    """One over the standard deviation of each output's error; ones where the model does not run."""
+    one = np.ones(scaled.n_outputs)
+    found = evaluated(draft.tables, draft.theta, scaled.parts, one, free=free)
+    if not found.finite:
+        return one
+    size = np.sqrt(np.mean(np.concatenate(found.errors) ** 2, axis=0))
+    out: Array = 1.0 / np.maximum(size, 1e-12)
+    return out
+
+
+def _keep(work: Work, scaled: Scaled, draft: Draft) -> None:
+    """Hold on to a draft if it runs."""
+    if evaluated(draft.tables, draft.theta, scaled.parts, np.ones(scaled.n_outputs), free=False).finite:
+        work.draft = draft
+
+
+def _searched(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, free: bool) -> Draft:
+    """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
+    t = draft.tables
+    if not free and not t.noisy and not any(draft.denominators):
+        _keep(work, scaled, draft)
+        return draft
+    weight = _weight(scaled, draft, free=free)
+    n = sum(max(y.shape[0] - t.lag, 1) for y, _ in scaled.parts) * scaled.n_outputs
+
+    def keep(theta: Array) -> None:
+        work.draft, work.focus = draft.with_theta(theta), "simulation" if free else "prediction"
+
+    found = search(t, draft.theta, scaled.parts, weight, free=free, tick=tick, keep=keep)
+    if not found.finite:
+        return draft
+    _note(work, found, n, weight, free=free)
+    keep(found.theta)
+    return draft.with_theta(found.theta)
+
+
+def _note(work: Work, found: Fitted, n: int, weight: Array, *, free: bool) -> None:
+    work.status = "converged" if found.converged else "stalled"
+    work.curves.append(
+        LearningCurve(
+            method=f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors",
+            seconds=np.array(found.seconds),
+            training=np.sqrt(np.array(found.costs) / n) / float(np.sqrt(np.mean(weight**2))),
+        )
+    )
+
+
+def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> Draft:
+    if s.pruning == "none":
+        return draft
+    before = draft
+    if s.pruning == "prediction":
+        draft = pruned_by_prediction(draft, scaled.parts, _weight(scaled, draft, free=False), s.criterion)
+    else:
+        one = np.ones(scaled.n_outputs)
+        draft = pruned_by_simulation(draft, scaled.parts, one, s.criterion, tick)
+    if draft is before:
+        return draft
+    return _searched(scaled, draft, work, tick, free=False)
+
+
+def _fit_to_simulation(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> None:
+    one = np.ones(scaled.n_outputs)
+    if any(f.kind == "e" for terms in draft.numerators for x in terms for f in x):
+        draft = _without_noise(draft)
+    if not evaluated(draft.tables, draft.theta, scaled.parts, one, free=True).finite:
+        work.status = "stalled"
+        work.warnings.append(
+            "the free run of the chosen terms diverges, so that their coefficients are those of the one-step errors: "
+            "choose terms by simulation (selection or pruning), or lower degree"
+        )
+        return
+    _searched(scaled, draft, work, tick, free=True)
+
+
+def _without_noise(draft: Draft) -> Draft:
+    """The process part: a free run does not see innovations."""
+    k, drop = 0, []
+    for num, den in zip(draft.numerators, draft.denominators, strict=True):
+        for x in (*num, *den):
+            if any(f.kind == "e" for f in x):
+                drop.append(k)
+            k += 1
+    return draft.without(drop, np.delete(draft.theta, drop))

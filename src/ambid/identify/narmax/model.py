@@ -1,0 +1,348 @@
+"""Polynomial and rational NARMAX models, y(t) = b(y, u, e) / a(y, u, e) + e(t) (thesis eqs 3.1-3.4).
+
+Coefficients belong to deviations of the signals from fixed levels (zero unless the data stand far from it), in SI.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.narmax.recursion import Tables, predicted, sensitivities, tables
+from ambid.identify.narmax.terms import Term, term_from_json, term_name, term_to_json
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """Where the training samples lie: mean of the lagged signals and the matrix that makes their scatter round.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n_factors,), scaled
+    whitening : ndarray, shape (n_factors, n_factors)
+        Such that \\|whitening (x - mean)\\| is 1 for the farthest training sample (Mahalanobis distance).
+    """
+
+    mean: Array
+    whitening: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PolynomialNarmax:
+    """A NARMAX model with constant coefficients (implements `NonlinearModel`).
+
+    The predictor takes the innovations before its first prediction as zero.
+
+    Attributes
+    ----------
+    dt : float
+        s.
+    n_inputs : int
+    numerators, denominators : tuple of tuple of Term
+        By output; 1 is added to the denominators, which are empty for a polynomial model.
+    theta : ndarray, shape (n_theta,), SI
+        Coefficients, output by output, numerator before denominator.
+    u_level, u_scale : ndarray, shape (n_inputs,), SI
+        What deviations are taken from, and the typical size of them.
+    y_level, y_scale : ndarray, shape (n_outputs,), SI
+    cloud : Cloud
+        Of the lagged inputs and outputs in training.
+    """
+
+    dt: float
+    n_inputs: int
+    numerators: tuple[tuple[Term, ...], ...]
+    denominators: tuple[tuple[Term, ...], ...]
+    theta: Array
+    u_level: Array
+    u_scale: Array
+    y_level: Array
+    y_scale: Array
+    cloud: Cloud
+
+    @property
+    def kind(self) -> str:
+        """Under which files know it."""
+        return "narmax"
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.numerators)
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The terms as the compiled recursions want them."""
+        return tables(self.numerators, self.denominators, self.n_inputs)
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.tables.lag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients: their terms; denominators in the form ``1/(...)``."""
+        n_y, n_u, out = self.n_outputs, self.n_inputs, []
+        for o in range(n_y):
+            before = f"y{o + 1}: " if n_y > 1 else ""
+            out += [before + term_name(x, n_y, n_u) for x in self.numerators[o]]
+            out += [f"{before}1/({term_name(x, n_y, n_u)})" for x in self.denominators[o]]
+        return tuple(out)
+
+    @cached_property
+    def unit(self) -> Array:
+        """What a scaled coefficient of 1 is in SI, shape (n_theta,)."""
+        size = {"y": self.y_scale, "u": self.u_scale, "e": self.y_scale}
+        out = []
+        for o in range(self.n_outputs):
+            for of, own in ((self.numerators[o], self.y_scale[o]), (self.denominators[o], 1.0)):
+                out += [own / np.prod([size[f.kind][f.channel] for f in x]) for x in of]
+        return np.array(out, dtype=np.float64)
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,), SI
+
+        Returns
+        -------
+        PolynomialNarmax
+        """
+        return replace(self, theta=theta)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """Return one-step-ahead predictions; past innovations are those of the predictor itself.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            NaN in the first `lag` rows, and from where the innovations diverge on.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = self._scaled(u, y)
+        found, _ = predicted(self.tables, self.theta / self.unit, ys, us)
+        return self.y_level + self.y_scale * found
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """Return the exact derivative of `predict` by `theta`, past innovations included.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs, n_theta)
+            The first `lag` rows are zero.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = self._scaled(u, y)
+        theta = self.theta / self.unit
+        _, z = predicted(self.tables, theta, ys, us)
+        return sensitivities(self.tables, theta, z) * (self.y_scale[:, None] / self.unit)
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """Run freely from the first `lag` measured samples on, innovations zero.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (at least lag, n_outputs), SI
+            Only the first `lag` rows are looked at.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
+            training data.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        head = min(self.lag, u.shape[0])
+        if y.shape[0] < head:
+            raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
+        whole = np.zeros((u.shape[0], self.n_outputs))
+        whole[:head] = y[:head]
+        ys, us = self._scaled(u, whole)
+        found, _ = predicted(self.tables, self.theta / self.unit, ys, us, free=True)
+        out: Array = self.y_level + self.y_scale * found
+        out[:head] = y[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """Return the Mahalanobis distance of the lagged signals, 1 for the farthest training sample.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+            The first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = self._scaled(u, y)
+        x = lagged_signals(self.tables, ys, us)
+        out = np.full(ys.shape[0], np.nan)
+        out[self.lag :] = np.linalg.norm((x - self.cloud.mean) @ self.cloud.whitening.T, axis=1)
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that `from_json` needs.
+
+        Returns
+        -------
+        dict
+        """
+        arrays: dict[str, Any] = {
+            k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")
+        }
+        return {
+            "dt_s": self.dt,
+            "n_inputs": self.n_inputs,
+            "numerators": [[term_to_json(x) for x in terms] for terms in self.numerators],
+            "denominators": [[term_to_json(x) for x in terms] for terms in self.denominators],
+            **arrays,
+            "cloud": {"mean": self.cloud.mean.tolist(), "whitening": self.cloud.whitening.tolist()},
+        }
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back.
+
+        Parameters
+        ----------
+        found : dict
+            That `as_json` made.
+
+        Returns
+        -------
+        PolynomialNarmax
+
+        Raises
+        ------
+        EstimationError
+            If something is missing or of another shape.
+        """
+        try:
+            return cls(**_read(found))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise EstimationError(f"no NARMAX model ({type(error).__name__}: {error}). Write the file again") from error
+
+    def _scaled(self, u: Array, y: Array) -> tuple[Array, Array]:
+        u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        want = ((y.shape[0] if y.ndim else 0, self.n_inputs), (y.shape[0] if y.ndim else 0, self.n_outputs))
+        if (u.shape, y.shape) != want:
+            raise EstimationError(
+                f"inputs of shape {u.shape} and outputs of shape {y.shape} for a model of {self.n_inputs} and "
+                f"{self.n_outputs} channels; time is axis 0. Pass (n_samples, n_channels)"
+            )
+        return (y - self.y_level) / self.y_scale, (u - self.u_level) / self.u_scale
+
+
+def _read(found: dict[str, Any]) -> dict[str, Any]:
+    """What the model is made with, checked."""
+    num, den = (
+        tuple(tuple(term_from_json(x) for x in terms) for terms in found[k]) for k in ("numerators", "denominators")
+    )
+    n_u, n_y = int(found["n_inputs"]), len(num)
+    used = tables(num, den, n_u)
+    n_seen = int(np.count_nonzero(used.column < n_y + n_u))
+    sizes = {"theta": (used.place.shape[0],), "u_level": (n_u,), "u_scale": (n_u,), "y_level": (n_y,)}
+    arrays: dict[str, Any] = {k: _numbers(found[k], shape, k) for k, shape in {**sizes, "y_scale": (n_y,)}.items()}
+    cloud = Cloud(
+        mean=_numbers(found["cloud"]["mean"], (n_seen,), "cloud"),
+        whitening=_numbers(found["cloud"]["whitening"], (n_seen, n_seen), "cloud"),
+    )
+    if len(den) != n_y or np.any(used.column >= 2 * n_y + n_u):
+        raise ValueError("terms name channels that the model does not have")
+    dt = float(found["dt_s"])
+    return {"dt": dt, "n_inputs": n_u, "numerators": num, "denominators": den, "cloud": cloud, **arrays}
+
+
+def lagged_signals(t: Tables, y: Array, u: Array) -> Array:
+    """Return the lagged inputs and outputs that a model looks at, from sample `lag` on.
+
+    Parameters
+    ----------
+    t : Tables
+    y : ndarray, shape (n_samples, n_outputs), scaled
+    u : ndarray, shape (n_samples, n_inputs), scaled
+
+    Returns
+    -------
+    ndarray, shape (n_samples - lag, n_factors)
+        Innovations are left out.
+    """
+    z, n = np.hstack([y, u]), y.shape[0]
+    seen = [k for k in range(t.column.size) if t.column[k] < z.shape[1]]
+    if n <= t.lag or not seen:
+        return np.empty((max(n - t.lag, 0), len(seen)))
+    return np.stack([z[t.lag - t.back[k] : n - t.back[k], t.column[k]] for k in seen], axis=1)
+
+
+def cloud_of(parts: list[Array]) -> Cloud:
+    """Return where the training samples lie.
+
+    Parameters
+    ----------
+    parts : list of ndarray, shape (n_rows, n_factors)
+        `lagged_signals` of each record.
+
+    Returns
+    -------
+    Cloud
+        Directions in which nothing moved count as very narrow.
+    """
+    x = np.concatenate(parts)
+    mean = x.mean(axis=0) if x.size else np.zeros(x.shape[1])
+    if not x.size:
+        return Cloud(mean=mean, whitening=np.zeros((x.shape[1],) * 2))
+    _, s, Vt = np.linalg.svd(x - mean, full_matrices=False)
+    if s.size < x.shape[1] or not s[0] > 0:
+        return Cloud(mean=mean, whitening=np.zeros((x.shape[1],) * 2))
+    narrow = np.maximum(s, 1e-6 * s[0])
+    W = Vt / (narrow / np.sqrt(x.shape[0]))[:, None]
+    far = float(np.max(np.linalg.norm((x - mean) @ W.T, axis=1)))
+    return Cloud(mean=mean, whitening=W / far if far > 0 else W)
+
+
+def _numbers(value: Any, shape: tuple[int, ...], what: str) -> Array:
+    out = np.array(value, dtype=np.float64).reshape(shape)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{what} is not finite")
+    return out

@@ -1,0 +1,163 @@
+"""A NARMAX model in scaled signals as tables, and its predictions, free runs and sensitivities over one record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.narmax.terms import Factor, Term
+
+Array = NDArray[np.float64]
+Table = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tables:
+    """Terms as whole numbers, for the compiled recursions.
+
+    Attributes
+    ----------
+    n_outputs, n_inputs, lag : int
+    column, back : ndarray of int, shape (n_factors,)
+        Column of the array of all signals, and lag, of each factor.
+    terms : ndarray of int, shape (n_terms, most factors)
+        Factor numbers, -1 behind the last.
+    place : ndarray of int, shape (n_terms, 2)
+        Output, and 1 for a term of the denominator.
+    noisy : bool
+        Whether a term holds innovations.
+    """
+
+    n_outputs: int
+    n_inputs: int
+    lag: int
+    column: Table
+    back: Table
+    terms: Table
+    place: Table
+    noisy: bool
+
+    def shape(self, free: bool) -> Table:
+        """Return what the recursions are told beside the tables.
+
+        Parameters
+        ----------
+        free : bool
+            Whether the model runs on its own outputs.
+
+        Returns
+        -------
+        ndarray of int, shape (4,)
+        """
+        return np.array([self.lag, self.n_outputs, self.n_inputs, int(free)], dtype=np.int64)
+
+
+def tables(numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int) -> Tables:
+    """Return the tables of a model; coefficients stand output by output, numerator before denominator.
+
+    Parameters
+    ----------
+    numerators, denominators : sequence of sequence of Term
+        By output.
+    n_inputs : int
+
+    Returns
+    -------
+    Tables
+    """
+    n_y = len(numerators)
+    rows: list[tuple[int, int, Term]] = []
+    for o in range(n_y):
+        rows += [(o, 0, x) for x in numerators[o]] + [(o, 1, x) for x in denominators[o]]
+    factors: dict[Factor, int] = {}
+    for _, _, x in rows:
+        for f in x:
+            factors.setdefault(f, len(factors))
+    first = {"y": 0, "u": n_y, "e": n_y + n_inputs}
+    width = max((len(x) for _, _, x in rows), default=0)
+    numbers = np.full((len(rows), max(width, 1)), -1, dtype=np.int64)
+    for k, (_, _, x) in enumerate(rows):
+        numbers[k, : len(x)] = [factors[f] for f in x]
+    return Tables(
+        n_outputs=n_y,
+        n_inputs=n_inputs,
+        lag=max((f.lag for f in factors), default=0),
+        column=np.array([first[f.kind] + f.channel for f in factors], dtype=np.int64),
+        back=np.array([f.lag for f in factors], dtype=np.int64),
+        terms=numbers,
+        place=np.array([(o, d) for o, d, _ in rows], dtype=np.int64).reshape(-1, 2),
+        noisy=any(f.kind == "e" for f in factors),
+    )
+
+
+def signals(t: Tables, y: Array, u: Array) -> Array:
+    """Return the array of all signals, innovations zero.
+
+    Parameters
+    ----------
+    t : Tables
+    y : ndarray, shape (n_given, n_outputs)
+        With fewer samples than `u`, the rest is zero.
+    u : ndarray, shape (n_samples, n_inputs)
+
+    Returns
+    -------
+    ndarray, shape (n_samples, 2 n_outputs + n_inputs)
+    """
+    n = u.shape[0]
+    z = np.zeros((n, 2 * t.n_outputs + t.n_inputs))
+    given = y[:n]
+    z[: given.shape[0], : t.n_outputs] = given
+    z[:, t.n_outputs : t.n_outputs + t.n_inputs] = u
+    return z
+
+
+def predicted(t: Tables, theta: Array, y: Array, u: Array, *, free: bool = False) -> tuple[Array, Array]:
+    """Return predictions or a free run, and all signals behind them.
+
+    Parameters
+    ----------
+    t : Tables
+    theta : ndarray, shape (n_terms,)
+    y : ndarray, shape (n_samples, n_outputs), scaled
+    u : ndarray, shape (n_samples, n_inputs), scaled
+    free : bool, optional
+        Run on the model's own outputs from sample `lag` on.
+
+    Returns
+    -------
+    predictions : ndarray, shape (n_samples, n_outputs)
+        NaN before `lag`, and from where the recursion diverges on.
+    signals : ndarray, shape (n_samples, 2 n_outputs + n_inputs)
+    """
+    from ambid.identify.narmax._kernels import run
+
+    z = signals(t, y[: t.lag] if free else y, u)
+    out = np.empty((z.shape[0], t.n_outputs))
+    run(z, t.column, t.back, t.terms, t.place, theta, t.shape(free), out)
+    return out, z
+
+
+def sensitivities(t: Tables, theta: Array, z: Array, *, free: bool = False) -> Array:
+    """Return the exact derivative of `predicted` by theta.
+
+    Parameters
+    ----------
+    t : Tables
+    theta : ndarray, shape (n_terms,)
+    z : ndarray, shape (n_samples, 2 n_outputs + n_inputs)
+        The signals that `predicted` returned.
+    free : bool, optional
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n_outputs, n_terms)
+    """
+    from ambid.identify.narmax._kernels import slopes
+
+    out = np.empty((z.shape[0], t.n_outputs, theta.size))
+    slopes(z, t.column, t.back, t.terms, t.place, theta, t.shape(free), out)
+    return out
