@@ -160,6 +160,24 @@ def test_a_defect_in_who_listens_is_told_and_ends_the_pings():
         until(lambda: not any(t.name == "ping a pipe" for t in threading.enumerate()))
 
 
+def test_a_ping_takes_no_number_from_the_commands(monkeypatch):
+    """Else the 255th number after a command is its own again, and what has it is taken for the same command."""
+    monkeypatch.setattr("ambid.acquire.link.controller._PING_S", 0.001)
+    board, numbers = FakeController(), []
+    with Session(board) as s:
+        s.controller.identify()
+        carry_out = board.answer
+        board.answer = lambda asked: (numbers.append((asked.name, asked["id"])), carry_out(asked))[1]
+        s.controller.pace(2000.0)
+        for setpoint in range(300):
+            s.controller.ask("setpoint", {"setpoint": setpoint})
+        until(lambda: board.pings > 300)
+    pings = {number for name, number in numbers if name in ("ping", "ask_status")}
+    commands = [number for name, number in numbers if name == "setpoint"]
+    assert len(commands) == 300  # each was carried out
+    assert not pings & set(commands)
+
+
 def test_pings_come_by_samples_and_by_the_clock():
     board = FakeController()
     with Session(board) as s:

@@ -1,7 +1,8 @@
 """The controller as the host talks to it: commands that are answered or told why not, and a sign of life from the host.
 
 A command has a number. Without an answer in time it is sent again with the same number, which the controller answers
-again without carrying it out twice. Pings go out from a thread of their own, whatever the rest of the program does.
+again without carrying it out twice. Pings go out from a thread of their own, whatever the rest of the program does, and
+under a number of their own: else a command after 254 of them would have that of the last one, and be taken for it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _SLOW = {"self_test": 10.0}  # times as long as another command's answer: the pr
 _PING_S = 0.05  # of the host's clock, or
 _PING_SAMPLES_S = 0.025  # of samples received, whichever comes first
 _SILENT_S = 0.5  # without a sample: it is asked for its status
+_LAST_ID, _PING_ID = 254, 255  # of a command, of every ping
 _NONE: Mapping[str, int] = MappingProxyType({})
 _LOST = "the controller goes to its safe state by itself"
 
@@ -206,9 +208,8 @@ class Controller:
         self._port.close()
 
     def _next_id(self) -> int:
-        with self._news:
-            self._id = self._id % 255 + 1
-            return self._id
+        self._id = self._id % _LAST_ID + 1
+        return self._id
 
     def _answered(self, data: bytes, waiting: _Waiting) -> Message | None:
         limit = self._answer_s * _SLOW.get(waiting.name, 1.0)
@@ -248,7 +249,7 @@ class Controller:
                 silent = time.monotonic() - self._heard_s > _SILENT_S
             # A controller that was reset still answers pings: only its status tells.
             if not self._paused():
-                self._send(encode(message("ask_status" if silent else "ping", id=self._next_id())))
+                self._send(encode(message("ask_status" if silent else "ping", id=_PING_ID)))
             due = time.monotonic() + _PING_S
 
     def _ping_is_due(self) -> bool:
