@@ -38,3 +38,14 @@ def test_absent_tools_fail_in_ci(monkeypatch):
     monkeypatch.setenv("CI", "true")
     with pytest.raises(pytest.fail.Exception, match=INSTALL):
         lacking("no avr-gcc")
+
+
+def test_make_builds_anew_with_other_flags(avr_gcc, tmp_path):
+    def built(*flags):
+        words = ["make", "-s", "-C", str(FIRMWARE), f"BUILD={tmp_path}", "firmware", *flags]
+        subprocess.run(words, check=True, capture_output=True, timeout=60)
+        return (tmp_path / "amb_daq.hex").read_bytes(), (tmp_path / "amb_daq.elf").stat().st_mtime_ns
+
+    plain = built()
+    assert built() == plain  # nothing to do
+    assert built("AVR_CFLAGS=-std=gnu99 -Os -DCAP_DUTY_HIGH=600")[0] != plain[0]
