@@ -244,7 +244,7 @@ class LineDevice(ABC):
     def events(self) -> Sequence[DeviceEvent]:
         """Return what was told since the last call."""
         found = self._stream.events()
-        damaged = self.counters().damaged
+        damaged = self._last.damaged if self._controller is None else self._damaged(self._controller)
         if damaged > self._damaged_told:
             new, self._damaged_told = damaged - self._damaged_told, damaged
             found.append(DeviceEvent(kind="damaged", sample=None, what="frames with wrong check values", count=new))
@@ -350,7 +350,7 @@ class LineDevice(ABC):
         return Counters(
             samples=kept.samples - frames.overrun_samples,
             lost=kept.lost + frames.overrun_samples,
-            damaged=line.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0],
+            damaged=self._damaged(c),
             discarded_bytes=line.discarded_bytes + c.overrun_bytes - self._before[1],
             overruns=frames.overruns + c.overruns,
             resent=c.resent,
@@ -358,6 +358,10 @@ class LineDevice(ABC):
             drift=drift.drift,
             drift_sd=drift.drift_sd,
         )
+
+    def _damaged(self, c: Controller) -> int:
+        kept = self._stream.counters
+        return c.counters.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0]
 
     def _end(self) -> None:
         controller, self._controller = self._controller, None
