@@ -1,0 +1,383 @@
+"""The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
+
+Physical numbers `theta` (16): the magnet's seven, then m, R, c, g, a, x_offset, i_offset, v_offset, and the delay
+beyond `whole` samples. Columns of all sensitivities: the active ones of these, then the log noise levels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ambid.physics.coenergy_law import coenergy_derivatives
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+# Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
+_energy: Callable[..., None] = njit(cache=True, nogil=True)(coenergy_derivatives)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _left(M: Array, X: Array, factor: float, out: Array) -> None:
+    """Add factor M X to `out`, X (n, columns, p) a matrix for each of p numbers."""
+    for a in range(out.shape[0]):
+        for c in range(X.shape[0]):
+            f = factor * M[a, c]
+            if f != 0.0:
+                for b in range(X.shape[1]):
+                    for j in range(X.shape[2]):
+                        out[a, b, j] += f * X[c, b, j]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _right(X: Array, M: Array, factor: float, out: Array) -> None:
+    """Add factor X M to `out`, X (n, n, p) a matrix for each of p numbers."""
+    for c in range(X.shape[1]):
+        for b in range(M.shape[1]):
+            f = factor * M[c, b]
+            if f != 0.0:
+                for a in range(X.shape[0]):
+                    for j in range(X.shape[2]):
+                        out[a, b, j] += f * X[a, c, j]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _sum(x: Array, factor: float, y: Array, out: Array) -> None:
+    """Write x + factor y to `out`, all of one shape."""
+    for a in range(x.shape[0]):
+        for b in range(x.shape[1]):
+            for j in range(x.shape[2]):
+                out[a, b, j] = x[a, b, j] + factor * y[a, b, j]
+
+
+@njit(cache=True, nogil=True)
+def _rates(z: Array, volt: Array, th: Array, flags: Flags, w: Array, dw: Array, g: Array, A: Array, G: Array) -> None:
+    """Write the right-hand side g (n,), its Jacobian A (n, n), and its derivatives G (n, 16) by `theta`.
+
+    `volt` is the voltage and its derivative by the delay. Position, velocity and current, then the force behind the
+    eddy pole, then a drifting force, where `flags` (exponential, pair, eddy, drift, locked) have them.
+    """
+    for a in range(g.size):
+        g[a] = 0.0
+        for b in range(g.size):
+            A[a, b] = 0.0
+        for b in range(16):
+            G[a, b] = 0.0
+    x, v, i = z[0], z[1], z[2]
+    _energy(x, i, th, flags[0], flags[1], w, dw)
+    m, ell = th[7], w[3]
+    if not flags[4]:
+        pull = z[3] if flags[2] else w[0]
+        net = pull - th[9] * v
+        last = g.size - 1
+        if flags[3]:
+            net += z[last]
+            A[1, last] = 1.0 / m
+        g[0] = v
+        g[1] = net / m + th[10]
+        A[0, 1] = 1.0
+        A[1, 1] = -th[9] / m
+        if flags[2]:
+            A[1, 3] = 1.0 / m
+        else:
+            A[1, 0] = w[1] / m
+            A[1, 2] = w[2] / m
+            for q in range(7):
+                G[1, q] = dw[0, q] / m
+        G[1, 7] = -net / m**2
+        G[1, 9] = -v / m
+        G[1, 10] = 1.0
+    rate = (volt[0] + th[14] - th[8] * i - w[2] * v) / ell
+    g[2] = rate
+    A[2, 0] = (-w[5] * v - rate * w[6]) / ell
+    A[2, 1] = -w[2] / ell
+    A[2, 2] = (-th[8] - w[6] * v - rate * w[7]) / ell
+    for q in range(7):
+        G[2, q] = (-dw[2, q] * v - rate * dw[3, q]) / ell
+    G[2, 8] = -i / ell
+    G[2, 14] = 1.0 / ell
+    G[2, 15] = volt[1] / ell
+    if flags[2]:
+        g[3] = th[11] * (w[0] - z[3])
+        A[3, 0], A[3, 2], A[3, 3] = th[11] * w[1], th[11] * w[2], -th[11]
+        for q in range(7):
+            G[3, q] = th[11] * dw[0, q]
+        G[3, 11] = w[0] - z[3]
+
+
+@njit(cache=True, nogil=True)
+def _advance(
+    z: Array, S: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
+    steps: int, slopes: bool, w: Array, dw: Array, g: Array, A: Array, G: Array, room: Array,
+) -> None:  # fmt: skip
+    """Carry state and sensitivities over one sample in place by `steps` classical Runge-Kutta steps.
+
+    `volts`: mean and slope of the voltage over the sample, and their derivatives by the delay.
+    """
+    n, n_a = z.size, active.size
+    at, to, volt, K, Ss, St = np.empty(n), np.empty(n), np.empty(2), room[0], room[1], room[2]
+    step = h / steps
+    for k in range(steps):
+        for a in range(n):
+            to[a] = z[a]
+            g[a] = 0.0
+        if slopes:
+            _sum(K, -1.0, K, K)
+            _sum(S, 0.0, K, Ss)
+        for stage in range(4):
+            forth = 0.0 if stage == 0 else (step if stage == 3 else 0.5 * step)
+            weight = step / 6.0 if stage in (0, 3) else step / 3.0
+            where = (k + forth / step) / steps - 0.5
+            volt[0] = volts[0] + volts[1] * where
+            volt[1] = volts[2] + volts[3] * where
+            for a in range(n):
+                at[a] = z[a] + forth * g[a]
+            _rates(at, volt, th, flags, w, dw, g, A, G)
+            for a in range(n):
+                to[a] += weight * g[a]
+            if slopes:
+                _sum(S, forth, K, St)
+                _sum(K, -1.0, K, K)
+                _left(A, St, 1.0, K)
+                for a in range(1, n):
+                    for j in range(n_a):
+                        K[a, 0, j] += G[a, active[j]] * chain[j]
+                _sum(Ss, weight, K, Ss)
+        for a in range(n):
+            z[a] = to[a]
+        if slopes:
+            _sum(Ss, 0.0, K, S)
+
+
+@njit(cache=True, nogil=True)
+def _bend(
+    S: Array, th: Array, active: Integers, chain: Array, flags: Flags, h: float, w: Array, dw: Array,
+    A: Array, dA: Array, dE: Array,
+) -> None:  # fmt: skip
+    """Write the total derivatives of A and E of `_spread` by all numbers: by themselves, and through the state."""
+    n, p, n_a = S.shape[0], S.shape[2], active.size
+    m, ell, last = th[7], w[3], n - 1
+    push = 3 if flags[2] else 1
+    gain = th[11] if flags[2] else 1.0 / m
+    bf = 0.0 if flags[4] else 1.0 / m
+    _sum(dA, -1.0, dA, dA)
+    for j in range(p):
+        dx, di = S[0, 0, j], S[2, 0, j]
+        q = active[j] if j < n_a else -1
+        xx, xi, ii = w[4] * dx + w[5] * di, w[5] * dx + w[6] * di, w[6] * dx + w[7] * di
+        f = chain[j] if j < n_a else 0.0
+        if 0 <= q < 7:
+            xx, xi, ii = xx + dw[1, q] * f, xi + dw[2, q] * f, ii + dw[3, q] * f
+        dm = f if q == 7 else 0.0
+        dr, dc, da = f if q == 8 else 0.0, f if q == 9 else 0.0, f if q == 11 else 0.0
+        dgain = da if flags[2] else -dm / m**2
+        if not flags[4]:
+            dA[push, 0, j] += gain * xx + dgain * w[1]
+            dA[push, 2, j] += gain * xi + dgain * w[2]
+            dA[1, 1, j] += -dc / m + th[9] * dm / m**2
+            dA[2, 1, j] = -xi / ell + w[2] * ii / ell**2
+            if flags[2]:
+                dA[1, 3, j] = -dm / m**2
+                dA[3, 3, j] = -da
+            if flags[3]:
+                dA[1, last, j] = -dm / m**2
+        dA[2, 2, j] = -dr / ell + th[8] * ii / ell**2
+        dbf = 0.0 if flags[4] else -dm / m**2
+        dbv = -ii / ell**2
+        for a in range(n):
+            dE[a, 0, j] = 0.5 * h * h * (dA[a, 1, j] * bf + A[a, 1] * dbf)
+            dE[a, 1, j] = 0.5 * h * h * (dA[a, 2, j] / ell + A[a, 2] * dbv)
+        dE[1, 0, j] += h * dbf
+        dE[2, 1, j] += h * dbv
+
+
+@njit(cache=True, nogil=True)
+def _spread(
+    z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
+    h: float, slopes: bool, w: Array, dw: Array, A: Array, dA: Array, F: Array, dF: Array, T: Array, dT: Array,
+    E: Array, dE: Array, T2: Array, H: Array,
+) -> None:  # fmt: skip
+    """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the plant linearised at rest.
+
+    F = I + h A + (h A)^2/2 and E = h (I + h A/2) B, A without the terms that are products with the velocity or with
+    di/dt: they move the gain a little, not the predictor's mean, which the full equations carry.
+    """
+    n, p, n_a = z.size, S.shape[2], active.size
+    _energy(z[0], z[2], th, flags[0], flags[1], w, dw)
+    m, ell, last = th[7], w[3], n - 1
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = 0.0
+    push = 3 if flags[2] else 1  # the row in which the magnet's force enters
+    gain = th[11] if flags[2] else 1.0 / m
+    if not flags[4]:
+        A[0, 1] = 1.0
+        A[1, 1] = -th[9] / m
+        A[push, 0] += gain * w[1]
+        A[push, 2] += gain * w[2]
+        A[2, 1] = -w[2] / ell
+        if flags[2]:
+            A[1, 3] = 1.0 / m
+            A[3, 3] = -th[11]
+        if flags[3]:
+            A[1, last] = 1.0 / m
+    A[2, 2] = -th[8] / ell
+    bf = 0.0 if flags[4] else 1.0 / m
+    for a in range(n):
+        for b in range(n):
+            s = 0.0
+            for c in range(n):
+                s += A[a, c] * A[c, b]
+            F[a, b] = h * A[a, b] + 0.5 * h * h * s
+        F[a, a] += 1.0
+        E[a, 0] = 0.5 * h * h * A[a, 1] * bf
+        E[a, 1] = 0.5 * h * h * A[a, 2] / ell
+    E[1, 0] += h * bf
+    E[2, 1] += h / ell
+    for a in range(n):
+        for b in range(n):
+            s = 0.0
+            for c in range(n):
+                s += P[a, c] * F[b, c]
+            T[a, b] = s  # P F'
+    if slopes:
+        _bend(S, th, active, chain, flags, h, w, dw, A, dA, dE)
+        _sum(dF, -1.0, dF, dF)
+        _sum(dT, -1.0, dT, dT)
+        for a in range(n):
+            for b in range(n):
+                T2[a, b] = F[b, a]
+                H[a, b] = 0.5 * h * h * A[a, b]
+            H[a, a] += 0.5 * h  # dF = H dA + dA H
+        _left(H, dA, 1.0, dF)
+        _right(dA, H, 1.0, dF)
+        _left(F, dP, 0.5, dT)  # dT = F dP/2 + dF P, so that dP+ = dT F' + F dT' + noise
+        _right(dF, P, 1.0, dT)
+        _sum(dP, -1.0, dP, dP)
+        _right(dT, T2, 1.0, dP)
+        for a in range(n):
+            for b in range(a, n):
+                f00, f01 = E[b, 0] * q2[0], E[a, 0] * q2[0]
+                f10, f11 = E[b, 1] * q2[1], E[a, 1] * q2[1]
+                for j in range(p):
+                    noise = f00 * dE[a, 0, j] + f01 * dE[b, 0, j] + f10 * dE[a, 1, j] + f11 * dE[b, 1, j]
+                    dP[a, b, j] += dP[b, a, j] + noise
+                    dP[b, a, j] = dP[a, b, j]
+                for d in range(2):
+                    dP[a, b, n_a + 2 + d] += 2.0 * q2[d] * E[a, d] * E[b, d]
+                    dP[b, a, n_a + 2 + d] = dP[a, b, n_a + 2 + d]
+        if flags[3]:
+            dP[last, last, n_a + 4] += 2.0 * q2[2]
+    for a in range(n):
+        for b in range(a, n):
+            s = E[a, 0] * E[b, 0] * q2[0] + E[a, 1] * E[b, 1] * q2[1]
+            for c in range(n):
+                s += F[a, c] * T[c, b]
+            P[a, b] = s
+            P[b, a] = s
+    if flags[3]:
+        P[last, last] += q2[2]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _correct(
+    e: float, de: Array, c: int, r2: float, level: int, z: Array, S: Array, P: Array, dP: Array, slopes: bool,
+    rows: Array, col: Array, dcol: Array, dk: Array,
+) -> float:  # fmt: skip
+    """Take in one measured output, state number `c`; return its innovation variance.
+
+    `rows` (2, p + 1) gets the rows of the likelihood: innovation over its deviation, and (1 - e^2/s)/sqrt(2) with the
+    derivative ds/(s sqrt(2)): their inner products are gradient and Fisher information of (log s + e^2/s)/2.
+    """
+    n, p = S.shape[0], S.shape[2]
+    for a in range(n):
+        col[a] = P[a, c]
+    s: float = col[c] + r2
+    if slopes:
+        root, narrow = math.sqrt(s), 1.0 / (s * math.sqrt(2.0))
+        for a in range(n):
+            for j in range(p):
+                dcol[a, j] = dP[a, c, j]
+        ds = dk[n]
+        for j in range(p):
+            ds[j] = dcol[c, j]
+        ds[level] += 2.0 * r2
+        for j in range(p):
+            rows[0, j] = de[j] / root
+            rows[1, j] = ds[j] * narrow
+        rows[0, p], rows[1, p] = e / root, (1.0 - e * e / s) / math.sqrt(2.0)
+        for a in range(n):
+            f = col[a] / s
+            for j in range(p):
+                dk[a, j] = (dcol[a, j] - f * ds[j]) / s
+                S[a, 0, j] += dk[a, j] * e + f * de[j]
+        for a in range(n):
+            f = col[a] / s
+            for b in range(a, n):
+                t = col[b]
+                for j in range(p):
+                    dP[a, b, j] -= dk[a, j] * t + f * dcol[b, j]
+                    dP[b, a, j] = dP[a, b, j]
+    for a in range(n):
+        z[a] += col[a] * e / s
+        for b in range(n):
+            P[a, b] -= col[a] * col[b] / s
+    return s
+
+
+@njit(cache=True, nogil=True)
+def predict(
+    u: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers, chain: Array,
+    noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, slopes: bool, e: Array, s: Array,
+    rows: Array,
+) -> bool:  # fmt: skip
+    """Run the predictor over one record; False where a gap closes or numbers cease to be finite.
+
+    `u` (n,), `y` (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,) and `P` hold
+    the state before sample `first`, and move along. `noise2` holds the squares of the levels of position, current,
+    force, voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows` (4 n, p + 1)
+    the rows of the likelihood, where `slopes` wants them.
+    """
+    n, n_a = z.size, active.size
+    p = n_a + 5
+    w, dw = np.zeros(8), np.zeros((4, 7))
+    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, 16))
+    S, dP, room = np.zeros((n, 1, p)), np.zeros((n, n, p)), np.zeros((3, n, 1, p))
+    dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
+    F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
+    col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
+    none = np.zeros((2, p + 1))
+    phi = th[15]
+    for k in range(first, u.size):
+        for c in range(2):
+            if not valid[k, c]:
+                continue
+            at = 0 if c == 0 else 2
+            error = y[k, c] - z[at] - th[12 + c]
+            if slopes:
+                for j in range(p):
+                    de[j] = -S[at, 0, j]
+                for j in range(n_a):
+                    if active[j] == 12 + c:
+                        de[j] -= chain[j]
+                # the derivative of the innovation is -(d prediction); the correction adds K (dy - dC z) = K de
+            out = rows[4 * k + 2 * c : 4 * k + 2 * c + 2] if slopes else none
+            s[k, c] = _correct(error, de, at, noise2[c], n_a + c, z, S, P, dP, slopes, out, col, dcol, dk)
+            e[k, c] = error
+        late, now = u[k - whole - 1], u[k - whole]
+        volts[0], volts[1] = phi * late + (1.0 - phi) * now, 6.0 * phi * (1.0 - phi) * (now - late)
+        volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
+        _spread(z, S, P, dP, th, active, chain, flags, noise2[2:], h, slopes, w, dw, A, dA, F, dF, T, dT, E, dE, T2, H)
+        _advance(z, S, th, active, chain, flags, volts, h, steps, slopes, w, dw, g, A, G, room)
+        low, high = z[0] + th[1], th[1] - z[0]
+        if not flags[0] and (low <= 0.0 or (flags[1] and high <= 0.0)):
+            return False
+        if not (math.isfinite(z[0] + z[1] + z[2]) and math.isfinite(P[0, 0] + P[2, 2])):
+            return False
+    return True

@@ -1,0 +1,215 @@
+"""Strategy of the nonlinear grey box: laws compared by likelihood, extensions where they pay, delay as the data show.
+
+Prediction error with an extended Kalman predictor: consistent under feedback and for an unstable plant as far as the
+linearisation of the *noise* holds (the mean follows the full equations), because each prediction uses the past alone
+and the predictor, unlike the plant, is stable. Its gain follows the operating point through the Riccati recursion from
+four levels per record; a constant gain would be wrong by the change of k_x over the gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from ambid.errors import EstimationError
+from ambid.identify.nonlinear_bearing.likelihood import BearingFit, criterion, linearise, promise, search
+from ambid.identify.nonlinear_bearing.problem import LEVELS, BearingProblem, BearingRecord, Number
+from ambid.identify.nonlinear_bearing.start import LinearStart, linear_start, start_numbers, with_noise
+from ambid.identify.threads import one_thread
+from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.parameters import Parameter
+
+Switch = bool | Literal["auto"]
+
+_NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole number is tried
+_SHORT = 12  # iterations with which a law or an extension is first tried
+
+
+def estimate_bearing(
+    records: Sequence[BearingRecord],
+    known: Mapping[str, Parameter],
+    *,
+    laws: Sequence[MagnetLaw],
+    delay: float | None = None,
+    extend: bool = True,
+    eddy: bool = False,
+    drift: Switch = "auto",
+    tick: Callable[[], None] | None = None,
+) -> BearingFit:
+    """Estimate one nonlinear bearing from several records at once.
+
+    Parameters
+    ----------
+    records : sequence of BearingRecord
+        At least one of a rotor that is free to move.
+    known : Mapping[str, Parameter]
+        What is known of the numbers, by name.
+    laws : sequence of MagnetLaw
+        The likelihood chooses.
+    delay : float or None
+        Of the voltage in samples of the first record; None: found.
+    extend : bool
+        Whether rising leakage and saturation are tried beyond the laws given (BIC decides).
+    eddy : bool
+        Force behind a pole a/(s + a).
+    drift : bool or "auto"
+        A force that walks slowly (what the law leaves over); "auto": where the likelihood pays for it.
+    tick : callable, optional
+        Called after each evaluation; KeyboardInterrupt ends in the best so far.
+
+    Returns
+    -------
+    BearingFit
+
+    Raises
+    ------
+    EstimationError
+        If nothing can be estimated, or no start makes a predictor.
+    """
+    free = [r for r in records if not r.held]
+    if not free:
+        raise EstimationError("every record holds the rotor; masses and forces want one in which it moves")
+    with one_thread():
+        linear = linear_start(free[0], known, delay, laws[0])
+        fits = [_first(records, known, law, linear, delay, eddy=eddy, drift=drift is True, tick=tick) for law in laws]
+        fits = [f for f in fits if f.status != "failed"]
+        if not fits:
+            raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
+        fit = min(fits, key=lambda f: f.criterion)
+        for option in ("rise", "saturation") if extend else ():
+            if not getattr(fit.problem.law, option):
+                law = fit.problem.law
+                richer = replace(law, rise=True) if option == "rise" else replace(law, saturation=True)
+                fit = _extended(fit, richer, known, records, linear, tick)
+        if drift == "auto":
+            fit = _with_drift(fit, tick)
+        if delay is None:
+            fit = _with_fraction(fit, tick)
+        return fit if fit.status == "converged" else _better(fit, search(fit.problem, fit.vector, tick=tick))
+
+
+def _first(
+    records: Sequence[BearingRecord], known: Mapping[str, Parameter], law: MagnetLaw, linear: LinearStart,
+    delay: float | None, *, eddy: bool, drift: bool, tick: Callable[[], None] | None,
+) -> BearingFit:  # fmt: skip
+    """Start values of one law, and a search from there."""
+    rate = next(r.rate_hz for r in records if not r.held)
+    total = linear.delay if delay is None else delay
+    whole = float(round(total)) if delay is None and abs(total - round(total)) < _NEAR_WHOLE else total
+    delays = {r: (whole if r == rate else whole / rate * r) for r in dict.fromkeys(x.rate_hz for x in records)}
+    problem = BearingProblem(
+        law=law,
+        records=tuple(records),
+        numbers=_with_eddy(start_numbers(law, known, records, linear), known, on=eddy),
+        delays=delays,
+        free_delay=frozenset(r for r in delays if delay is None and (r != rate or whole != round(whole))),
+        eddy=eddy,
+        drift=drift,
+        noise_center=np.zeros((len(records), len(LEVELS))),
+        skip=int(max(delays.values())) + 8,
+    )
+    problem = with_noise(problem, linear.values)
+    return search(problem, problem.start(), tick=tick)
+
+
+def _with_eddy(numbers: tuple[Number, ...], known: Mapping[str, Parameter], *, on: bool) -> tuple[Number, ...]:
+    free = on and ("a" not in known or known["a"].role != "fixed")
+    return tuple(replace(n, estimated=free) if n.name == "a" else n for n in numbers)
+
+
+def _extended(
+    fit: BearingFit, law: MagnetLaw, known: Mapping[str, Parameter], records: Sequence[BearingRecord],
+    linear: LinearStart, tick: Callable[[], None] | None,
+) -> BearingFit:  # fmt: skip
+    """The fit with a richer law where it pays (BIC)."""
+    values, old = fit.problem.values(fit.vector), {n.name: n for n in fit.problem.numbers}
+    fresh = {n.name: n for n in start_numbers(law, known, records, linear)}
+    new = [n for n in law.names if fresh[n].estimated and not old[n].estimated]
+    if not new:
+        return fit
+    if "L_rise" in new:
+        values |= {"L_leak": 0.7 * values["L_leak"], "L_rise": 0.4 * values["L_leak"]}
+    numbers = tuple(
+        fresh[n.name] if n.name in new
+        else n if not n.estimated or np.isfinite(n.prior_sd) else replace(n, value=values[n.name])
+        for n in fit.problem.numbers
+    )  # fmt: skip
+    if "L_rise" in new:
+        numbers = tuple(replace(n, value=values["L_rise"]) if n.name == "L_rise" else n for n in numbers)
+    problem = replace(fit.problem, law=law, numbers=numbers)
+    found = search(problem, _carried(fit, problem), tick=tick)
+    return found if fit.criterion - found.criterion > len(new) * np.log(fit.problem.n_used) else fit
+
+
+def _with_drift(fit: BearingFit, tick: Callable[[], None] | None) -> BearingFit:
+    """Let a force walk where what the law leaves over asks for it (BIC)."""
+    if fit.problem.drift:
+        return fit
+    problem = replace(fit.problem, drift=True)
+    found = search(problem, _carried(fit, problem), tick=tick)
+    added = problem.size - fit.problem.size
+    return found if fit.criterion - found.criterion > added * np.log(fit.problem.n_used) else fit
+
+
+def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
+    """Write a fit's numbers in the vector of another problem; what is new stands at its start."""
+    vector, old = problem.start(), fit.problem
+    place = {n.name: fit.vector[j] for j, n in enumerate(old.estimated)}
+    for j, n in enumerate(problem.estimated):
+        vector[j] = place.get(n.name, vector[j])
+        if n.name == "L_leak" and "L_rise" in {x.name for x in problem.estimated} - set(place):
+            vector[j] = np.log(n.value)
+    for j, rate in enumerate(problem.rates):
+        vector[len(problem.estimated) + j] = old.delay_at(fit.vector, rate)
+    for r, slot in enumerate(problem.noise_slices):
+        levels, had = problem.levels(r), old.levels(r)
+        for j, level in enumerate(levels):
+            if level in had:
+                vector[slot.start + j] = fit.vector[old.noise_slices[r].start + had.index(level)]
+            elif level == LEVELS.index("drift"):  # a hundredth of the force of one sample, at first
+                vector[slot.start + j] = fit.vector[old.noise_slices[r].start + had.index(2)] - np.log(100.0)
+    return vector
+
+
+def _with_fraction(fit: BearingFit, tick: Callable[[], None] | None) -> BearingFit:
+    """Free a delay that was whole where the score test says so; put one back that came out whole."""
+    price = float(np.log(fit.problem.n_used))
+    for rate, delay in fit.problem.delays.items():
+        if rate not in fit.problem.free_delay:
+            free = replace(fit.problem, free_delay=fit.problem.free_delay | {rate})
+            start = _carried(fit, free)
+            place, gain, from_here = len(free.estimated) + free.rates.index(rate), 0.0, start
+            for shift in (0.0, -1e-9) if delay >= 1.0 else (0.0,):  # the slope differs on the two sides
+                beside = start.copy()
+                beside[place] += shift
+                at = linearise(free, beside)
+                if at is not None and promise(at) > gain:
+                    gain, from_here = promise(at), beside
+            if gain > price:
+                found = search(free, from_here, tick=tick)
+                fit = found if fit.criterion - found.criterion > price else fit
+        if rate in fit.problem.free_delay:
+            total = fit.problem.delay_at(fit.vector, rate)
+            if abs(total - round(total)) < _NEAR_WHOLE:
+                fit = _whole(fit, rate, float(round(total)), price, tick)
+    return fit
+
+
+def _whole(
+    fit: BearingFit, rate: float, total: float, price: float, tick: Callable[[], None] | None
+) -> BearingFit:  # fmt: skip
+    exact = replace(
+        fit.problem, delays={**fit.problem.delays, rate: total}, free_delay=fit.problem.free_delay - {rate}
+    )  # fmt: skip
+    vector = _carried(fit, exact)
+    if criterion(exact, vector) - fit.criterion > 100.0 * price:
+        return fit
+    back = search(exact, vector, iterations=_SHORT, tick=tick)
+    return back if back.status == "converged" and back.criterion - fit.criterion < price else fit
+
+
+def _better(a: BearingFit, b: BearingFit) -> BearingFit:
+    return b if b.criterion <= a.criterion and b.status != "failed" else a

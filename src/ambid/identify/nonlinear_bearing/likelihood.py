@@ -1,0 +1,338 @@
+"""Maximum likelihood of the extended Kalman predictor over all records, by Levenberg-Marquardt on Fisher information.
+
+Minimised is the sum of log s + e^2/s over all innovations e with their predicted variances s (Ljung 1999, sec. 7.4;
+Astrom 1980), exact in state and covariance. Its gradient and Fisher information are inner products of rows
+(`_kernels`), reduced by QR record by record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.nonlinear_bearing.problem import NOISE_PRIOR_SD, SIGNED, BearingProblem
+
+Array = NDArray[np.float64]
+Status = Literal["converged", "stalled", "failed"]
+
+_BATCHES = 30  # stretches of all records together for the robust covariance
+_ITERATIONS = 60
+_SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
+_LONGEST = 1.0  # step of a logarithm at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linear:
+    """The criterion about one vector.
+
+    Attributes
+    ----------
+    J : ndarray, shape (n_rows, size)
+        J'J is the Fisher information, priors included.
+    r : ndarray, shape (n_rows,)
+        J'r is half the gradient of the criterion.
+    criterion : float
+    scores : ndarray, shape (n_stretches, size)
+        Half gradients of the stretches of the records.
+    """
+
+    J: Array
+    r: Array
+    criterion: float
+    scores: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingFit:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    problem : BearingProblem
+    vector : ndarray, shape (size,)
+    at : Linear or None
+        The criterion about it; None where the search failed.
+    criterion : float
+        Twice the negative log-likelihood but for constants, with the squared residuals of the priors.
+    status : {"converged", "stalled", "failed"}
+    evaluations : int
+    """
+
+    problem: BearingProblem
+    vector: Array
+    at: Linear | None
+    criterion: float
+    status: Status
+    evaluations: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Innovations:
+    """One-step prediction errors of one record.
+
+    Attributes
+    ----------
+    e, s : ndarray, shape (n_samples, 2)
+        Innovations of position in m and current in A, and their predicted variances; NaN where nothing was measured.
+    rows : ndarray, shape (4 n_samples, n_columns + 1) or (0, 0)
+        See `_kernels.predict`.
+    columns : ndarray, shape (n_columns,)
+        Place of each column in the vector; -1 where it has none.
+    """
+
+    e: Array
+    s: Array
+    rows: Array
+    columns: NDArray[np.int64]
+
+
+def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Innovations | None:
+    """Run the predictor over one record.
+
+    Parameters
+    ----------
+    problem : BearingProblem
+    vector : ndarray, shape (size,)
+    r : int
+        Which record.
+    slopes : bool
+        Whether the rows of the likelihood are wanted.
+
+    Returns
+    -------
+    Innovations or None
+        None where there is no predictor.
+    """
+    from ambid.identify.nonlinear_bearing._kernels import predict
+
+    record, n_e = problem.records[r], len(problem.estimated)
+    theta, whole = problem.theta(vector, record.rate_hz)
+    if whole < 0 or whole > problem.skip - 1 or not np.all(np.isfinite(theta)):
+        return None
+    names = [*problem.law.names, *[n.name for n in problem.numbers[7:]]]
+    active = [names.index(n.name) for n in problem.estimated]
+    chain, columns = problem.chain(vector), list(range(n_e))
+    if record.rate_hz in problem.free_delay:
+        active.append(15)
+        chain = np.append(chain, 1.0)
+        columns.append(n_e + problem.rates.index(record.rate_hz))
+    place, levels = problem.noise_slices[r], problem.levels(r)
+    columns += [place.start + levels.index(j) if j in levels else -1 for j in range(5)]
+    noise2, flags = problem.noise2(vector, r), problem.flags(r)
+    z, P = _initial(problem, r)
+    n = record.u.size
+    e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
+    steps = problem.substeps * max(1, round(0.25 * max(problem.delays) / record.rate_hz))
+    done = predict(
+        record.u, record.y, record.valid & np.array([not record.held, True]), problem.skip, whole, theta,
+        np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes, e, s, rows,
+    )  # fmt: skip
+    if not done:
+        return None
+    return Innovations(e=e, s=s, rows=rows if slopes else np.zeros((0, 0)), columns=np.array(columns))
+
+
+def _initial(problem: BearingProblem, r: int) -> tuple[Array, Array]:
+    """State before the first sample used, and its covariance, which is generous and does not hang on the vector."""
+    record, flags = problem.records[r], problem.flags(r)
+    rate, n = record.rate_hz, 3 + int(flags[2]) + int(flags[3])
+    noise, begun = np.exp(problem.noise_center[r]), {n.name: n.value for n in problem.numbers}
+    first = record.y[max(problem.skip - 4, 0) : problem.skip + 4]
+    x = record.y[:, 0].mean() if record.held else first[:, 0].mean()
+    z, P = np.zeros(n), np.zeros((n, n))
+    z[0], z[2] = x - begun["x_offset"], first[:, 1].mean() - begun["i_offset"]
+    moved = max(float(np.ptp(first[:, 0])), noise[0])
+    if not record.held:
+        z[1] = (record.y[problem.skip + 3, 0] - record.y[problem.skip - 4, 0]) * rate / 7.0
+        P[0, 0], P[1, 1] = (3.0 * moved) ** 2, (moved * rate) ** 2
+    P[2, 2] = (3.0 * max(float(np.ptp(first[:, 1])), noise[1])) ** 2
+    if flags[2]:  # the force behind the eddy pole starts at that of the weight
+        z[3] = -begun["m"] * begun["g"]
+        P[3, 3] = (0.3 * z[3]) ** 2 + (10.0 * noise[2]) ** 2
+    if flags[3]:
+        P[-1, -1] = (10.0 * noise[2]) ** 2
+    return z, P
+
+
+def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
+    """Return residual and Jacobian rows of the priors: those of the numbers, and the weak one on log noise levels.
+
+    Parameters
+    ----------
+    problem : BearingProblem
+    vector : ndarray, shape (size,)
+
+    Returns
+    -------
+    r : ndarray, shape (n_priors,)
+    J : ndarray, shape (n_priors, size)
+    """
+    values, chain = problem.values(vector), problem.chain(vector)
+    r, J = [], []
+    for j, n in enumerate(problem.estimated):
+        row = np.zeros(problem.size)
+        if np.isfinite(n.prior_sd):
+            r.append((values[n.name] - n.value) / n.prior_sd)
+            row[j] = chain[j] / n.prior_sd
+            J.append(row)
+        elif n.name not in SIGNED:
+            r.append((vector[j] - np.log(n.value)) / NOISE_PRIOR_SD)
+            row[j] = 1.0 / NOISE_PRIOR_SD
+            J.append(row)
+    first = problem.noise_slices[0].start
+    centre = problem.start()[first:]
+    rows = np.zeros((centre.size, problem.size))
+    rows[:, first:] = np.eye(centre.size) / NOISE_PRIOR_SD
+    return np.concatenate([r, (vector[first:] - centre) / NOISE_PRIOR_SD]), np.vstack([*J, rows])
+
+
+def criterion(problem: BearingProblem, vector: Array) -> float:
+    """Return the criterion at a vector: infinite where there is no predictor.
+
+    Parameters
+    ----------
+    problem : BearingProblem
+    vector : ndarray, shape (size,)
+
+    Returns
+    -------
+    float
+    """
+    total = 0.0
+    for r in range(len(problem.records)):
+        found = run(problem, vector, r, slopes=False)
+        if found is None:
+            return np.inf
+        total += _sum(found)
+    prior, _ = prior_rows(problem, vector)
+    total += float(prior @ prior)
+    return total if np.isfinite(total) else np.inf
+
+
+def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
+    """Return the criterion, its gradient and Fisher information at a vector, as rows.
+
+    Parameters
+    ----------
+    problem : BearingProblem
+    vector : ndarray, shape (size,)
+
+    Returns
+    -------
+    Linear or None
+        None where there is no predictor.
+    """
+    prior, J_prior = prior_rows(problem, vector)
+    total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], []
+    stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
+    for r in range(len(problem.records)):
+        found = run(problem, vector, r, slopes=True)
+        if found is None or not np.all(np.isfinite(found.rows)):
+            return None
+        total += _sum(found)
+        used = np.flatnonzero(found.columns >= 0)
+        local = np.delete(found.rows, np.flatnonzero(found.columns < 0), axis=1)
+        for first in range(0, local.shape[0], 4 * stretch):
+            part, score = local[first : first + 4 * stretch], np.zeros(problem.size)
+            score[found.columns[used]] = part[:, :-1].T @ part[:, -1]
+            scores.append(score)
+        triangle, short = np.zeros((local.shape[1], problem.size + 1)), _triangle(local)
+        triangle[: short.shape[0], np.append(found.columns[used], problem.size)] = short
+        parts.append(triangle)
+    whole = _triangle(np.vstack(parts))
+    return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
+
+
+def _triangle(rows: Array) -> Array:
+    """R of a QR decomposition."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def promise(at: Linear) -> float:
+    """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
+
+    Parameters
+    ----------
+    at : Linear
+
+    Returns
+    -------
+    float
+    """
+    norm = np.linalg.norm(at.J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, _ = np.linalg.svd(at.J / norm, full_matrices=False)
+    inside = u[:, s > 1e-10 * s[0]].T @ at.r
+    return float(inside @ inside)
+
+
+def search(
+    problem: BearingProblem, start: Array, *, iterations: int = _ITERATIONS, tick: Callable[[], None] | None = None
+) -> BearingFit:
+    """Minimise the criterion from `start`.
+
+    Parameters
+    ----------
+    problem : BearingProblem
+    start : ndarray, shape (size,)
+    iterations : int
+        Bound on linearisations.
+    tick : callable, optional
+        Called after each evaluation; may raise KeyboardInterrupt, upon which the best so far comes back as stalled.
+
+    Returns
+    -------
+    BearingFit
+        With status ``"failed"`` where there is no predictor at `start`.
+    """
+    at = linearise(problem, start)
+    vector, damping, count, status = start.copy(), 1e-3, 1, "stalled"
+    if at is None:
+        return BearingFit(problem=problem, vector=vector, at=None, criterion=np.inf, status="failed", evaluations=1)
+    try:
+        for _ in range(iterations):
+            if promise(at) < _SETTLED:
+                status = "converged"
+                break
+            moved, first = None, True
+            while damping < 1e8:
+                trial = vector + _step(at, damping)
+                # the first step is mostly right, and wants its slopes anyway; after a refusal the criterion alone asks
+                if first or criterion(problem, trial) < at.criterion:
+                    moved = linearise(problem, trial)
+                count, first = count + 1, False
+                if tick is not None:
+                    tick()
+                if moved is not None and moved.criterion < at.criterion:
+                    break
+                moved, damping = None, max(10.0 * damping, 1e-6)
+            if moved is None:
+                # no way down from here: converged where what a step promises is below what rounding leaves
+                status = "converged" if promise(at) < 1.0 else "stalled"
+                break
+            vector, at, damping = trial, moved, damping / 10.0
+    except KeyboardInterrupt:
+        status = "stalled"
+    final: Status = "converged" if status == "converged" else "stalled"
+    return BearingFit(problem=problem, vector=vector, at=at, criterion=at.criterion, status=final, evaluations=count)
+
+
+def _step(at: Linear, damping: float) -> Array:
+    norm = np.linalg.norm(at.J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, vt = np.linalg.svd(at.J / norm, full_matrices=False)
+    step = np.asarray(-(vt.T @ (s / (s**2 + damping) * (u.T @ at.r))) / norm)
+    longest = float(np.max(np.abs(step)))
+    return step if longest <= _LONGEST else step * (_LONGEST / longest)
+
+
+def _sum(found: Innovations) -> float:
+    with np.errstate(all="ignore"):
+        used = ~np.isnan(found.s)
+        e, s = found.e[used], found.s[used]
+        return float(np.sum(np.log(s) + e * e / s))

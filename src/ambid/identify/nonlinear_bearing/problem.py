@@ -1,0 +1,256 @@
+"""What is estimated from what: records, magnet law, numbers, and the layout of the vector that the search moves.
+
+The vector holds, in this order: the free and prior numbers (the logarithm of those that physics wants positive, the
+others over their magnitudes), one delay for each sampling rate where delays are free, and the log noise levels of each
+record (position, current, force, voltage, drift; of a held rotor current and voltage alone).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.physics.coenergy_law import MagnetLaw
+
+Array = NDArray[np.float64]
+
+BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset")
+"""Numbers after those of the magnet, in the order of the kernels."""
+
+SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset"})
+"""Numbers that may have either sign; all others are positive, or zero where they are fixed."""
+
+UNITS: Mapping[str, str] = {
+    "k": "N m^2/A^2", "s": "m", "L_g": "H", "zeta": "m", "sigma": "1/A^2", "L_leak": "H", "L_rise": "H", "i_knee": "A",
+    "i0": "A", "m": "kg", "R": "ohm", "c": "N s/m", "g": "m/s^2", "a": "rad/s", "x_offset": "m", "i_offset": "A",
+    "v_offset": "V",
+}  # fmt: skip
+"""SI unit of every number."""
+
+LEVELS = ("position", "current", "force", "voltage", "drift")
+"""Noise levels in the order of the kernels: rms of one sample, the last three held over it."""
+
+NOISE_PRIOR_SD = 5.0
+"""Of a log noise level: keeps a level that the data do not see from running to minus infinity."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingRecord:
+    """One record as the predictor sees it.
+
+    Attributes
+    ----------
+    name : str
+    rate_hz : float
+    u : ndarray, shape (n_samples,), V
+        Voltage, held over a sample.
+    y : ndarray, shape (n_samples, 2)
+        Position in m and current in A.
+    valid : ndarray, shape (n_samples, 2), bool
+        Which of them are measured; the predictor runs on through the others.
+    held : bool
+        The rotor is held at rest at the mean position: only the coil moves.
+    """
+
+    name: str
+    rate_hz: float
+    u: Array
+    y: Array
+    valid: NDArray[np.bool_]
+    held: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number:
+    """One number of the model, in SI units.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        Start, fixed value, or mean of the prior.
+    estimated : bool
+    prior_sd : float
+        Infinite without a prior.
+    magnitude : float
+        Scale of a number that may have either sign.
+    """
+
+    name: str
+    value: float
+    estimated: bool
+    prior_sd: float = np.inf
+    magnitude: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingProblem:
+    """Records, law and what is estimated.
+
+    Attributes
+    ----------
+    law : MagnetLaw
+    records : tuple of BearingRecord
+    numbers : tuple of Number
+        One for each name of the law and of `BODY`, in that order.
+    delays : Mapping[float, float]
+        By sampling rate: delay of the voltage in samples (start where free).
+    free_delay : frozenset of float
+        Rates at which it is estimated.
+    eddy, drift : bool
+        Whether the force has a pole a/(s + a), and whether a random-walk force acts.
+    noise_center : ndarray, shape (n_records, 5)
+        Centres of the weak prior on log noise levels.
+    skip : int
+        Samples left out at the start of each record.
+    substeps : int
+        Runge-Kutta steps in a sample.
+    """
+
+    law: MagnetLaw
+    records: tuple[BearingRecord, ...]
+    numbers: tuple[Number, ...]
+    delays: Mapping[float, float]
+    free_delay: frozenset[float]
+    eddy: bool
+    drift: bool
+    noise_center: Array
+    skip: int = 8
+    substeps: int = 1
+
+    @property
+    def estimated(self) -> tuple[Number, ...]:
+        """Numbers in the vector."""
+        return tuple(n for n in self.numbers if n.estimated)
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Sampling rates whose delay is in the vector."""
+        return tuple(r for r in self.delays if r in self.free_delay)
+
+    def levels(self, r: int) -> tuple[int, ...]:
+        """Return which noise levels record `r` has, as places in `LEVELS`."""
+        if self.records[r].held:
+            return (1, 3)
+        return (0, 1, 2, 3, 4) if self.drift else (0, 1, 2, 3)
+
+    @property
+    def noise_slices(self) -> tuple[slice, ...]:
+        """Places of each record's noise levels in the vector."""
+        found, first = [], len(self.estimated) + len(self.rates)
+        for r in range(len(self.records)):
+            found.append(slice(first, first + len(self.levels(r))))
+            first = found[-1].stop
+        return tuple(found)
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return int(self.noise_slices[-1].stop)
+
+    @property
+    def n_used(self) -> int:
+        """Measured values that enter the fit."""
+        return int(sum(np.count_nonzero(r.valid[self.skip :, 1 if r.held else 0 :]) for r in self.records))
+
+    def start(self) -> Array:
+        """Return the vector at the numbers' own values and the centres of the noise, in shape (size,)."""
+        vector = np.zeros(self.size)
+        for j, n in enumerate(self.estimated):
+            vector[j] = n.value / n.magnitude if n.name in SIGNED else np.log(n.value)
+        first = len(self.estimated)
+        vector[first : first + len(self.rates)] = [self.delays[r] for r in self.rates]
+        for r, place in enumerate(self.noise_slices):
+            vector[place] = self.noise_center[r, list(self.levels(r))]
+        return vector
+
+    def values(self, vector: Array) -> dict[str, float]:
+        """Return all numbers at a vector, SI.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+
+        Returns
+        -------
+        dict of str to float
+        """
+        found = {n.name: n.value for n in self.numbers}
+        for n, v in zip(self.estimated, vector.tolist(), strict=False):
+            found[n.name] = v * n.magnitude if n.name in SIGNED else float(np.exp(v))
+        return found
+
+    def chain(self, vector: Array) -> Array:
+        """Return d(number)/d(vector) of the estimated numbers.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+
+        Returns
+        -------
+        ndarray, shape (n_estimated,)
+        """
+        values = self.values(vector)
+        return np.array([n.magnitude if n.name in SIGNED else values[n.name] for n in self.estimated])
+
+    def delay_at(self, vector: Array, rate_hz: float) -> float:
+        """Return the delay in samples at a rate.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+        rate_hz : float
+
+        Returns
+        -------
+        float
+        """
+        if rate_hz in self.free_delay:
+            return float(vector[len(self.estimated) + self.rates.index(rate_hz)])
+        return self.delays[rate_hz]
+
+    def theta(self, vector: Array, rate_hz: float) -> tuple[Array, int]:
+        """Return the kernels' numbers at a vector, and the whole samples of delay.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+        rate_hz : float
+            Whose delay.
+
+        Returns
+        -------
+        theta : ndarray, shape (16,)
+        whole : int
+        """
+        values, delay = self.values(vector), self.delay_at(vector, rate_hz)
+        whole = int(np.floor(delay))
+        body = [values[name] for name in BODY]
+        return np.concatenate([self.law.vector(values), body, [delay - whole]]), whole
+
+    def flags(self, r: int) -> NDArray[np.bool_]:
+        """Return (exponential, pair, eddy, drift, held) of record `r`, in shape (5,)."""
+        held = self.records[r].held
+        drift, eddy = self.drift and not held, self.eddy and not held
+        return np.array([self.law.gap == "exponential", self.law.pair, eddy, drift, held])
+
+    def noise2(self, vector: Array, r: int) -> Array:
+        """Return the squared noise levels of one record.
+
+        Parameters
+        ----------
+        vector : ndarray, shape (size,)
+        r : int
+            Which record.
+
+        Returns
+        -------
+        ndarray, shape (5,)
+        """
+        found = np.zeros(len(LEVELS))
+        found[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
+        return found

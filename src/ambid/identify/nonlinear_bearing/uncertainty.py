@@ -1,0 +1,108 @@
+"""Covariance of the numbers of a nonlinear bearing: from Fisher information, and robust (as `identify.uncertainty`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.nonlinear_bearing.likelihood import BearingFit
+from ambid.identify.nonlinear_bearing.problem import SIGNED
+from ambid.identify.uncertainty import WEAK, inverse_information
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingUncertainty:
+    """What a fit knows of its numbers.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Estimated numbers.
+    information, robust : ndarray, shape (n, n), SI
+        Covariance from the Fisher information (priors and noise levels included), and the sandwich over stretches.
+    relative : ndarray, shape (n,)
+        Standard deviations of the logarithm of numbers that are positive; of signed ones over their natural size.
+    delay_sd : dict of float to float
+        By rate, in samples, where it was estimated.
+    inflation : float
+        Largest ratio of robust to information standard deviation.
+    data_only : ndarray, shape (n,)
+        `relative` without the priors of the numbers.
+    """
+
+    names: tuple[str, ...]
+    information: Array
+    robust: Array
+    relative: Array
+    delay_sd: dict[float, float]
+    inflation: float
+    data_only: Array
+
+    def covariance(self, *, robust: bool) -> Array:
+        """Return the covariance; the robust one is nowhere smaller than that of the information.
+
+        Parameters
+        ----------
+        robust : bool
+
+        Returns
+        -------
+        ndarray, shape (n, n), SI
+        """
+        if not robust:
+            return self.information
+        ratio = np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.robust), 1e-300))
+        wider = np.maximum(ratio, 1.0)
+        return np.asarray(self.robust * np.outer(wider, wider))
+
+
+def uncertainty(fit: BearingFit, *, robust: bool | None = None) -> BearingUncertainty:
+    """Compute the covariances of a fit.
+
+    Parameters
+    ----------
+    fit : BearingFit
+        Not failed.
+    robust : bool, optional
+        Whether `relative` is that of the robust covariance; None: as the larger.
+
+    Returns
+    -------
+    BearingUncertainty
+    """
+    assert fit.at is not None
+    problem, at = fit.problem, fit.at
+    n, chain = len(problem.estimated), problem.chain(fit.vector)
+    whole = inverse_information(at.J)
+    centred = at.scores - at.scores.mean(axis=0)
+    middle = centred * np.sqrt(len(centred) / max(len(centred) - 1, 1))
+    half = whole @ middle.T
+    sandwich = half @ half.T
+    unit = np.outer(chain, chain)
+    information, wide = whole[:n, :n] * unit, sandwich[:n, :n] * unit
+    ratio = np.sqrt(np.diag(wide) / np.maximum(np.diag(information), 1e-300))
+    used = np.sqrt(np.diag(information)) * (np.maximum(ratio, 1.0) if robust is not False else 1.0)
+    size = np.array(
+        [number.magnitude if number.name in SIGNED else c for number, c in zip(problem.estimated, chain, strict=True)]
+    )
+    prior = np.array([1.0 / number.prior_sd for number in problem.estimated]) ** 2  # of the natural number
+    left = 1.0 / np.maximum(1.0 / np.maximum(np.diag(information), 1e-300) - prior, 1e-300)
+    extra = [float(np.sqrt(whole[n + j, n + j])) for j in range(len(problem.rates))]
+    return BearingUncertainty(
+        names=tuple(number.name for number in problem.estimated),
+        information=information,
+        robust=wide,
+        relative=used / size,
+        delay_sd=dict(zip(problem.rates, extra, strict=True)),
+        inflation=float(ratio.max()),
+        data_only=np.sqrt(left) / size,
+    )
+
+
+def identifiable(relative: float) -> bool:
+    """Return whether a number with the given `relative` standard deviation counts as shown by the data."""
+    return relative < WEAK
