@@ -13,8 +13,9 @@ from ambid.job.acquire import acquire
 from ambid.job.physical import identify
 from ambid.job.track_live import track_live
 from ambid.record import read_record
+from ambid.rig import rig_from_text
 from tests.acquire.scripted import Listener
-from tests.job.benches import Spoiled, prototype
+from tests.job.benches import PROTOTYPE_FILE, Spoiled, prototype
 
 RIG = prototype()
 TRUTH = {"m": 0.3, "R": 6.0}
@@ -95,6 +96,28 @@ def test_a_gap_is_seen_by_the_tracker(start):
     assert done.run.lost == 20
     assert done.track.summary.samples + done.track.summary.rejected_samples >= 7980
     assert any(e.kind == "rejected" and "20 samples" in e.why for line in done.track.lines for e in line.events)
+
+
+def test_a_sample_outside_a_calibration_table_is_rejected_and_ends_nothing(start, tmp_path):
+    gain, offset = 2.44140625e-6, -1.248779296875e-3
+    rows = [f"{count},{count * gain + offset!r}" for count in (100.0, 500.0, 923.0)]
+    (tmp_path / "p.csv").write_text("\n".join(["counts [1],position [m]", *rows]) + "\n", encoding="utf-8")
+    text = PROTOTYPE_FILE.read_text(encoding="utf-8")
+    for line in ("gain   = 2.44140625e-6 ", "offset = -1.248779296875e-3 "):
+        text = text.replace(line, f"# {line}")
+    text = text.replace('column = "position"', 'column = "position"\ntable = "p.csv"')
+    rig = rig_from_text(text, tmp_path / "rig.toml")
+
+    def spike(values, device):
+        if device.blocks == 300 and device.excited:
+            values[3, 0] = 60.0
+
+    heard = Listener()
+    with Spoiled(rig, spoil=spike) as device:
+        done = track_live(device, rig, course(4.0), start=start, taps=[heard])
+    assert done.run.complete
+    assert len(heard.numbers) == 8000
+    assert 1 <= done.track.summary.rejected_samples < 40
 
 
 def test_a_bench_that_changes_is_seen(start):

@@ -30,7 +30,7 @@ from ambid.physics.models import model
 from ambid.record import Channel, Record
 from ambid.rig import Rig
 from ambid.track.lines import Track, TrackHeader, TrackLine
-from ambid.track.stream.block import Block, Frame
+from ambid.track.stream.block import Array, Block, Frame
 from ambid.track.stream.replay import Replay
 from ambid.track.stream.ring import BlockRing
 
@@ -157,7 +157,8 @@ class _RingTap:
     """Puts what a device samples into the ring, seen through the rig, numbered from its first sample.
 
     A bench of this world waits for nobody: blocks that find the ring full are counted. One that is only played runs
-    ahead of the tracker, and is held up instead.
+    ahead of the tracker, and is held up instead. Samples that a calibration does not cover go in as NaN, which the
+    tracker rejects and counts.
     """
 
     def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
@@ -166,12 +167,24 @@ class _RingTap:
         self.over = Signal()  # nobody reads the ring any more
 
     def take(self, frame: Frame) -> None:
-        block = self._view.block(frame.block)
+        block = self._seen(frame.block)
         if self._origin is None:
             self._origin = block.first
         while self._waits and not self.over.is_set() and not self._ring.wait_for_room(_LOOK_S):
             pass
         self._ring.put(replace(block, first=block.first - self._origin), frame.arrived_s)
+
+    def _seen(self, raw: Block) -> Block:
+        try:
+            return self._view.block(raw)
+        except AmbidError:
+            return replace(raw, values=np.concatenate([self._row(raw, k) for k in range(len(raw.values))]))
+
+    def _row(self, raw: Block, k: int) -> Array:
+        try:
+            return self._view.block(replace(raw, values=raw.values[k : k + 1])).values
+        except AmbidError:
+            return np.full((1, len(self._view.units)), np.nan)
 
 
 class _Runner:
@@ -189,7 +202,7 @@ class _Runner:
         stopped: Callable[[], bool],
         ring: BlockRing,
     ) -> None:
-        self._job = (device, course, (ring_tap, *taps), on_event)
+        self._job = (device, course, (*taps, ring_tap), on_event)  # who records is never behind the tracker
         self._ring_tap = ring_tap
         self._on_run, self._on_trouble, self._stopped = on_run, on_trouble, stopped
         self._ring, self._stop = ring, Signal()
