@@ -140,13 +140,16 @@ def scale_of(rig: Rig, role: str) -> Scale:
     _check_counts(rig, c)
     if of.raw is None or of.out is None:
         raw = np.array([0.0, float(top)])
-        return Scale(role=role, column=c.column, top=top, raw=raw, si=of.gain * raw + of.offset)
+        si = of.gain * raw + of.offset
+        _check_slopes(rig, role, raw, si)
+        return Scale(role=role, column=c.column, top=top, raw=raw, si=si)
     steps = np.diff(of.out)
     if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
         raise RigError(
             f"{who(rig)}: channels.{role}.table rises and falls, or stands still; the controller needs one value"
             " for each count and back. Cut the table to a part that only rises or only falls"
         )
+    _check_slopes(rig, role, of.raw, of.out)
     ends = None if of.extrapolate else (float(of.raw[0]), float(of.raw[-1]))
     return Scale(role=role, column=c.column, top=top, raw=of.raw, si=of.out, ends=ends)
 
@@ -165,6 +168,17 @@ def who(rig: Rig) -> str:
         By its file, else by its name.
     """
     return f"rig {rig.source}" if rig.source is not None else f"rig {rig.name!r}"
+
+
+def _check_slopes(rig: Rig, role: str, raw: Array, si: Array) -> None:
+    """Refuse values that do not differ from count to count, or are beyond all numbers."""
+    with np.errstate(all="ignore"):
+        slopes = np.concatenate([np.diff(si) / np.diff(raw), np.diff(raw) / np.diff(si)])
+    if not np.all(np.isfinite(slopes)):
+        raise RigError(
+            f"{who(rig)}: channels.{role} gives {si[0]:.6g} at {raw[0]:g} counts and {si[-1]:.6g} at {raw[-1]:g}; each"
+            " count has to be another value. Correct its gain, offset or table"
+        )
 
 
 def _check_counts(rig: Rig, c: RigChannel) -> None:

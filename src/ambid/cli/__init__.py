@@ -8,7 +8,8 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import NoReturn
+from contextlib import suppress
+from typing import NoReturn, TextIO
 
 INTERRUPTED = 130
 BROKEN_PIPE = 141
@@ -32,7 +33,50 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if not sys.warnoptions:
         # Warnings of numerical libraries speak to programmers; what concerns the user is said in results and errors.
         warnings.simplefilter("ignore")
+    _hold_standard_files()
+    if sys.stderr is not None:
+        sys.stderr = _Told.of(sys.stderr)
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def _hold_standard_files() -> None:
+    """Let no file that is opened later become what others take for standard output or error.
+
+    Where one of the three was closed before the program began, the next file that is opened gets its number: a record
+    or a port, into which a library then writes its complaints.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number: this one
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115 - stays open to the end
+
+
+class _Told(io.TextIOWrapper):
+    """Standard error of which nothing depends: a recording goes on where nobody reads what is said of it."""
+
+    _before: TextIO
+
+    @classmethod
+    def of(cls, stream: TextIO) -> TextIO:
+        """Return a stream's stand-in; the stream itself where it is of another kind."""
+        buffer = getattr(stream, "buffer", None)
+        if buffer is None:
+            return stream
+        told = cls(buffer, encoding=stream.encoding, errors=stream.errors, line_buffering=True)
+        told._before = stream  # which would close the file when nobody holds it any more
+        return told
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            super().flush()
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -78,6 +122,10 @@ def run(arguments: Sequence[str]) -> int:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             return _refused(
                 f"the output cannot be written: {error.strerror}. Make room, or write elsewhere", 2, trace=trace
+            )
+        if isinstance(error, MemoryError):
+            return _refused(
+                "there is not enough memory. Close other programs, or take a shorter record", 2, trace=trace
             )
         where = f"{type(error).__name__}: {' '.join(str(error).split())}"
         advice = "" if trace else ". Run with --traceback, and report it"

@@ -140,6 +140,7 @@ def _course(wish: Wish, device: Device, stop: Stop, watch: Watch) -> Course:
     """Say what the device is to do; find the amplitude of its excitation where none is given."""
     from ambid.acquire.session import Course
 
+    wish.check_length(device.info.rate_hz)
     return Course(
         mode=wish.mode, seconds=wish.seconds, settle_s=wish.settle_s, program=_wave(wish, device, stop, watch)
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
+from ambid.cli.options import LARGEST, check_positive
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
@@ -54,11 +54,9 @@ class Wish:
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
-        for option, x in (("--seconds", self.seconds), ("--amplitude", self.amplitude)):
-            if x is not None and not (math.isfinite(x) and x > 0):
-                raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
-        if not (math.isfinite(self.settle_s) and self.settle_s >= 0):
-            raise AmbidError(f"--settle is {self.settle_s:g}; it must be a number, 0 or more. Correct it")
+        check_positive({"--seconds": self.seconds, "--amplitude": self.amplitude})
+        if not 0 <= self.settle_s <= LARGEST:
+            raise AmbidError(f"--settle is {self.settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
         if self.name is None:
             for option, y in (("--amplitude", self.amplitude), ("--band", self.band)):
                 if y is not None:
@@ -71,8 +69,30 @@ class Wish:
             raise AmbidError(
                 "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"
             )
-        if self.record.exists() and not self.force:
+        if (self.record.exists() or self.record.is_symlink()) and not self.force:
             raise AmbidError(f"-o {self.record} exists already. Choose another name, or give --force")
+
+    def check_length(self, rate_hz: float) -> None:
+        """Refuse a record that would be too short to be read.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Of the device.
+
+        Raises
+        ------
+        AmbidError
+            If it has fewer samples than a record needs.
+        """
+        from ambid.record.sampling import MIN_SAMPLES
+
+        samples = max(1, round(self.seconds * rate_hz))
+        if samples < MIN_SAMPLES:
+            raise AmbidError(
+                f"--seconds is {self.seconds:g}: {samples} samples at {rate_hz:g} Hz; a record has {MIN_SAMPLES} at"
+                f" least. Give {MIN_SAMPLES / rate_hz:.3g} or more"
+            )
 
 
 def start_of_track(track: str | None) -> Estimate | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +12,7 @@ import typer
 from ambid.cli import INTERRUPTED
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
 from ambid.cli.interrupts import Stop, signals
-from ambid.cli.options import FAILED_CHECK, band_of
+from ambid.cli.options import FAILED_CHECK, band_of, check_positive
 from ambid.cli.terminal import painter
 from ambid.cli.watch import watching
 from ambid.errors import AmbidError
@@ -64,7 +63,9 @@ def command(
     from ambid.report.commission_text import next_text, step_text
     from ambid.rig import load_rig
 
-    _check({"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest})
+    check_positive(
+        {"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest}
+    )
     wishes = Wishes(
         record_s=seconds,
         second_s=_second_s(seconds),
@@ -127,12 +128,6 @@ def _second_s(seconds: float) -> float:
     return max(0.4 * seconds, min(seconds, 4.0))
 
 
-def _check(given: dict[str, float | None]) -> None:
-    for option, x in given.items():
-        if x is not None and not (math.isfinite(x) and x > 0):
-            raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
-
-
 def _check_port(port: str, *, yes: bool) -> None:
     """Refuse what cannot be commissioned, before it is opened."""
     if port.startswith("replay:"):
@@ -145,7 +140,11 @@ def _check_port(port: str, *, yes: bool) -> None:
 
 
 def _check_place(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
+    try:
+        exists = folder.exists()
+    except OSError as failure:  # a name that no folder can have
+        raise AmbidError(f"-o {folder} cannot be: {failure.strerror or failure}. Give another name") from None
+    if exists and not folder.is_dir():
         raise AmbidError(f"-o {folder} is a file; a folder is wanted. Name one")
     if not folder.parent.is_dir():
         raise AmbidError(f"-o {folder}: there is no folder {folder.parent}. Make it first, or correct the path")

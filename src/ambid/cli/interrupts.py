@@ -41,7 +41,10 @@ def signals(take: Callable[[int], None]) -> Iterator[None]:
 
 
 class Stop:
-    """Takes the first signal as a wish to end; the second one interrupts at once.
+    """Takes the first signal as a wish to end; the second one interrupts at once; more change nothing.
+
+    Whoever presses Ctrl-C again and again would otherwise tear off the very steps that switch the output off, close
+    the device and keep what was recorded.
 
     Attributes
     ----------
@@ -52,6 +55,7 @@ class Stop:
     def __init__(self) -> None:
         """Nothing has been wished."""
         self.number: int | None = None
+        self._torn = False
 
     def take(self, number: int) -> None:
         """Take a signal.
@@ -65,9 +69,11 @@ class Stop:
         KeyboardInterrupt
             At the second one.
         """
-        if self.number is not None:
+        if self.number is None:
+            self.number = number
+        elif not self._torn:
+            self._torn = True
             raise KeyboardInterrupt
-        self.number = number
 
     def wished(self) -> bool:
         """Return whether the run is to end.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -49,6 +50,26 @@ Strict = Annotated[
 ]
 
 FAILED_CHECK = 3
+LARGEST = 1e9
+"""What a time in s or an amplitude may be at most: beyond it is a slip, and numbers of samples would overflow."""
+
+
+def check_positive(given: Mapping[str, float | None]) -> None:
+    """Refuse numbers that are not positive, not finite or absurd.
+
+    Parameters
+    ----------
+    given : mapping of str to float or None
+        By option; None where it was not given.
+
+    Raises
+    ------
+    AmbidError
+        For the first one that breaks the rule.
+    """
+    for option, x in given.items():
+        if x is not None and not 0 < x <= LARGEST:
+            raise AmbidError(f"{option} is {x:g}; it must be a positive number, up to {LARGEST:g}. Correct it")
 
 
 def json_path(json: str | None) -> Path | None:

@@ -47,7 +47,14 @@ class Outputs:
         """
         if path is None:
             return
-        folder = path.parent
+        try:
+            self._check(path, option, suffixes)
+        except OSError as failure:  # a name that no file can have
+            raise AmbidError(f"{option} {path} cannot be: {failure.strerror or failure}. Give another name") from None
+        self._claimed.append(path)
+
+    def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
+        folder = (path.resolve() if path.is_symlink() else path).parent
         if path.exists() and not path.is_file() and not path.is_dir():
             raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. Use - for standard output")
         if path.is_dir():
@@ -64,7 +71,6 @@ class Outputs:
         for other in self._claimed:
             if _same(path, other):
                 raise AmbidError(f"{option} {path} is named by two options. Choose another file for one of them")
-        self._claimed.append(path)
 
     def stage(self, path: Path, write: Callable[[Path], object]) -> None:
         """Write a file under a name beside its own.

@@ -63,6 +63,8 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
     from ambid.acquire.recorder.disk import sync_folder
     from ambid.errors import DeviceError
 
+    if not journal.name:
+        raise AmbidError(f"journal {str(journal)!r} is a folder; a file is wanted. Name the file inside it")
     path = record_path(journal) if output is None else output
     Outputs(journal).claim(path, "-o")
     with JournalReader.open(journal) as reader, progress("recover"):

@@ -13,6 +13,7 @@ from ambid.rig.rig import DAQ_RATE_HZ, Daq, RigChannel
 if TYPE_CHECKING:
     from ambid.rig.schema import DaqEntry
 
+_BAUD = (300, 12_000_000)
 _HOST_MS = (20, 2000)
 _LIFT_MS = (0, 2000)
 
@@ -56,6 +57,11 @@ def daq_of(
     place = f"{where}: daq"
     if entry.duty is not None and not entry.duty[0] < entry.duty[1]:
         raise RigError(f"{place}.duty is {list(entry.duty)}; the lower comes first. Swap or correct them")
+    if not _BAUD[0] <= entry.baud <= _BAUD[1]:
+        raise RigError(
+            f"{place}.baud is {entry.baud}; a serial line goes at {_BAUD[0]} to {_BAUD[1]} bit/s."
+            " Give the firmware's, 1000000"
+        )
     for name, (low, high) in (("host_ms", _HOST_MS), ("lift_ms", _LIFT_MS)):
         value = getattr(entry, name)
         if not low <= value <= high:

@@ -23,6 +23,10 @@ NotNegative = Annotated[float, Field(allow_inf_nan=False, strict=True, ge=0)]
 Samples = Annotated[int, Field(strict=True, ge=0)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
+Name = Annotated[
+    str,
+    Field(strict=True, min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*[^\s\x00-\x1f\x7f][^\x00-\x1f\x7f]*$"),
+]
 
 
 class _Entry(BaseModel):
@@ -41,7 +45,7 @@ class QuantityEntry(_Entry):
 class ChannelEntry(_Entry):
     """``[channels.<role>]``: which column is this role, and how its values become the role's unit."""
 
-    column: Text | None = None
+    column: Name | None = None
     variable: Text | None = None
     unit: Text | None = None
     gain: Number | None = None
@@ -135,7 +139,7 @@ class DaqEntry(_Entry):
     duty_off: Whole | None = None
     host_ms: Whole = 250
     lift_ms: Whole = 300
-    third: Text | None = None
+    third: Name | None = None
     bench: Text | None = None
     trip: TripEntry = Field(default_factory=TripEntry)
 
@@ -264,7 +268,7 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     place, kind, limits = ".".join(keys), error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
         return _unknown_key(keys)
-    if kind == "missing":
+    if kind == "missing" and keys[-1] != "duty" and "limits" not in keys[:-1] and "trip" not in keys[:-1]:
         return f"{place} is missing. Add it"
     got = error["input"]
     shown = "a table" if isinstance(got, dict) else f"{got!r}"
@@ -285,6 +289,8 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     elif kind in ("model_type", "dict_type"):
         example = '{ value = 1.0, unit = "…" }' if keys[0] in ("parameters", "operating_point") else "a [table]"
         rule = f"it must be {example}"
+    elif kind in ("string_pattern_mismatch", "string_too_long"):
+        rule = "a name of a column is up to 200 printable characters, not all of them blanks"
     elif kind in ("string_type", "string_too_short"):
         rule = "it must be a text that is not empty"
     elif kind == "bool_type":

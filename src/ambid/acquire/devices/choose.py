@@ -58,6 +58,8 @@ def open_device(
         raise DeviceError(
             f"a bench is chosen for ports emulated and simulated; behind {port!r} stands its own. Leave it out"
         )
+    if not port.strip():
+        raise DeviceError("the port has no name. Give a serial port, or emulated, simulated, or replay:FILE")
     if port == "emulated":
         from ambid.acquire.devices.emulated import EmulatedDevice
 

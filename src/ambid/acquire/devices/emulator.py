@@ -157,9 +157,15 @@ class Emulator:
         command += ["--trajectory", str(self.trajectory_path)] if self._trajectory else []
         atexit.register(self.close)
         with self._said_path().open("wb") as said:
-            self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, start_new_session=True
-            )
+            try:
+                self._process = subprocess.Popen(
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, start_new_session=True
+                )
+            except OSError as failure:
+                raise DeviceError(
+                    f"emulated bench: {program} cannot be started: {failure.strerror or failure}. Build it with 'make"
+                    " firmware', or correct AMBID_BENCH"
+                ) from None
         self.pid = self._process.pid
         try:
             self.port = self._read_port(self._process)
@@ -249,7 +255,13 @@ class Emulator:
                 f"emulated bench: it ended with {code} before its port was there: {self.said() or 'without a word'}."
                 " Correct what it names"
             )
-        return str(json.loads(text)["pty"])
+        try:
+            return str(json.loads(text)["pty"])
+        except (ValueError, TypeError, KeyError):
+            raise DeviceError(
+                f"emulated bench: {process.args[0]!r} said {text[:80]!r} instead of its port; it is not the bench of"  # type: ignore[index]
+                " this firmware. Correct AMBID_BENCH, or build it with 'make firmware'"
+            ) from None
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol
 
-from ambid.errors import DeviceError
+from ambid.errors import DeviceError, nearest
 
 if TYPE_CHECKING:
     import serial
@@ -215,8 +215,12 @@ def _refusal(name: str, baud: int, failure: Exception) -> str:
         )
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
         known = candidate_ports()
-        there = f"there are {'; '.join(known)}" if known else "no serial port with a device is there"
-        return f"port {name} does not exist; {there}. Plug the board in, or give one of these"
+        meant = "" if "/" in name else nearest(name.lower(), ("emulated", "simulated", "replay:FILE"))
+        if not known:
+            return f"port {name} does not exist; no serial port with a device is there.{meant} Plug the board in"
+        return (
+            f"port {name} does not exist; there are {'; '.join(known)}.{meant} Plug the board in, or give one of these"
+        )
     if isinstance(failure, ValueError) or "baud" in text.lower():
         return f"port {name} cannot go at {baud} baud ({text}). Give the daq.baud of the firmware, or another adapter"
     return f"port {name} cannot be opened ({text}). Check the name and the cable"

@@ -16,6 +16,7 @@ from ambid.errors import DeviceError
 
 _LOOK_S = 1.0  # how often the disk is looked at
 _HEADER_EVERY = 16 << 20  # bytes after which the header is written again: damage at the beginning costs no more
+_HEADER_AGAIN = 16 << 10  # the same at first, four times as many each time: no single bad sector hits every header
 _NOTHING_LOST = "What is on the disk stays in the journal"
 
 
@@ -38,7 +39,7 @@ class JournalWriter:
         self._on_acknowledged, self._on_trouble = on_acknowledged, on_trouble
         self._journal = secrets.randbits(64)
         self._frames = self._block = 0
-        self._header_at = 0
+        self._header_at, self._header_every = 0, min(_HEADER_AGAIN, _HEADER_EVERY)
         self._file: JournalFile | None = None
         self._thread = threading.Thread(target=self._run, name="ambid-recorder", daemon=True)
         self._wake = threading.Condition()
@@ -124,8 +125,8 @@ class JournalWriter:
         elif items:
             before = self._open.size
             frames = [self._frame_of(item) for item in items]
-            if before - self._header_at > _HEADER_EVERY:
-                self._header_at = before
+            if before - self._header_at > self._header_every:
+                self._header_at, self._header_every = before, min(4 * self._header_every, _HEADER_EVERY)
                 frames.append(self._header_frame())
             try:
                 self._open.write(b"".join(frames))

@@ -169,13 +169,20 @@ class JournalReader:
                 f"journal {self.path} is of version {version}; this program reads {frames.VERSION}."
                 " Recover it with the version that recorded it"
             )
+        blocks = 0
         for _, head, data in self._frames(None):
+            blocks += head.kind == frames.BLOCK
             if head.kind == frames.HEADER:
                 return head.journal, JournalHeader.from_json(json.loads(_payload(head, data)))
         if not self._size:
             raise DeviceError(f"journal {self.path} is empty: it was cut off before anything was recorded. Remove it")
         if version is None:
             raise DeviceError(f"{self.path} is not a journal of ambid. Name a file that ends in .journal")
+        if blocks:
+            raise DeviceError(
+                f"journal {self.path} holds {blocks} sound blocks, but every header, which says what they are, is"
+                " damaged. Keep it, and copy it once more from where it was recorded"
+            )
         raise DeviceError(f"journal {self.path} holds no sound header: it was cut off before anything was acknowledged,"
                           " or is damaged throughout. There is nothing to recover: remove it")  # fmt: skip
 
@@ -240,10 +247,10 @@ class _Window:
         return -1
 
     def _piece(self, at: int, n: int) -> bytes:
+        end = min(at + n, self._size)
         try:
-            return self._whole(at, n)
+            return self._whole(at, n).ljust(end - at, b"\0")  # a file that somebody cut off meanwhile
         except OSError:
-            end = min(at + n, self._size)
             return b"".join(self._sector(k, min(_SECTOR - k % _SECTOR, end - k)) for k in _sectors(at, end))
 
     def _whole(self, at: int, n: int) -> bytes:

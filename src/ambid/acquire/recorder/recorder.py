@@ -242,6 +242,13 @@ class Recorder:
             self.result = recorded_from(reader, self.path, force=self._force, extra=extra, progress=progress)
             if self.result is None or not (self.result.keep_journal or self.failed):
                 file.remove()
+        except DeviceError as failure:
+            if "ambid recover" in str(failure) or not self.journal.exists():
+                raise
+            raise DeviceError(
+                f"{str(failure).rstrip('.')}. What was recorded is in {self.journal}: ambid recover {self.journal}"
+                " -o NAME"
+            ) from None
         finally:
             file.close()
         self._writer.raise_fault()

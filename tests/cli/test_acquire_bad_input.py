@@ -1,0 +1,161 @@
+"""What acquire, commission, recover and init refuse: one line on standard error, exit code 2, nothing written."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from importlib.resources import files
+from io import FileIO
+
+import pytest
+
+from ambid.cli import _Told
+from ambid.cli.interrupts import Stop
+
+PROTOTYPE = files("ambid").joinpath("data", "prototype.toml").read_text(encoding="utf-8")
+SHORT = ("acquire", "--port", "simulated", "--rig", "p.toml", "-o", "a.h5", "--seconds", "0.05", "--settle", "0.05")
+LONG = "n" * 300
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a rig of the prototype."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.toml").write_text(PROTOTYPE, encoding="utf-8")
+    return tmp_path
+
+
+def refused(outcome, *parts):
+    """The one line that is no note."""
+    assert outcome.code == 2
+    assert outcome.out == ""
+    lines = [line for line in outcome.err.splitlines() if not line.startswith("ambid: note: ")]
+    assert len(lines) == 1, outcome.err
+    for part in parts:
+        assert part in lines[0]
+
+
+@pytest.mark.parametrize("option", ["--seconds", "--settle", "--amplitude"])
+@pytest.mark.parametrize("number", ["nan", "inf", "-1", "1e308"])
+def test_numbers_that_nothing_can_be_done_with_are_refused(ambid, folder, option, number):
+    refused(ambid(*SHORT, option, number), option, "must be")
+    assert os.listdir(folder) == ["p.toml"]
+
+
+@pytest.mark.parametrize("option", ["--seconds", "--track-seconds", "--amplitude", "--widest"])
+@pytest.mark.parametrize("number", ["nan", "0", "1e308"])
+def test_commission_refuses_them_too(ambid, folder, option, number):
+    refused(ambid("commission", "--port", "simulated", "--rig", "p.toml", "-o", "f", option, number), option)
+    assert os.listdir(folder) == ["p.toml"]
+
+
+def test_a_record_too_short_to_be_read_is_refused(ambid, folder):
+    refused(ambid(*SHORT, "--seconds", "1e-300"), "--seconds is 1e-300", "8 at least", "Give 0.004 or more")
+    assert os.listdir(folder) == ["p.toml"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (*SHORT, "-o", LONG + ".h5"),
+        ("commission", "--port", "simulated", "--rig", "p.toml", "-o", LONG),
+        ("init", "--preset", "prototype", "-o", LONG),
+        ("recover", LONG),
+        ("recover", "p.toml", "-o", LONG + ".h5"),
+    ],
+)
+def test_a_name_that_no_file_can_have_is_refused(ambid, folder, words):
+    refused(ambid(*words), "name")
+    assert os.listdir(folder) == ["p.toml"]
+
+
+def test_a_journal_without_a_name_is_refused(ambid, folder):
+    refused(ambid("recover", ""), "is a folder")
+
+
+def test_a_link_to_nowhere_is_refused_before_anything_is_recorded(ambid, folder):
+    os.symlink("nowhere/x.h5", "to_no_folder.h5")
+    os.symlink("x.h5", "to_no_file.h5")
+    refused(ambid(*SHORT, "-o", "to_no_folder.h5"), "there is no folder")
+    refused(ambid(*SHORT, "-o", "to_no_file.h5"), "exists already")
+
+
+@pytest.mark.parametrize("port", ["", "  "])
+def test_a_port_without_a_name_is_refused(ambid, folder, port):
+    refused(ambid(*SHORT, "--port", port), "the port has no name")
+
+
+def test_a_port_that_was_mistyped_is_recognised(ambid, folder):
+    pytest.importorskip("serial")
+    refused(ambid(*SHORT, "--port", "Emulatd"), "does not exist", "Did you mean 'emulated'?")
+
+
+@pytest.mark.parametrize(
+    ("entry", "parts"),
+    [
+        ("third = ' '", ("daq.third", "printable")),
+        ('third = "a\\u0000b"', ("daq.third", "printable")),
+        ("third = '" + "z" * 1000 + "'", ("daq.third", "200")),
+        ("baud = 99999999999999999999", ("daq.baud", "300 to 12000000")),
+        ("duty = [0]", ("daq.duty is [0]", "[low, high]")),
+        ("duty_off = 410", ("daq.duty_off is 410", "has to be 0 V within 2% of 12 V")),
+    ],
+)
+def test_strange_entries_of_daq_are_refused(ambid, folder, entry, parts):
+    (folder / "p.toml").write_text(PROTOTYPE.replace("[daq]\n", f"[daq]\n{entry}\n"), encoding="utf-8")
+    refused(ambid(*SHORT), *parts)
+
+
+@pytest.mark.parametrize("role", ["voltage", "current", "position"])
+def test_a_gain_too_small_for_any_count_is_refused(ambid, folder, role):
+    before, after = PROTOTYPE.split(f"[channels.{role}]\n")
+    lines = [line if "gain " not in line else "gain = 1e-300" for line in after.split("\n\n")[0].splitlines()]
+    rest = after[len(after.split("\n\n")[0]) :]
+    (folder / "p.toml").write_text(f"{before}[channels.{role}]\n" + "\n".join(lines) + rest, encoding="utf-8")
+    refused(ambid(*SHORT), f"channels.{role}", "each count has to be another value")
+
+
+@pytest.mark.parametrize("says", [None, "hello", "[1]", "{}"])
+def test_a_program_that_is_no_emulated_bench_is_refused(ambid, folder, monkeypatch, says):
+    pytest.importorskip("serial")
+    program = folder / "bench.sh"
+    program.write_text(f"#!/bin/sh\necho '{says}'\n", encoding="utf-8")
+    program.chmod(0o644 if says is None else 0o755)
+    monkeypatch.setenv("AMBID_BENCH", str(program))
+    monkeypatch.setenv("AMBID_FIRMWARE", str(folder / "p.toml"))
+    refused(ambid(*SHORT, "--port", "emulated"), "emulated bench", "cannot be started" if says is None else "said")
+    assert sorted(os.listdir(folder)) == ["bench.sh", "p.toml"]
+
+
+def test_more_than_two_signals_tear_no_cleaning_off():
+    stop = Stop()
+    stop.take(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        stop.take(signal.SIGINT)
+    stop.take(signal.SIGINT)
+    stop.take(signal.SIGTERM)
+    assert stop.code == 130
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_what_is_said_of_a_recording_to_nobody_does_not_end_it():
+    with FileIO("/dev/full", "w") as full:
+        before = io.TextIOWrapper(io.BufferedWriter(full))
+        told = _Told.of(before)
+        told.write("a note\n")
+        told.flush()
+        with pytest.raises(OSError, match="space"):
+            before.buffer.flush()
+        with suppress(OSError):
+            before.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell closes standard error")
+def test_no_file_becomes_standard_error_where_that_was_closed(folder):
+    program = [sys.executable, "-c", "from ambid.cli import main; main()", *SHORT]
+    done = subprocess.run(["sh", "-c", 'exec "$0" "$@" 2>&-', *program], stdout=subprocess.PIPE, check=False)
+    assert done.returncode == 0
+    assert b"100 samples" in done.stdout
+    assert (folder / "a.h5").exists()
