@@ -58,7 +58,7 @@ def duty_off(rig: Rig, daq: Daq, voltage: Scale) -> int:
         asked = "daq.duty_off is" if daq.duty_off is not None else "the pulse width nearest to 0 V is"
         raise RigError(
             f"{who(rig)}: {asked} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state has to be"
-            f" within {_OFF_SHARE:.0%} of {most:.4g} V. Correct daq.duty_off or that calibration"
+            f" 0 V within {_OFF_SHARE:.0%} of {most:.4g} V. Correct daq.duty_off or that calibration"
         )
     return off
 
