@@ -20,10 +20,10 @@ void amb_setup(void)
     daq_begin(by_watchdog);
 }
 
-/* Takes bytes until one command is done. While an answer finds no room, bytes wait. */
+/* Takes bytes until one command is done; its answer takes the command's place. While an answer finds no room, bytes wait. */
 static void listen(void)
 {
-    uint8_t answer[ANSWER_LARGEST], n = 0;
+    uint8_t n = 0;
     if (tx_free(&board_tx) < FRAME_BYTES(ANSWER_LARGEST))
         return;
     while (n == 0 && rx_waiting(&board_rx)) {
@@ -35,8 +35,8 @@ static void listen(void)
     }
     if (n == 0)
         return;
-    n = commands_handle(decoder.body, n, answer);
-    frame_put(&board_tx, answer, n, 0);
+    n = commands_handle(decoder.body, n, decoder.body);
+    frame_put(&board_tx, decoder.body, n, 0);
     board_send();
 }
 

@@ -22,24 +22,27 @@
 
 #include "board_inside.h"
 #include "daq.h"
+#include "flash.h"
 #include "safety.h"
 #include "tick.h"
 
 #define LONGEST_BASE 10
 #define COUNTS_PER_PERIOD 25 /* of timer 2 */
 #define COUNT_US 2
-#define PHASE 435        /* counts of timer 1 at the tick: the way to the first conversion, and some 5 us to spare */
+#define PHASE 419        /* counts of timer 1 at the tick: the way to the first conversion, and some 5 us to spare */
+#define HUNG_PERIODS 240 /* 12 ms, before the watchdog resets after 16 ms */
 #define FIRST_CURRENT 0  /* steps of the conversions of a tick */
 #define POSITION_STEP 1
 #define SECOND_CURRENT 2
 #define START_LEAD 14    /* counts of timer 1 from its reading to the start of the conversion */
 #define HOLD 48          /* and from there until the input is held: 1.5 clocks of the converter */
 #define TIMER_1(us) ((us) * 16 - HOLD - START_LEAD)
-#define ORDER_EARLIEST 87 /* counts of timer 2 from the tick, which is 21 us before the begin of a period: 153 us */
+#define ORDER_EARLIEST 88 /* counts of timer 2 from the tick, which is 22 us before the begin of a period: 154 us */
 #define ORDER_LATEST 120  /* later than the begin of the period from which it should act */
 enum { POSITION, CURRENT, THIRD };
-static const uint8_t order_of_inputs[] = {CURRENT, POSITION, CURRENT, THIRD};
-static const uint16_t start_at[] = {TIMER_1(50 - 8), TIMER_1(25), TIMER_1(8)}; /* counts of timer 1 */
+static const uint8_t order_of_inputs[] FLASH = {CURRENT, POSITION, CURRENT, THIRD};
+/* Counts of timer 1; the last is over when the third input's turn comes, which therefore starts at once. */
+static const uint16_t start_at[] FLASH = {TIMER_1(50 - 8), TIMER_1(25), TIMER_1(8), TIMER_1(28)};
 static volatile uint8_t sampling, working, steps_wanted, step;
 static uint8_t awaited; /* step whose conversion the work of the tick looks for, 0: none */
 static uint16_t first_current;
@@ -47,6 +50,7 @@ static volatile uint8_t base = LONGEST_BASE;
 static volatile uint16_t share = 1, share_left = 1;
 static volatile uint8_t readings = 2, open_readings, low_readings;
 static volatile uint16_t beats;
+static volatile uint8_t unfed; /* periods since the watchdog was fed */
 
 /* Setup ------------------------------------------------------------------------------------------------------------ */
 
@@ -84,7 +88,7 @@ static void begin_timers(void)
 
 uint8_t board_begin(void)
 {
-    uint8_t by_watchdog = board_reset_cause & _BV(WDRF);
+    uint8_t by_watchdog = board_was_hung();
     cli();
     begin_pins();
     begin_timers();
@@ -93,9 +97,9 @@ uint8_t board_begin(void)
     ADCSRA = ADC_RUN;
     board_measure(0); /* the first one takes longer */
     set_sleep_mode(SLEEP_MODE_IDLE);
-    wdt_enable(WDTO_250MS);
+    wdt_enable(WDTO_15MS);
     sei();
-    return by_watchdog != 0;
+    return by_watchdog;
 }
 
 /* Output ----------------------------------------------------------------------------------------------------------- */
@@ -198,21 +202,31 @@ static inline void watch_lines(void)
 }
 
 /* Starts the conversion of a step, at its count of timer 1 unless that is over. */
-static inline void start_conversion(uint8_t next, uint8_t interrupt)
+static inline void start_conversion(uint8_t next)
 {
-    ADMUX = (uint8_t)(_BV(REFS0) | order_of_inputs[next]);
-    if (next <= SECOND_CURRENT) {
-        uint16_t at = start_at[next], now;
-        do
-            now = TCNT1;
-        while (now < at || now > at + BOARD_PWM_TOP / 2);
-    }
-    ADCSRA = ADC_RUN | _BV(ADSC) | _BV(ADIF) | interrupt;
+    uint16_t at = flash_u16(&start_at[next]), now;
+    ADMUX = (uint8_t)(_BV(REFS0) | flash_u8(&order_of_inputs[next]));
+    do
+        now = TCNT1;
+    while (now < at || now > at + BOARD_PWM_TOP / 2);
+    ADCSRA = ADC_RUN | _BV(ADIE) | _BV(ADSC) | _BV(ADIF);
+}
+
+/* The main loop hangs, though interrupts still come: nothing of the program is trusted any more. The watchdog follows. */
+static void __attribute__((noinline)) hang(void)
+{
+    board_output(0);
+    board_note_hung();
+    for (;;)
+        ;
 }
 
 static inline void watch(void)
 {
     beats++;
+    unfed = (uint8_t)(unfed + base);
+    if (unfed > HUNG_PERIODS)
+        hang();
     watch_lines();
     if (line_broken() || open_readings >= readings) {
         if (daq_output_on())
@@ -227,7 +241,7 @@ ISR(TIMER2_COMPA_vect)
         if (tick_begin(working)) {
             working = 1;
             step = FIRST_CURRENT;
-            start_conversion(FIRST_CURRENT, _BV(ADIE));
+            start_conversion(FIRST_CURRENT);
         }
     }
     watch();
@@ -265,7 +279,7 @@ static inline void keep_input(uint8_t done, uint16_t counts)
     else if (done == SECOND_CURRENT)
         daq.inputs[CURRENT] = (uint16_t)((first_current + counts + 1) / 2);
     else
-        daq.inputs[order_of_inputs[done]] = counts;
+        daq.inputs[done == POSITION_STEP ? POSITION : THIRD] = counts;
 }
 
 void board_await_input(uint8_t input)
@@ -276,8 +290,10 @@ void board_await_input(uint8_t input)
             ;
         keep_input(done, ADC);
         awaited = next < steps_wanted ? next : 0;
-        if (awaited)
-            start_conversion(next, 0);
+        if (awaited) {
+            ADMUX = _BV(REFS0) | THIRD;
+            ADCSRA = ADC_RUN | _BV(ADSC) | _BV(ADIF);
+        }
     }
 }
 
@@ -297,24 +313,24 @@ static inline void work(void)
 /* The next conversion starts before the last one's result is read, which stands until the next one's is there. */
 ISR(ADC_vect)
 {
-    uint8_t done = step, next = (uint8_t)(done + 1), early;
+    uint8_t done = step, next = (uint8_t)(done + 1), last = next >= steps_wanted, early;
     if (!sampling) {
         working = 0;
         return;
     }
-    early = done == POSITION_STEP && daq_output_on();
-    if (next < steps_wanted) {
-        start_conversion(next, early ? 0 : _BV(ADIE));
+    if (!last) {
+        start_conversion(next);
         step = next;
     }
     keep_input(done, ADC);
+    early = done == POSITION_STEP && daq_output_on();
     if (early) {
+        ADCSRA = ADC_RUN; /* without its interrupt; the conversion goes on */
         awaited = next;
         board_send_later();
-        work();
-    } else if (next >= steps_wanted) {
-        work();
     }
+    if (last || early)
+        work();
 }
 
 uint8_t board_interlock_open(void)
@@ -333,13 +349,19 @@ uint8_t board_line_broken(void)
 
 /* Rest ------------------------------------------------------------------------------------------------------------- */
 
+void board_feed(void)
+{
+    wdt_reset();
+    unfed = 0;
+}
+
 uint16_t board_alive(void)
 {
     static uint16_t before;
     uint16_t now;
     ATOMICALLY { now = beats; }
     if (now != before)
-        wdt_reset();
+        board_feed();
     before = now;
     return now;
 }

@@ -24,7 +24,7 @@
 #define BOARD_PWM_HZ 20000UL
 #define BOARD_PERIODS_PER_MS 20 /* periods of the pulse width in 1 ms */
 #define BOARD_PERIOD_US 50      /* a period of the pulse width */
-#define BOARD_SHORTEST 4        /* periods of a tick: 5 kHz */
+#define BOARD_SHORTEST 5        /* periods of a tick: 4 kHz, at which any stream is sent while commands come */
 #define BOARD_LONGEST 20000     /* 1 Hz */
 #define BOARD_BYTE_US 11        /* a byte on the line, with a tenth kept for answers */
 
@@ -44,7 +44,7 @@
 extern struct tx_ring board_tx;
 extern struct rx_ring board_rx;
 
-/* Pins, timers, converter, line, watchdog; output off, pulse width 0. Returns 1 after a reset by the watchdog. */
+/* Pins, timers, converter, line, watchdog; output off, pulse width 0. Returns 1 if the program hung before. */
 uint8_t board_begin(void);
 
 void board_output(uint8_t on);
@@ -80,7 +80,8 @@ uint8_t board_pwm_sound(void);    /* period, read back compare value and pin are
 uint16_t board_rx_lost(void);
 /* Sends what was put into board_tx. */
 void board_send(void);
-/* Keeps the watchdog quiet if the timer's interrupts went on since the last call. Returns the count of these. */
+/* Keeps the watchdog quiet if the timer's interrupts went on since the last call; without it, ENABLE is low after 12 ms,
+ * and by a reset after 16 ms, which also comes where there are no interrupts. Returns the count of these interrupts. */
 uint16_t board_alive(void);
 /* Sleeps until the next interrupt, unless `pending` says that one came in between. */
 void board_sleep(uint8_t (*pending)(void));

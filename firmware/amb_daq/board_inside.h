@@ -17,8 +17,10 @@
 #define BYTE_CAME _BV(1)  /* a sound one, since the timer's last interrupt */
 
 extern volatile uint8_t board_bad_bytes; /* without stop bit, one after the other, before a SOUND_BYTE */
-extern uint8_t board_reset_cause;        /* MCUSR as the reset left it */
 
+void board_feed(void);        /* the watchdog */
+void board_note_hung(void);   /* for the program that runs after the reset */
+uint8_t board_was_hung(void); /* 1 if the last reset was the watchdog's; asked once */
 void board_begin_line(void);
 void board_send_later(void); /* sends nothing more until board_send; interrupts are off */
 

@@ -13,20 +13,40 @@
 #define ADC_SUPPLY_MUX (_BV(REFS0) | 0x0e) /* the internal reference of 1.1 V against the supply */
 #define REFERENCE_MV 1100UL
 
-uint8_t board_reset_cause __attribute__((section(".noinit")));
+#define HUNG 0x8a3cc5d1UL
+
+static uint8_t reset_cause __attribute__((section(".noinit"))); /* MCUSR as the reset left it */
+static uint32_t hung __attribute__((section(".noinit")));       /* HUNG: the program hung before the reset */
 
 extern uint8_t __heap_start, __stack, __data_load_end;
 
-/* Before any C runs: paint the memory that the stack may use, note the cause of the reset, stop its watchdog. */
+/* Before any C runs: note the cause of the reset; stop the watchdog, which after its own reset runs on with 16 ms; paint
+ * the memory that the stack may use. */
 void board_paint(void) __attribute__((naked, used, section(".init3")));
 void board_paint(void)
 {
     uint8_t *p = &__heap_start;
-    board_reset_cause = MCUSR;
+    reset_cause = MCUSR;
     MCUSR = 0;
     wdt_disable();
     while (p <= &__stack)
         *p++ = PAINT;
+}
+
+/* A bootloader may clear the cause, and may itself end by the watchdog after the reset button: so the word counts that is
+ * left here before the watchdog. Where interrupts no longer came it is not left; then only the cause tells. */
+void board_note_hung(void)
+{
+    hung = HUNG;
+}
+
+uint8_t board_was_hung(void)
+{
+    uint8_t was = hung == HUNG || ((reset_cause & _BV(WDRF)) && !(reset_cause & _BV(EXTRF)));
+    if (reset_cause & _BV(PORF))
+        was = 0;
+    hung = 0;
+    return was;
 }
 
 /* Measuring without ticks ------------------------------------------------------------------------------------------ */
@@ -63,8 +83,10 @@ uint16_t board_supply_mv(void)
 uint16_t board_digest(void)
 {
     uint16_t crc = 0, at;
-    for (at = 0; at < (uint16_t)(uintptr_t)&__data_load_end; at++)
+    for (at = 0; at < (uint16_t)(uintptr_t)&__data_load_end; at++) {
+        board_feed(); /* all takes longer than the watchdog waits */
         crc = crc16_add(crc, pgm_read_byte(at));
+    }
     return crc;
 }
 

@@ -39,7 +39,7 @@ struct rule {
 
 static struct {
     uint8_t id, code, n;
-    uint8_t answer[ANSWER_LARGEST];
+    uint8_t answer[LENGTH_SELF_TEST_RESULT]; /* the longest that is kept: those of identify and ask_status are not */
 } last;
 
 void commands_begin(void)
@@ -345,26 +345,26 @@ uint8_t commands_handle(const uint8_t *body, uint8_t n, uint8_t *answer)
 {
     struct rule rule;
     struct request r = {body, n, 0, answer, 0};
-    uint8_t code;
+    uint8_t code = body[0], id = body[1], done; /* body is gone once there is an answer */
     ATOMICALLY { daq.silent_ticks = 0; }
-    if (!rule_of(body[0], &rule))
+    if (!rule_of(code, &rule))
         return malformed(body, n, answer, CODE_UNKNOWN);
     if (!fits(&rule, n))
         return malformed(body, n, answer, CODE_LENGTH);
-    if (body[1] == 0)
+    if (id == 0)
         return write_ack(answer, 0, CODE_RANGE, 1);
-    if (body[1] == last.id && body[0] == last.code) {
+    if (id == last.id && code == last.code) {
         memcpy(answer, last.answer, last.n);
         return last.n;
     }
-    code = (rule.states & IN(daq.state)) ? rule.handle(&r) : not_now(&r);
+    done = (rule.states & IN(daq.state)) ? rule.handle(&r) : not_now(&r);
     if (!r.answered)
-        r.answered = write_ack(answer, body[1], code, r.detail);
-    if (body[0] == MSG_IDENTIFY) {
+        r.answered = write_ack(answer, id, done, r.detail);
+    if (code == MSG_IDENTIFY) {
         last.id = 0;
-    } else if (body[0] != MSG_PING && body[0] != MSG_ASK_STATUS) {
-        last.id = body[1];
-        last.code = body[0];
+    } else if (code != MSG_PING && code != MSG_ASK_STATUS) {
+        last.id = id;
+        last.code = code;
         last.n = r.answered;
         memcpy(last.answer, answer, r.answered);
     }

@@ -70,10 +70,10 @@ def test_every_preset_gets_settings(name):
     rig = of_preset(name)
     settings = controller_settings(with_default_daq(rig))
     assert settings.closed
-    assert settings.rate_hz == min(preset(name).rate_hz, 5000.0)
+    assert settings.rate_hz == min(preset(name).rate_hz, 2500.0)
     told = [line for line in default_daq_notes(rig) if line.startswith("rate")]
-    assert bool(told) == (preset(name).rate_hz > 5000.0)
-    assert all("rate: 5000 Hz, the nearest to" in line for line in told)
+    assert bool(told) == (preset(name).rate_hz > 2500.0)
+    assert all("rate: 2500 Hz, the nearest to" in line for line in told)
 
 
 def test_a_loop_that_is_too_steep_for_ten_bits_is_refused():

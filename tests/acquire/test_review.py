@@ -42,7 +42,7 @@ def test_presets_are_stable_as_their_controllers_close_the_loop(name):
         (
             "rate_hz = 2000.0",
             "rate_hz = 500.0",
-            "at 500 Hz the controller only samples: its output stays off below 1000",
+            "at 500 Hz the controller only samples: its output is on at 1000 to 2500 Hz only",
         ),
         ("kp = 1.94e4\nki = 7.85e4\nkd = 92.6\nkc = 33.8", "", "it can sample and drive, not levitate. Add [loop]"),
     ],

@@ -117,7 +117,7 @@ def test_what_is_realised_is_near_what_was_wanted():
     loop = realised(controller_settings(rig), rig)
     for name in ("kp", "ki", "kd", "kc", "derivative_cutoff_hz"):
         assert getattr(loop, name) == pytest.approx(getattr(rig.loop, name), rel=3e-3), name
-    assert loop.delay == pytest.approx(0.3)
+    assert loop.delay == pytest.approx(0.35)
     unfiltered = bench(("derivative_cutoff_hz = 300.0\n", ""))
     assert math.isinf(realised(controller_settings(unfiltered), unfiltered).derivative_cutoff_hz)
 
@@ -180,6 +180,8 @@ current = 1.0
 def test_slow_ticks_only_sample():
     assert controller_settings(bench(("rate_hz = 2000.0", "rate_hz = 1000.0"))).drives
     assert not controller_settings(bench(("rate_hz = 2000.0", "rate_hz = 500.0"))).drives
+    assert controller_settings(bench(("rate_hz = 2000.0", "rate_hz = 2500.0"))).drives
+    assert not controller_settings(bench(("rate_hz = 2000.0", "rate_hz = 4000.0"))).drives
 
 
 @pytest.mark.parametrize(
@@ -291,3 +293,17 @@ def test_a_scale_reads_counts_as_the_record_does(tmp_path):
         counts = np.arange(0.0, 1024.0)
         read = of.apply(Channel(name="gap", unit=of.unit_in, values=counts))
         np.testing.assert_allclose(scale_of(rig, "position").to_si(counts), read.values, atol=1e-15)
+
+
+def test_a_single_transistor_may_rest_without_any_pulse():
+    """Its line through the pulses may miss 0 V at no pulse; that it is off there is no question of the line."""
+    stage = (
+        ("gain = 0.03\noffset = -12.0", "gain = 0.015\noffset = -0.66"),
+        ("voltage = 11.4", "voltage = [0.0, 11.4]"),
+    )
+    assert controller_settings(bench(*stage)).duty_off == 44
+    assert controller_settings(bench(*stage, ("[daq]\n", "[daq]\nduty_off = 0\n"))).duty_off == 0
+    far = (("gain = 0.03\noffset = -12.0", "gain = 0.015\noffset = -3.0"), ("voltage = 11.4", "voltage = [0.0, 8.0]"))
+    rig = bench(*far, ("[daq]\n", "[daq]\nduty_off = 0\n"))
+    with pytest.raises(RigError, match=r"daq\.duty_off is 0 counts, -3 V"):
+        controller_settings(rig)

@@ -214,7 +214,7 @@ def test_identity_and_status(console):
     lines = console([command("identify", 5), *way_to(SAMPLING), command("ask_status", 9)])
     identity, status = unpack(answer(lines[0])), unpack(answer(lines[-1]))
     assert (identity["id"], identity["protocol"], identity["pwm_top"], identity["pwm_hz"]) == (5, 1, 800, 20_000)
-    assert (identity["table"], identity["shortest"], identity["digest"]) == (1000, 4, 0x1234)
+    assert (identity["table"], identity["shortest"], identity["digest"]) == (1000, 5, 0x1234)
     assert (status["id"], status["state"], status["ticks"], status["supply_mv"]) == (9, SAMPLING, 1, 5000)
 
 

@@ -83,7 +83,7 @@ def test_identity_and_self_test(bench, firmware_elf, tmp_path):
     assert result["free_bytes"] > 150
 
 
-@pytest.mark.parametrize(("period", "stream"), [(10, 0x0F), (5, 0x0F), (4, 0x0B)])
+@pytest.mark.parametrize(("period", "stream"), [(10, 0x0F), (5, 0x0F), (5, 0x3F)])
 def test_samples_flow_without_loss(bench, period, stream):
     _, host = bench()
     host.make_ready(period=period, stream=stream)
@@ -153,6 +153,8 @@ def test_silent_host(bench):
 
 
 HANG = """
+#include <avr/interrupt.h>
+#include <avr/io.h>
 #include "app.h"
 static unsigned passes __attribute__((section(".noinit")));
 static unsigned hung __attribute__((section(".noinit")));
@@ -160,12 +162,15 @@ int main(void)
 {
     amb_setup();
     if (hung != 0x5aa5)
-        for (passes = 0; passes < 3000; passes++)
+        for (passes = 0; passes < 3000 || !(PORTB & 1); passes++)
             amb_loop();
     if (hung != 0x5aa5) {
         hung = 0x5aa5;
+        HOW;
+        PORTB &= ~1; /* the log tells the time */
+        PORTB |= 1;
         for (;;)
-            ; /* interrupts go on, the loop does not */
+            ;
     }
     for (;;)
         amb_loop();
@@ -173,14 +178,80 @@ int main(void)
 """
 
 
-def test_a_hanging_program_is_restarted(bench, tmp_path, avr_gcc):
+def _hears_again(host):
+    """Ping until answers come: what is sent while the controller starts is lost."""
+    host.told.clear()
+    host.wait(lambda: len(host.told) >= 3)
+
+
+@pytest.mark.parametrize(
+    ("how", "off_ms", "reset_ms"),
+    [("", 12.0, 16.0), ("MCUSR = 0", 12.0, 16.0), ("TIMSK2 = 0", 16.0, 16.0), ("cli()", 16.0, 16.0)],
+)
+def test_a_hanging_program_is_switched_off_and_restarted(bench, tmp_path, avr_gcc, how, off_ms, reset_ms):
     main = tmp_path / "hang.c"
-    main.write_text(HANG, encoding="utf-8")
+    main.write_text(HANG.replace("HOW", how), encoding="utf-8")
     elf = tmp_path / "hang.elf"
     sources = [str(p) for p in sorted(FIRMWARE.glob("*.c")) if p.name != "main.c"]
     subprocess.run([avr_gcc, *AVR, f"-I{FIRMWARE}", "-o", str(elf), str(main), *sources], check=True)
     emulator, host = bench(firmware=elf)
+    host.make_ready(limits={"position_low": 60})
+    host.done("start", mode=2)
     host.wait(lambda: emulator.events("reset"))
+    _hears_again(host)
+    _, hangs, _, off = (e["t"] for e in emulator.events("enable"))
+    reset = emulator.events("reset")[0]["t"]
+    # The watchdog was fed a little before.
+    assert off_ms - 1.0 < 1e3 * (off - hangs) < off_ms + 1.0
+    assert reset_ms - 1.0 < 1e3 * (reset - hangs) < reset_ms + 1.0
     status = host.ask("ask_status")
     assert (status["state"], status["cause"]) == (IDLE, 8)
     assert host.ask("start", mode=1)["code"] == 5  # nothing of before is there
+    host.make_ready()
+    host.done("start", mode=1)
+    host.flow(200)  # longer than the watchdog that the reset left running
+    assert len(emulator.events("reset")) == 1
+
+
+BUTTON = """
+#include <avr/io.h>
+#include <avr/wdt.h>
+#include "app.h"
+static unsigned boots __attribute__((section(".noinit")));
+static unsigned began __attribute__((section(".noinit")));
+/* A bootloader that clears the cause and lets the program begin by its own watchdog, as after the reset button. */
+static void bootloader(void) __attribute__((naked, used, section(".init1")));
+static void bootloader(void)
+{
+    if (began != 0x5aa5) {
+        began = 0x5aa5;
+        boots = 0;
+    }
+    MCUSR = 0;
+    boots++;
+}
+int main(void)
+{
+    amb_setup();
+    if (boots == 1) {
+        __asm__ volatile("cli");
+        for (;;)
+            ;
+    }
+    for (;;)
+        amb_loop();
+}
+"""
+
+
+def test_a_bootloaders_own_watchdog_is_no_hang(bench, tmp_path, avr_gcc):
+    main = tmp_path / "button.c"
+    main.write_text(BUTTON, encoding="utf-8")
+    elf = tmp_path / "button.elf"
+    sources = [str(p) for p in sorted(FIRMWARE.glob("*.c")) if p.name != "main.c"]
+    subprocess.run([avr_gcc, *AVR, f"-I{FIRMWARE}", "-o", str(elf), str(main), *sources], check=True)
+    emulator, host = bench(firmware=elf)
+    host.wait(lambda: emulator.events("reset"))
+    _hears_again(host)
+    status = host.ask("ask_status")
+    assert (status["state"], status["cause"]) == (IDLE, 0)

@@ -42,6 +42,7 @@ def test_the_host_knows_the_board(defined):
     assert defined["EXCITATION_TABLE"] == board.TABLE_LENGTH
     assert defined["CONTROL_LARGEST"] == board.LARGEST_GAIN
     assert defined["CAP_OUTPUT_PERIOD"] == board.SLOWEST_OUTPUT
+    assert defined["CAP_OUTPUT_FASTEST"] == board.FASTEST_OUTPUT
     assert defined["BOARD_BYTE_US"] == board.BYTE_BITS  # at 1 Mbaud a bit takes 1 us
 
 
@@ -85,7 +86,7 @@ def test_the_controller_takes_what_is_made_from_a_rig(console, name):
 
 
 def test_the_controller_takes_the_fastest_rate_that_the_line_allows(console):
-    s = controller_settings(bench(("rate_hz = 2000.0", 'rate_hz = 5000.0\nthird = "hall"')))
+    s = controller_settings(bench(("rate_hz = 2000.0", 'rate_hz = 4000.0\nthird = "hall"')))
     assert code(console([command("configure", 1, **s.configure())])[0]) == (0, 0)
 
 

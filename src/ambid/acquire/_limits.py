@@ -14,6 +14,7 @@ from ambid.rig.rig import Daq, Rig
 
 _FEWEST_DUTY = 16  # counts of pulse width that a loop can work with
 _OFF_SHARE = 0.02  # of the stage's full voltage: what duty_off may miss 0 V by
+_NO_PULSE = 0.1  # of it: what a straight line may give for no pulse at all on a stage that drives one way
 _ONE_SIDED = 0.05  # of the larger end of a current trip: the other end, where the sensor shows one sign only
 _ROUND_OFF = 1e-6  # counts
 
@@ -54,7 +55,9 @@ def duty_off(rig: Rig, daq: Daq, voltage: Scale) -> int:
     if off > PWM_TOP:
         raise RigError(f"{who(rig)}: daq.duty_off is {off}; a pulse width is 0 to {PWM_TOP} counts. Correct it")
     most = float(np.abs(volts).max())
-    if abs(volts[off]) > _OFF_SHARE * most:
+    # A single transistor that is never on is without voltage, whatever the line through its pulses says there.
+    never_on = daq.duty_off == 0 and abs(volts[0]) <= _NO_PULSE * most and volts[0] * volts[-1] <= 0.0
+    if abs(volts[off]) > _OFF_SHARE * most and not never_on:
         asked = "daq.duty_off is" if daq.duty_off is not None else "the pulse width nearest to 0 V is"
         raise RigError(
             f"{who(rig)}: {asked} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state has to be"

@@ -21,14 +21,15 @@ TABLE_LENGTH = 1000
 """Elements of the excitation table."""
 BYTE_BITS = 11
 """Bit times that a byte may take on the line: ten, and one kept for answers."""
-SLOWEST_OUTPUT = 20
-"""Longest tick with which the output may be on, periods: a fault must end in the safe state within 2 ms."""
+FASTEST_OUTPUT, SLOWEST_OUTPUT = 8, 20
+"""Shortest and longest tick with which the output may be on, periods: a tick's work has to be done in time while
+commands come, and a fault has to end in the safe state within 2 ms."""
 LARGEST_GAIN = 2**19
 """Largest step number of a gain: no product can then overflow the controller's arithmetic."""
-SHORTEST_PERIOD, LONGEST_PERIOD = 4, 20_000
+SHORTEST_PERIOD, LONGEST_PERIOD = 5, 20_000
 """Of a tick, in periods of the pulse width modulation."""
-LAG_S = 0.15e-3
-"""From a tick to the pulse width that it orders: conversions, control law, then the next modulation period, s."""
+LAG_S = 175e-6
+"""From the moment that a sample stands for to that from which its pulse width acts, at every rate, s."""
 
 
 def period_of(rate_hz: float) -> int:
@@ -61,23 +62,52 @@ def period_of(rate_hz: float) -> int:
     )
 
 
-def nearest_rate(rate_hz: float) -> float:
+def nearest_rate(rate_hz: float, *, output: bool = False) -> float:
     """Return the rate that the controller can do and that is nearest by ratio.
 
     Parameters
     ----------
     rate_hz : float
         Wanted rate, Hz.
+    output : bool
+        Only rates with which the output may be on.
 
     Returns
     -------
     float
         Hz.
     """
+    ends = (FASTEST_OUTPUT, SLOWEST_OUTPUT) if output else (SHORTEST_PERIOD, LONGEST_PERIOD)
     exact = PWM_HZ / rate_hz
-    rates = [PWM_HZ / _possible(n) for n in (math.floor(exact), math.ceil(exact))]
+    rates = [PWM_HZ / _possible(n, ends) for n in (math.floor(exact), math.ceil(exact))]
     return min(rates, key=lambda rate: abs(math.log(rate / rate_hz)))
 
 
-def _possible(period: int) -> int:
-    return min(max(period, SHORTEST_PERIOD), LONGEST_PERIOD)
+def drives(period: int) -> bool:
+    """Return whether the output may be on with ticks of that length.
+
+    Parameters
+    ----------
+    period : int
+        In periods of the pulse width modulation.
+
+    Returns
+    -------
+    bool
+    """
+    return FASTEST_OUTPUT <= period <= SLOWEST_OUTPUT
+
+
+def output_rates() -> str:
+    """Return the rates with which the output may be on, for messages.
+
+    Returns
+    -------
+    str
+        Such as ``1000 to 2500 Hz``.
+    """
+    return f"{PWM_HZ / SLOWEST_OUTPUT:g} to {PWM_HZ / FASTEST_OUTPUT:g} Hz"
+
+
+def _possible(period: int, ends: tuple[int, int] = (SHORTEST_PERIOD, LONGEST_PERIOD)) -> int:
+    return min(max(period, ends[0]), ends[1])

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from ambid.acquire.board import ADC_TOP, PWM_TOP, nearest_rate, period_of
+from ambid.acquire.board import ADC_TOP, PWM_TOP, nearest_rate, output_rates
 from ambid.acquire.scales import who
-from ambid.errors import DeviceError, RigError
+from ambid.errors import RigError
 from ambid.physics.loop import UNLIMITED, Interval
 from ambid.physics.models import model
 from ambid.record.calibration import Calibration
@@ -99,10 +99,8 @@ def _full_scale(rig: Rig, role: str) -> Interval:
 
 def _daq(rig: Rig, notes: list[str]) -> Daq:
     wanted = rig.record.rate_hz or DAQ_RATE_HZ
-    try:
-        period_of(wanted)
-    except DeviceError:
-        rate = nearest_rate(wanted)
-        notes.append(f"rate: {rate:.6g} Hz, the nearest to {wanted:g} Hz that the controller can do")
-        return Daq(rate_hz=rate)
-    return Daq(rate_hz=wanted)
+    rate = nearest_rate(wanted, output=True)
+    if math.isclose(rate, wanted, rel_tol=1e-9):
+        return Daq(rate_hz=wanted)
+    notes.append(f"rate: {rate:.6g} Hz, the nearest to {wanted:g} Hz at which the controller drives ({output_rates()})")
+    return Daq(rate_hz=rate)

@@ -7,14 +7,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ambid.acquire.board import PWM_HZ, SLOWEST_OUTPUT
+from ambid.acquire.board import output_rates
 from ambid.acquire.layout import has_position
 from ambid.acquire.scales import scale_of
 from ambid.acquire.settings import ControllerSettings, exact_gains, realised
 from ambid.physics.models import model
 from ambid.rig.rig import Rig
 
-_SLOWEST_HZ = PWM_HZ / SLOWEST_OUTPUT
 _ROUNDED = 0.01  # of a gain: more is worth a line
 _BENT = 1.5  # largest over least slope of a calibration between the trips
 _NEAR_TRIP = 8  # counts between rest and a trip, under which noise may trip it
@@ -42,8 +41,8 @@ def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, f
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:
         lines.append(
-            f"at {settings.rate_hz:g} Hz the controller only samples: its output stays off below {_SLOWEST_HZ:g} Hz."
-            " Raise daq.rate_hz to drive or levitate"
+            f"at {settings.rate_hz:g} Hz the controller only samples: its output is on at {output_rates()} only."
+            " Give daq.rate_hz such a rate to drive or levitate"
         )
     if settings.closed:
         lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings, parameters)]

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ambid.acquire._limits import count_inside, duty_off, duty_range, trip_counts
-from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, SLOWEST_OUTPUT, period_of
+from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, drives, period_of
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
 from ambid.acquire.scales import scale_of, who
@@ -90,8 +90,8 @@ class ControllerSettings:
 
     @property
     def drives(self) -> bool:
-        """True where ticks are fast enough for the output to be on; else the controller only samples."""
-        return self.period <= SLOWEST_OUTPUT
+        """True at a rate at which the output may be on; else the controller only samples."""
+        return drives(self.period)
 
     @property
     def closed(self) -> bool:

@@ -181,7 +181,7 @@ def _prototype() -> Preset:
         summary="table-top bearing on an Arduino Uno: 12 V bridge, 10 bits, 2 kHz; k_i 20.1 N/A, k_x -6702 N/m",
         parameters=MappingProxyType(parameters),
         plant=plant,
-        loop=placed_loop(parameters, (-320, -80 + 80j, -80 - 80j, -16), derivative_cutoff_hz=300.0, delay=0.3),
+        loop=placed_loop(parameters, (-320, -80 + 80j, -80 - 80j, -16), derivative_cutoff_hz=300.0, delay=0.35),
         usually_closed=True,
         noise=Noise(
             position=2e-6,
@@ -201,6 +201,7 @@ def _prototype() -> Preset:
                 "turns, area, bias, gap, leakage, m, R": "chosen",
                 "limits.voltage": "pulse width of 2.5 to 97.5 %: a bridge with a charge pump needs its pause",
                 "limits.current": "the bias: neither coil reverses",
+                "loop.delay": "the controller's 175 us (firmware/amb_daq/README.md)",
                 "loop, noise, limits.position, rate_hz": "chosen",
             }
         ),

@@ -29,8 +29,6 @@ class Bench:
     limits : Limits
         Its stops count.
     noise : Noise
-    delay : float or None
-        From a tick to the voltage that it orders, in samples; None: the controller's own.
     """
 
     name: str
@@ -38,7 +36,6 @@ class Bench:
     point: OperatingPoint
     limits: Limits
     noise: Noise
-    delay: float | None
 
 
 def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
@@ -74,7 +71,6 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
             point=truth.operating_point,
             limits=truth.limits,
             noise=truth.noise,
-            delay=truth.loop.delay,
         )
     plant, _, point = parts_of_rig(truth, None)
     return Bench(
@@ -83,7 +79,6 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
         point=point,
         limits=truth.limits or Limits(),
         noise=truth.noise or Noise(),
-        delay=None if truth.loop is None else truth.loop.delay,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 from ambid.acquire.board import ADC_TOP
 from ambid.acquire.devices.benches import Bench, bench_of
+from ambid.acquire.layout import has_position
 from ambid.acquire.scales import Scale, scale_of
 from ambid.errors import DeviceError
 from ambid.physics.magnet import DifferentialPair
@@ -21,6 +22,8 @@ from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 
 _VOLT_PER_COUNT = 5.0 / (ADC_TOP + 1)
+_NO_POSITION = {"position_gain": 0.0, "position_offset": 2.5}
+_HELD = {"m": 1.0, "k_x": 0.0, "k_i": 0.0}  # a coil alone, in the words of one axis: nothing moves, nothing moves it
 
 
 def write_plant_file(
@@ -67,7 +70,7 @@ def write_plant_file(
     """
     truth = bench_of(rig, bench)
     body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name
-    position, current, voltage = (scale_of(rig, role) for role in ("position", "current", "voltage"))
+    current, voltage = scale_of(rig, "current"), scale_of(rig, "voltage")
     if voltage.raw.size > 2:
         raise DeviceError(
             f"rig {rig.name!r}: channels.voltage is calibrated by a table; the emulated power stage is a straight line"
@@ -81,7 +84,9 @@ def write_plant_file(
         *_numbers(stage),
         *_numbers(_noise(truth, noise) | {"pin_noise": pin_noise}),
     ]
-    lines += [*_sensor("position", position), *_sensor("current", current)]
+    # A rig without position leaves that input alone: it shows half of the supply.
+    position = _sensor("position", scale_of(rig, "position")) if has_position(rig) else _numbers(_NO_POSITION)
+    lines += [*position, *_sensor("current", current)]
     lines += _numbers(dict(zip(("third_position_gain", "third_current_gain", "third_offset"), third, strict=True)))
     lines += _numbers({"start_position": _resting_place(truth) if start is None else start})
     # A single transistor with its diode: no current the other way, and a coil that is switched off runs out slowly.
@@ -98,15 +103,15 @@ def _plant(bench: Bench) -> Iterator[str]:
         yield f"kind {'differential' if pair else 'single'}"
         yield from _numbers({"m": plant.m, "R": plant.R, "c": plant.c, "k": w.k_b, "leakage": w.leakage})
         yield from _numbers({"gravity": plant.gravity} | ({"gap": w.s_b, "bias": w.i0} if pair else {}))
-    elif plant.model.name == "one-axis":
+    elif plant.model.name in ("one-axis", "coil"):
         yield "kind linear"
-        yield from _numbers(dict(plant.parameters))
+        yield from _numbers((_HELD if plant.model.name == "coil" else {}) | dict(plant.parameters))
         rest = {"position": point.position, "current": point.current, "voltage": point.voltage}
         yield from _numbers({f"rest_{name}": value for name, value in rest.items()})
     else:
         raise DeviceError(
-            f"bench {bench.name!r} is of model {plant.model.name!r}; the emulated bench knows one-axis and its magnets."
-            " Give a bench of one axis"
+            f"bench {bench.name!r} is of model {plant.model.name!r}; the emulated bench knows coil, one-axis and its"
+            " magnets. Give a bench of those"
         )
     low, high = bench.limits.position
     floor, ceiling = (-math.inf, math.inf) if not isinstance(plant, NonlinearPlant) else plant.magnet.range
@@ -136,6 +141,8 @@ def _sensor(role: str, scale: Scale) -> Iterator[str]:
 def _resting_place(bench: Bench) -> float:
     """Return where an unpowered rotor lies: on a stop if nothing brings it back, along its weight if it has one."""
     plant, stops = bench.plant, bench.limits.position
+    if not isinstance(plant, NonlinearPlant) and plant.model.name == "coil":
+        return 0.0
     nonlinear = isinstance(plant, NonlinearPlant)
     weight = plant.gravity if isinstance(plant, NonlinearPlant) else 0.0
     stable = not nonlinear and bench.plant.parameters["k_x"] > 0.0  # type: ignore[union-attr]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquire.board import ADC_TOP, LAG_S, PWM_TOP, TABLE_LENGTH
+from ambid.acquire.board import ADC_TOP, LAG_S, PWM_TOP, TABLE_LENGTH, output_rates
 from ambid.acquire.default_daq import with_default_daq
 from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.benches import Bench, bench_of
@@ -130,8 +130,8 @@ class SimulatedDevice(PlayedDevice):
             )
         if mode != "sample" and not self._settings.drives:
             raise DeviceError(
-                f"{self._where} refuses mode {mode!r}; at {self._rate:g} Hz the controller only samples. Raise"
-                " daq.rate_hz"
+                f"{self._where} refuses mode {mode!r}; at {self._rate:g} Hz the controller only samples, its output"
+                f" is on at {output_rates()}. Give daq.rate_hz such a rate"
             )
         memory = self._memory
         if self._state == "idle":
@@ -238,7 +238,7 @@ def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
     """Return the plant for the compiled loop, and the whole samples of its delay."""
     standing = Standing.of(bench.plant, bench.point)
     of, period = standing.model, 1.0 / settings.rate_hz
-    delay = LAG_S * settings.rate_hz if bench.delay is None else bench.delay
+    delay = LAG_S * settings.rate_hz  # the controller's own, whatever delay a loop was designed for
     whole = math.floor(delay)
     force, voltage = bench.noise.held_rms(settings.rate_hz)
     size = {"force": force, "voltage": voltage}
