@@ -82,6 +82,14 @@ def test_a_link_to_nowhere_is_refused_before_anything_is_recorded(ambid, folder)
     refused(ambid(*SHORT, "-o", "to_no_file.h5"), "exists already")
 
 
+def test_a_record_is_not_replayed_onto_itself(ambid, folder):
+    assert ambid(*SHORT).code == 0
+    before = (folder / "a.h5").read_bytes()
+    words = ("acquire", "--port", "replay:a.h5", "--rig", "p.toml", "-o", "./a.h5", "--force", "--seconds", "0.02")
+    refused(ambid(*words), "is also read; writing would destroy it")
+    assert (folder / "a.h5").read_bytes() == before
+
+
 @pytest.mark.parametrize("port", ["", "  "])
 def test_a_port_without_a_name_is_refused(ambid, folder, port):
     refused(ambid(*SHORT, "--port", port), "the port has no name")

@@ -107,7 +107,8 @@ def command(
     if json is not None and track is None:
         raise AmbidError("--json writes a track, and none is wanted. Give --track too, or leave it out")
     wanted_band = band_of(band)
-    with Outputs(rig, None if track in (None, "auto") else Path(str(track))) as outputs:
+    replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
+    with Outputs(rig, None if track in (None, "auto") else Path(str(track)), replayed) as outputs:
         outputs.claim(record, "-o", _ENDINGS)
         outputs.claim(json_path(json), "--json")
     known = load_rig(rig)
