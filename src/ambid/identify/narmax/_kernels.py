@@ -21,13 +21,14 @@ _FAR = 1e6  # times the typical size of the output: a recursion that is beyond h
 def run(
     z: Array, column: Table, back: Table, terms: Table, place: Table, theta: Array, shape: Table, out: Array
 ) -> None:
-    """Run the model over z from sample `lag` on; `shape` = (lag, n_outputs, n_inputs, free).
+    """Run the model over z from sample `lag` on; `shape` = (lag, n_outputs, n_inputs, free, folded).
 
     `place` (n_terms, 2) holds output and 1 for the denominator. Predicts from the measured outputs and writes
     innovations into z, or with `free` writes its own outputs into z. `out` (n_samples, n_outputs) is NaN where nothing
-    is predicted, and from where the recursion diverges on.
+    is predicted, and from where the recursion diverges on. With `folded` only the magnitude of the output is measured:
+    it gets the sign that is predicted, and `out` is the magnitude of the prediction.
     """
-    lag, n_y, n_u, free = shape[0], shape[1], shape[2], shape[3]
+    lag, n_y, n_u, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, n_e = z.shape[0], n_y + n_u
     recursive = free == 1
     for v in range(column.size):
@@ -53,10 +54,12 @@ def run(
             if recursive and not abs(x) < _FAR:
                 out[t:, :] = np.nan
                 return
-            out[t, o] = x
+            out[t, o] = abs(x) if folded == 1 else x
             if free == 1:
                 z[t, o] = x
             else:
+                if folded == 1:
+                    z[t, o] = np.copysign(z[t, o], x)
                 z[t, n_e + o] = z[t, o] - x
 
 
@@ -67,7 +70,8 @@ def slopes(
     """Derive what `run` computed by theta; z as `run` left it; `out` (n_samples, n_outputs, n_terms), zero before lag.
 
     Each output's slope is that of its own terms, plus what its factors that are themselves computed pass on: the
-    innovations (slope minus that of the prediction) or, in a free run, the outputs.
+    innovations (slope minus that of the prediction) or, in a free run, the outputs. Where outputs are folded, the slope
+    of the magnitude is that of the output times its sign, which is put in at the end.
     """
     lag, n_y, n_u, free = shape[0], shape[1], shape[2], shape[3]
     n, n_e, n_v, n_k = z.shape[0], n_y + n_u, column.size, terms.shape[0]
@@ -122,3 +126,9 @@ def slopes(
                     if a != 0.0:
                         for k in range(n_k):
                             out[t, o, k] += a * out[t - back[v], source, k]
+    if shape[4] == 1:
+        for t in range(lag, n):
+            for o in range(n_y):
+                if np.copysign(1.0, z[t, o]) < 0:
+                    for k in range(n_k):
+                        out[t, o, k] = -out[t, o, k]

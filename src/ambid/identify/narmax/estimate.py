@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.narmax.choose import Draft, process_terms, rational_terms, with_noise_terms
+from ambid.identify.narmax.choose import Draft, process_terms
+from ambid.identify.narmax.noise_model import with_all_noise, with_noise_terms
 from ambid.identify.narmax.pruning import pruned_by_prediction, pruned_by_simulation
+from ambid.identify.narmax.rational import rational_terms
 from ambid.identify.narmax.result import failed_fit, finished_fit
 from ambid.identify.narmax.scaled import Scaled, scaled_records
 from ambid.identify.narmax.search import Fitted, evaluated, search
+from ambid.identify.narmax.selection import information
 from ambid.identify.narmax.settings import NarmaxSettings, narmax_settings
 from ambid.identify.narmax.simulated_choice import terms_by_simulation
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
@@ -86,6 +89,7 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     s = narmax_settings(settings, n_inputs=records[0].n_inputs)
     began = perf_counter()
     scaled = scaled_records("narmax", records, lag=s.lag, levels=s.levels)
+    _check_magnitude(s, records)
     work = Work(draft=_linear_start(s, scaled))
     try:
         _identify(s, scaled, work, tick)
@@ -110,9 +114,22 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     )
 
 
+def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
+    if s.output != "magnitude":
+        return
+    if (records[0].n_inputs, records[0].n_outputs) != (1, 1):
+        raise EstimationError("narmax: output = magnitude is for one input and one output. Choose one of each")
+    for r, x in enumerate(records):
+        if np.min(x.y) < 0:
+            raise EstimationError(
+                f"narmax: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
+                "magnitude is not. Use output = signed"
+            )
+
+
 def _linear_start(s: NarmaxSettings, scaled: Scaled) -> Draft:
     """A linear model: something to hand over when the very next thing is an interruption."""
-    return process_terms(replace(s, degree=1, ne=0, selection="frols"), scaled.parts, None)
+    return process_terms(replace(s, degree=1, ne=0, selection="frols", output="signed"), scaled.parts, None)
 
 
 def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
@@ -120,13 +137,19 @@ def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) 
         tick("start")
     with _Timed(work, "terms"):
         if s.selection == "simulation":
-            draft = terms_by_simulation(s, scaled.parts, tick)
+            draft = terms_by_simulation(s, scaled.parts, tick, lambda x: _keep_simulated(work, x))
         else:
             draft = process_terms(s, scaled.parts, tick)
         if s.kind == "rational":
             draft = rational_terms(s, draft, scaled.parts, tick)
             draft = _searched(scaled, draft, work, tick, free=False)
-        _keep(work, scaled, draft)
+        if not (s.selection == s.focus == "simulation"):
+            draft = _refitted(s, scaled, draft)
+            _keep(work, scaled, draft)
+    if s.selection == s.focus == "simulation":
+        with _Timed(work, "simulation errors"):
+            _fit_to_simulation(scaled, draft, work, tick)
+        return
     with _Timed(work, "noise terms"):
         if s.ne:
             draft = with_noise_terms(s, draft, scaled.parts, tick)
@@ -162,10 +185,22 @@ def _weight(scaled: Scaled, draft: Draft, *, free: bool) -> Array:
     return out
 
 
+def _refitted(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> Draft:
+    """Coefficients by one-step errors for terms that were chosen, and fitted, by the free run."""
+    if s.selection != "simulation":
+        return draft
+    one = np.ones(scaled.n_outputs)
+    return draft.with_theta(search(draft.tables, draft.theta, scaled.parts, one, free=False).theta)
+
+
+def _keep_simulated(work: Work, draft: Draft) -> None:
+    work.draft, work.focus = draft, "simulation"
+
+
 def _keep(work: Work, scaled: Scaled, draft: Draft) -> None:
     """Hold on to a draft if it runs."""
     if evaluated(draft.tables, draft.theta, scaled.parts, np.ones(scaled.n_outputs), free=False).finite:
-        work.draft = draft
+        work.draft, work.focus = draft, "prediction"
 
 
 def _searched(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, free: bool) -> Draft:
@@ -202,15 +237,33 @@ def _note(work: Work, found: Fitted, n: int, weight: Array, *, free: bool) -> No
 def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> Draft:
     if s.pruning == "none":
         return draft
-    before = draft
-    if s.pruning == "prediction":
-        draft = pruned_by_prediction(draft, scaled.parts, _weight(scaled, draft, free=False), s.criterion)
-    else:
-        one = np.ones(scaled.n_outputs)
-        draft = pruned_by_simulation(draft, scaled.parts, one, s.criterion, tick)
-    if draft is before:
-        return draft
-    return _searched(scaled, draft, work, tick, free=False)
+    if s.pruning == "simulation":
+        fewer = pruned_by_simulation(draft, scaled.parts, np.ones(scaled.n_outputs), s.criterion, tick)
+        return draft if fewer is draft else _searched(scaled, fewer, work, tick, free=False)
+    weight = _weight(scaled, draft, free=False)
+
+    def pruned(d: Draft, *, noise: bool = True) -> Draft:
+        fewer = pruned_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
+        return _searched(scaled, fewer, work, tick, free=False)
+
+    best = pruned(draft)
+    richer = with_all_noise(s, draft)
+    if richer is not draft and draft.tables.noisy:
+        # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
+        # these are there can the surplus process terms go one by one.
+        other = pruned(pruned(_searched(scaled, richer, work, tick, free=False), noise=False))
+        if _value(s, scaled, other, weight) < _value(s, scaled, best, weight):
+            best = other
+    _keep(work, scaled, best)
+    return best
+
+
+def _value(s: NarmaxSettings, scaled: Scaled, draft: Draft, weight: Array) -> float:
+    """Information criterion of the one-step errors."""
+    found = evaluated(draft.tables, draft.theta, scaled.parts, weight, free=False)
+    n = sum(x.size for x in found.errors)
+    m = max(draft.n_candidates, draft.theta.size)
+    return information(s.criterion, found.cost / n, draft.theta.size, n, m) if found.finite else np.inf
 
 
 def _fit_to_simulation(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> None:

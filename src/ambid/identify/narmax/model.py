@@ -54,6 +54,9 @@ class PolynomialNarmax:
     y_level, y_scale : ndarray, shape (n_outputs,), SI
     cloud : Cloud
         Of the lagged inputs and outputs in training.
+    magnitude : bool
+        Whether the outputs are magnitudes of what the equation describes. Past outputs get the sign that was predicted
+        for them, the first ones that to which the linear part is driven by the first inputs.
     """
 
     dt: float
@@ -66,6 +69,7 @@ class PolynomialNarmax:
     y_level: Array
     y_scale: Array
     cloud: Cloud
+    magnitude: bool = False
 
     @property
     def kind(self) -> str:
@@ -80,7 +84,7 @@ class PolynomialNarmax:
     @cached_property
     def tables(self) -> Tables:
         """The terms as the compiled recursions want them."""
-        return tables(self.numerators, self.denominators, self.n_inputs)
+        return tables(self.numerators, self.denominators, self.n_inputs, folded=self.magnitude)
 
     @property
     def lag(self) -> int:
@@ -216,7 +220,8 @@ class PolynomialNarmax:
             If the signals are not of the model's shape.
         """
         ys, us = self._scaled(u, y)
-        x = lagged_signals(self.tables, ys, us)
+        _, z = predicted(self.tables, self.theta / self.unit, ys, us)
+        x = lagged_signals(self.tables, z)
         out = np.full(ys.shape[0], np.nan)
         out[self.lag :] = np.linalg.norm((x - self.cloud.mean) @ self.cloud.whitening.T, axis=1)
         return out
@@ -234,6 +239,7 @@ class PolynomialNarmax:
         return {
             "dt_s": self.dt,
             "n_inputs": self.n_inputs,
+            "magnitude": self.magnitude,
             "numerators": [[term_to_json(x) for x in terms] for terms in self.numerators],
             "denominators": [[term_to_json(x) for x in terms] for terms in self.denominators],
             **arrays,
@@ -290,26 +296,36 @@ def _read(found: dict[str, Any]) -> dict[str, Any]:
     )
     if len(den) != n_y or np.any(used.column >= 2 * n_y + n_u):
         raise ValueError("terms name channels that the model does not have")
+    if not isinstance(found["magnitude"], bool):
+        raise ValueError("magnitude is neither true nor false")
     dt = float(found["dt_s"])
-    return {"dt": dt, "n_inputs": n_u, "numerators": num, "denominators": den, "cloud": cloud, **arrays}
+    return {
+        "dt": dt,
+        "n_inputs": n_u,
+        "numerators": num,
+        "denominators": den,
+        "cloud": cloud,
+        "magnitude": found["magnitude"],
+        **arrays,
+    }
 
 
-def lagged_signals(t: Tables, y: Array, u: Array) -> Array:
+def lagged_signals(t: Tables, z: Array) -> Array:
     """Return the lagged inputs and outputs that a model looks at, from sample `lag` on.
 
     Parameters
     ----------
     t : Tables
-    y : ndarray, shape (n_samples, n_outputs), scaled
-    u : ndarray, shape (n_samples, n_inputs), scaled
+    z : ndarray, shape (n_samples, 2 n_outputs + n_inputs), scaled
+        The signals that `recursion.predicted` returns.
 
     Returns
     -------
     ndarray, shape (n_samples - lag, n_factors)
         Innovations are left out.
     """
-    z, n = np.hstack([y, u]), y.shape[0]
-    seen = [k for k in range(t.column.size) if t.column[k] < z.shape[1]]
+    n = z.shape[0]
+    seen = [k for k in range(t.column.size) if t.column[k] < t.n_outputs + t.n_inputs]
     if n <= t.lag or not seen:
         return np.empty((max(n - t.lag, 0), len(seen)))
     return np.stack([z[t.lag - t.back[k] : n - t.back[k], t.column[k]] for k in seen], axis=1)

@@ -21,7 +21,7 @@ Parts = Sequence[tuple[Array, Array]]
 Tick = Callable[[str], object]
 
 
-def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: str) -> Draft:
+def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Draft:
     """Leave out terms as long as the information criterion of the one-step errors falls.
 
     Parameters
@@ -31,6 +31,8 @@ def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: s
     weight : ndarray, shape (n_outputs,)
         One over the standard deviation of each output's one-step error.
     criterion : str
+    noise : bool, optional
+        Whether terms with innovations may go.
 
     Returns
     -------
@@ -43,9 +45,12 @@ def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: s
         if not np.all(np.isfinite(R)):
             return draft
         loss, _ = _losses(R, draft.theta)
-        k = int(np.argmin(np.where(_may_go(draft), loss, np.inf)))
+        may = _may_go(draft) & (noise | ~_noisy(draft))
+        if not np.any(may):
+            return draft
+        k = int(np.argmin(np.where(may, loss, np.inf)))
         saved = penalty(criterion, draft.theta.size, n, m) - penalty(criterion, draft.theta.size - 1, n, m)
-        if not loss[k] < saved or not _may_go(draft)[k]:
+        if not loss[k] < saved:
             return draft
         fewer = draft.without([k], _readjusted(R, draft.theta, k))
         if not evaluated(fewer.tables, fewer.theta, parts, weight, free=False).finite:

@@ -29,6 +29,8 @@ class Tables:
         Output, and 1 for a term of the denominator.
     noisy : bool
         Whether a term holds innovations.
+    folded : bool
+        Whether only the magnitude of the outputs is measured.
     """
 
     n_outputs: int
@@ -39,6 +41,7 @@ class Tables:
     terms: Table
     place: Table
     noisy: bool
+    folded: bool = False
 
     def shape(self, free: bool) -> Table:
         """Return what the recursions are told beside the tables.
@@ -50,12 +53,14 @@ class Tables:
 
         Returns
         -------
-        ndarray of int, shape (4,)
+        ndarray of int, shape (5,)
         """
-        return np.array([self.lag, self.n_outputs, self.n_inputs, int(free)], dtype=np.int64)
+        return np.array([self.lag, self.n_outputs, self.n_inputs, int(free), int(self.folded)], dtype=np.int64)
 
 
-def tables(numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int) -> Tables:
+def tables(
+    numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int, *, folded: bool = False
+) -> Tables:
     """Return the tables of a model; coefficients stand output by output, numerator before denominator.
 
     Parameters
@@ -63,6 +68,8 @@ def tables(numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence
     numerators, denominators : sequence of sequence of Term
         By output.
     n_inputs : int
+    folded : bool, optional
+        Whether only the magnitude of the outputs is measured.
 
     Returns
     -------
@@ -90,6 +97,7 @@ def tables(numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence
         terms=numbers,
         place=np.array([(o, d) for o, d, _ in rows], dtype=np.int64).reshape(-1, 2),
         noisy=any(f.kind == "e" for f in factors),
+        folded=folded,
     )
 
 
@@ -136,9 +144,24 @@ def predicted(t: Tables, theta: Array, y: Array, u: Array, *, free: bool = False
     from ambid.identify.narmax._kernels import run
 
     z = signals(t, y[: t.lag] if free else y, u)
+    if t.folded:
+        z[: t.lag, : t.n_outputs] *= _first_sign(t, theta, u)
     out = np.empty((z.shape[0], t.n_outputs))
     run(z, t.column, t.back, t.terms, t.place, theta, t.shape(free), out)
     return out, z
+
+
+def _first_sign(t: Tables, theta: Array, u: Array) -> float:
+    """Sign of the first outputs, of which only the magnitude is known: where the linear part is driven to at first."""
+    width = np.count_nonzero(t.terms >= 0, axis=1)
+    pushed, kept = 0.0, 1.0
+    for k in np.flatnonzero((width == 1) & (t.place[:, 1] == 0)):
+        c = int(t.column[t.terms[k, 0]])
+        if c < t.n_outputs:
+            kept -= float(theta[k])
+        elif c < t.n_outputs + t.n_inputs:
+            pushed += float(theta[k] * np.mean(u[: max(t.lag, 1), c - t.n_outputs]))
+    return -1.0 if pushed * kept < 0 else 1.0
 
 
 def sensitivities(t: Tables, theta: Array, z: Array, *, free: bool = False) -> Array:

@@ -139,7 +139,8 @@ def _model(records: Sequence[IOData], scaled: Scaled, draft: Draft) -> Polynomia
         u_scale=scaled.u_scale,
         y_level=scaled.y_level,
         y_scale=scaled.y_scale,
-        cloud=cloud_of([lagged_signals(t, y, u) for y, u in scaled.parts]),
+        cloud=cloud_of([lagged_signals(t, predicted(t, draft.theta, y, u)[1]) for y, u in scaled.parts]),
+        magnitude=draft.folded,
     )
     return model.with_theta(draft.theta * model.unit)
 

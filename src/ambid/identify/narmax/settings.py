@@ -15,6 +15,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "selection": ("frols", "simulation", "all"),
     "focus": ("prediction", "simulation"),
     "levels": ("auto", "zero", "mean"),
+    "output": ("signed", "magnitude"),
 }
 _RANGES: Mapping[str, tuple[int, int]] = {
     "ny": (0, 100),
@@ -35,7 +36,7 @@ class NarmaxSettings:
     Attributes
     ----------
     ny, nu, nk, ne, degree, noise_degree, terms, constant : int
-    criterion, pruning, kind, selection, focus, levels : str
+    criterion, pruning, kind, selection, focus, levels, output : str
     """
 
     ny: int = 2
@@ -52,6 +53,7 @@ class NarmaxSettings:
     selection: str = "frols"
     focus: str = "prediction"
     levels: str = "auto"
+    output: str = "signed"
 
     @property
     def lag(self) -> int:
@@ -102,7 +104,27 @@ def narmax_settings(given: Mapping[str, object], *, n_inputs: int) -> NarmaxSett
             raise EstimationError(
                 f"narmax: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, known)}"
             )
+    if given.get("output") == "magnitude":
+        given = {**_for_magnitude(given)}
     s = NarmaxSettings(**{**given, **({} if n_inputs else {"nu": 0, "nk": 1})})  # type: ignore[arg-type]
     if not s.ny and not s.nu:
         raise EstimationError("narmax: ny and nu are both 0; nothing is left to predict from. Raise one of them")
     return s
+
+
+_WITH_MAGNITUDE: Mapping[str, object] = {
+    "selection": "simulation",
+    "focus": "simulation",
+    "kind": "polynomial",
+    "levels": "zero",
+    "pruning": "simulation",
+    "ne": 0,
+}
+
+
+def _for_magnitude(given: Mapping[str, object]) -> Mapping[str, object]:
+    """A sign that is not measured is found by simulation: what that needs is set, and anything else refused."""
+    for name, value in _WITH_MAGNITUDE.items():
+        if given.get(name, value) != value:
+            raise EstimationError(f"narmax: output = magnitude needs {name} = {value}; it is {given[name]!r}")
+    return {**_WITH_MAGNITUDE, **given}

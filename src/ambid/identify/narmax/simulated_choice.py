@@ -1,23 +1,25 @@
-"""Terms chosen by what they do for the free run (Piroddi and Spinelli 2003, simulation error minimisation).
+"""Terms chosen by what they do for the free run: orthogonal least squares on the slopes of the simulation.
 
-At each step those candidates that orthogonal least squares finds most promising are tried; that one is taken with
-which the model, its coefficients by least squares, simulates best. After each step terms that have become useless
-are taken out again.
+From a linear model on, each candidate not in the model is looked at as a coefficient that is still zero: the slope of
+the free run by it, an exact sensitivity, is its column, and the simulation error what the columns have to explain. The
+one with the largest error reduction ratio enters, all coefficients are searched anew by simulation error, terms that
+have become useless go. The aim is that of Piroddi and Spinelli (2003), who try every candidate in a run of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.narmax.candidates import Candidates, candidates
-from ambid.identify.narmax.choose import Draft, least_squares
-from ambid.identify.narmax.recursion import tables
-from ambid.identify.narmax.search import evaluated
-from ambid.identify.narmax.selection import information, select_terms
+from ambid.identify.narmax.choose import Draft, process_terms
+from ambid.identify.narmax.folded import linear_folded
+from ambid.identify.narmax.recursion import predicted, sensitivities, tables
+from ambid.identify.narmax.search import evaluated, search, triangle
+from ambid.identify.narmax.selection import information
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Term, lagged, products
 
@@ -25,11 +27,11 @@ Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
 Tick = Callable[[str], object]
 
-_TRIED = 40  # candidates at each step
-_MOST_STEPS = 200
+_TRIED = 4  # candidates that are tried before it is said that none pays
+_ONE = np.ones(1)
 
 
-def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
+def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep: Callable[[Draft], None]) -> Draft:
     """Choose process terms by the error of the free run.
 
     Parameters
@@ -37,65 +39,105 @@ def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> D
     s : NarmaxSettings
     parts : sequence of (outputs, inputs), scaled
     tick : callable or None
+    keep : callable
+        Given each better model.
 
     Returns
     -------
     Draft
+        Coefficients by simulation errors; those of a one-step fit where no free run stays finite.
 
     Raises
     ------
     EstimationError
         With several outputs.
     """
+    n_u = parts[0][1].shape[1]
     if parts[0][0].shape[1] > 1:
         raise EstimationError("narmax: selection = simulation is for one output. Use frols, and pruning = simulation")
-    n_u = parts[0][1].shape[1]
     terms = products(lagged(1, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0), s.degree, constant=bool(s.constant))
-    found = candidates(terms, [p[0] for p in parts], [p[1] for p in parts], None, s.lag)
-    y = np.concatenate([p[0][s.lag :, 0] for p in parts])
-    n, m = y.size, len(terms)
-    most = min(s.terms, max(n // 5, 1), m)
+    n = sum(max(p[0].shape[0] - s.lag, 1) for p in parts)
+    most = min(s.terms, max(n // 5, 1), len(terms))
 
-    def tried(picks: tuple[int, ...]) -> tuple[float, Array]:
-        """Information criterion of the free run, and the coefficients."""
-        theta = least_squares(found.columns(picks), y)
-        t = tables((tuple(terms[k] for k in picks),), ((),), n_u)
-        cost = evaluated(t, theta, parts, np.ones(1), free=True).cost / n
-        return (information(s.criterion, cost, len(picks), n, m) if np.isfinite(cost) else np.inf), theta
+    def value(d: Draft) -> float:
+        cost = evaluated(d.tables, d.theta, parts, _ONE, free=True).cost / n
+        return information(s.criterion, cost, d.theta.size, n, len(terms)) if np.isfinite(cost) else np.inf
 
-    now: tuple[int, ...] = ()
-    value, theta = float("inf"), np.empty(0)
-    for _ in range(_MOST_STEPS):
-        if tick is not None:
-            tick("choice of terms by simulation")
-        if len(now) >= most:
-            break
-        trials = [(*now, k) for k in _promising(found, y, now)]
-        scored = [(tried(x)[0], x) for x in trials]
-        best, picks = min(scored, default=(float("inf"), now))
-        if not best < value:
-            break
-        value, now = best, picks
-        while len(now) > 2:
-            fewer = min((tried(x)[0], x) for x in (now[:k] + now[k + 1 :] for k in range(len(now))))
-            if not fewer[0] < value:
+    draft = replace(_start(s, parts, tick), n_candidates=len(terms))
+    now = value(draft)
+    if not np.isfinite(now):
+        return draft
+    keep(draft)
+    while draft.theta.size < most:
+        better = None
+        for term in _promising(draft, terms, parts)[:_TRIED]:
+            if tick is not None:
+                tick("choice of terms by simulation")
+            trial = _pruned(_searched(_with(draft, term), parts), parts, value)
+            if value(trial) < now:
+                better = trial
                 break
-            value, now = fewer
-    if not now:
-        now = select_terms(found, y, most=most, criterion=s.criterion).chosen
-    _, theta = tried(now)
-    chosen: tuple[Term, ...] = tuple(terms[k] for k in now)
-    return Draft(numerators=(chosen,), denominators=((),), theta=theta, n_inputs=n_u, n_candidates=m)
+        if better is None:
+            break
+        draft, now = better, value(better)
+        keep(draft)
+    return draft
 
 
-def _promising(found: Candidates, y: Array, now: tuple[int, ...]) -> list[int]:
-    """Candidates with the largest error reduction ratios beside those chosen."""
-    P = found.columns(range(len(found.terms)))
-    Q = np.linalg.qr(P[:, now])[0] if now else np.empty((y.size, 0))
-    rest, left = y - Q @ (Q.T @ y), P - Q @ (Q.T @ P)
+def _start(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
+    """A linear model by simulation errors."""
+    if s.output == "magnitude":
+        return linear_folded(s, parts, tick)
+    draft = process_terms(replace(s, degree=1, selection="all", ne=0), parts, None)
+    return _searched(draft, parts)
+
+
+def _searched(draft: Draft, parts: Parts) -> Draft:
+    return draft.with_theta(search(draft.tables, draft.theta, parts, _ONE, free=True, most=25).theta)
+
+
+def _with(draft: Draft, term: Term) -> Draft:
+    return replace(draft, numerators=((*draft.numerators[0], term),), theta=np.append(draft.theta, 0.0))
+
+
+def _promising(draft: Draft, terms: Sequence[Term], parts: Parts) -> list[Term]:
+    """Candidates outside the model, the largest error reduction ratio beside its terms first."""
+    inside = draft.numerators[0]
+    outside = [x for x in terms if x not in set(inside)]
+    if not outside:
+        return []
+    t = tables(((*inside, *outside),), ((),), draft.n_inputs, folded=draft.folded)
+    theta = np.concatenate([draft.theta, np.zeros(len(outside))])
+    rows, errors = [], []
+    for y, u in parts:
+        yhat, z = predicted(t, theta, y, u, free=True)
+        rows.append(sensitivities(t, theta, z, free=True)[t.lag :, 0])
+        errors.append((y - yhat)[t.lag :, 0])
+    J, e = np.concatenate(rows), np.concatenate(errors)
+    if not (np.all(np.isfinite(J)) and np.all(np.isfinite(e))):
+        return []
+    k = len(inside)
+    Q = np.linalg.qr(J[:, :k])[0]
+    rest, left = e - Q @ (Q.T @ e), J[:, k:] - Q @ (Q.T @ J[:, k:])
     squared = np.sum(left**2, axis=0)
-    live = squared > 1e-18 * np.sum(P**2, axis=0)
-    live[list(now)] = False
+    live = squared > 1e-12 * np.sum(J[:, k:] ** 2, axis=0)
     ratio = np.where(live, (left.T @ rest) ** 2 / np.where(live, squared, 1.0), -1.0)
-    order = np.argsort(-ratio, kind="stable")[:_TRIED]
-    return [int(k) for k in order if ratio[k] >= 0]
+    return [outside[int(i)] for i in np.argsort(-ratio, kind="stable") if ratio[i] > 0]
+
+
+def _pruned(draft: Draft, parts: Parts, value: Callable[[Draft], float]) -> Draft:
+    """Leave out terms, the least significant first, as long as the criterion gains by it."""
+    now = value(draft)
+    while draft.theta.size > 2 and np.isfinite(now):
+        R = triangle(draft.tables, draft.theta, parts, _ONE, free=True)
+        if not np.all(np.isfinite(R)):
+            return draft
+        scale = np.maximum(np.linalg.norm(R[:, :-1], axis=0), 1e-150)
+        inverse = np.linalg.pinv(R[:, :-1] / scale, rcond=1e-13) / scale[:, None]
+        k = int(np.argmin(draft.theta**2 / np.maximum(np.sum(inverse**2, axis=1), 1e-300)))
+        fewer = _searched(draft.without([k], np.delete(draft.theta, k)), parts)
+        then = value(fewer)
+        if not then < now:
+            return draft
+        draft, now = fewer, then
+    return draft

@@ -1,0 +1,143 @@
+"""Terms with innovations, by extended least squares: those of the model before stand for the unknown ones.
+
+Process terms stay as they are (Billings 2013, sec. 3.5); the rounds end when coefficients stand still. Their last
+digits come from the prediction-error search, whose innovations are those of the model itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.narmax.candidates import Candidates, candidates
+from ambid.identify.narmax.choose import Draft, least_squares, redrawn
+from ambid.identify.narmax.recursion import predicted
+from ambid.identify.narmax.selection import select_terms
+from ambid.identify.narmax.settings import NarmaxSettings
+from ambid.identify.narmax.terms import Term, noise_terms
+
+Array = NDArray[np.float64]
+Parts = Sequence[tuple[Array, Array]]
+Tick = Callable[[str], object]
+
+_ROUNDS = 12
+_CHOOSING = 3  # rounds in which the choice of noise terms may still change
+
+
+def with_noise_terms(s: NarmaxSettings, draft: Draft, parts: Parts, tick: Tick | None) -> Draft:
+    """Add terms with innovations by extended least squares, until coefficients stand still.
+
+    Parameters
+    ----------
+    s : NarmaxSettings
+    draft : Draft
+        Of process terms.
+    parts : sequence of (outputs, inputs), scaled
+    tick : callable or None
+
+    Returns
+    -------
+    Draft
+    """
+    n_y, n_u = parts[0][0].shape[1], draft.n_inputs
+    extra = noise_terms(n_y, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=s.ne, degree=s.noise_degree)
+    y, u = [p[0] for p in parts], [p[1] for p in parts]
+    errors = innovations(draft, parts)
+    if not extra or errors is None:
+        return draft
+    chosen: list[tuple[Term, ...]] = [()] * n_y
+    process, last, best = draft.numerators, draft.theta, draft
+    targets = [np.concatenate([x[s.lag :, o] for x in y]) for o in range(n_y)]
+    own, below = _denominators(s, draft, parts)
+    for rounds in range(_ROUNDS):
+        if tick is not None:
+            tick("extended least squares")
+        num, theta = [], []
+        for o in range(n_y):
+            over = below[o]
+            if rounds < _CHOOSING:
+                rows = candidates((*process[o], *extra), y, u, errors, s.lag, over)
+                chosen[o] = _noise_choice(s, rows, len(process[o]), targets[o])
+            terms = (*process[o], *chosen[o])
+            rows = candidates(terms, y, u, errors, s.lag, over)
+            num.append(terms)
+            theta += [least_squares(rows.columns(range(len(terms))), targets[o]), own[o]]
+        found = redrawn(tuple(num), draft.denominators, np.concatenate(theta), draft)
+        new = innovations(found, parts)
+        if new is None:
+            return best
+        errors, best = new, found
+        still = found.theta.shape == last.shape and np.allclose(found.theta, last, rtol=1e-4, atol=1e-6)
+        last = found.theta
+        if still and rounds >= _CHOOSING - 1:
+            break
+    return best
+
+
+def _denominators(s: NarmaxSettings, draft: Draft, parts: Parts) -> tuple[list[Array], list[tuple[Array, ...] | None]]:
+    """Coefficients of each output's denominator, and one over its values in each record."""
+    first, own, below = 0, [], []
+    for num, den in zip(draft.numerators, draft.denominators, strict=True):
+        first += len(num)
+        theta = draft.theta[first : first + len(den)]
+        first += len(den)
+        rows = candidates(den, [p[0] for p in parts], [p[1] for p in parts], None, s.lag)
+        a = 1.0 + rows.columns(range(len(den))) @ theta if len(den) else None
+        own.append(theta)
+        below.append(None if a is None else tuple(np.split(1.0 / a, np.cumsum(rows.rows)[:-1])))
+    return own, below
+
+
+def _noise_choice(s: NarmaxSettings, rows: Candidates, n_process: int, target: Array) -> tuple[Term, ...]:
+    """Noise terms that pay beside the process terms; these are in the regression, not in the choice."""
+    found = select_terms(rows, target, most=n_process + s.terms, criterion=s.criterion, first=range(n_process))
+    return tuple(rows.terms[k] for k in found.chosen if k >= n_process)
+
+
+def with_all_noise(s: NarmaxSettings, draft: Draft) -> Draft:
+    """Return a draft with every linear term in the innovations that it may have, those that are new at zero.
+
+    Parameters
+    ----------
+    s : NarmaxSettings
+    draft : Draft
+
+    Returns
+    -------
+    Draft
+        The same one where nothing is new.
+    """
+    n_y, k, new = len(draft.numerators), 0, False
+    extra = noise_terms(n_y, draft.n_inputs, ny=0, nu=0, nk=1, ne=s.ne, degree=1)
+    num, theta = [], []
+    for up, down in zip(draft.numerators, draft.denominators, strict=True):
+        more = tuple(x for x in extra if x not in up)
+        new = new or bool(more)
+        num.append((*up, *more))
+        theta += [draft.theta[k : k + len(up)], np.zeros(len(more)), draft.theta[k + len(up) : k + len(up) + len(down)]]
+        k += len(up) + len(down)
+    return redrawn(tuple(num), draft.denominators, np.concatenate(theta), draft) if new else draft
+
+
+def innovations(draft: Draft, parts: Parts) -> list[Array] | None:
+    """Return the one-step errors of each record, zero before the first prediction; None where they diverge.
+
+    Parameters
+    ----------
+    draft : Draft
+    parts : sequence of (outputs, inputs), scaled
+
+    Returns
+    -------
+    list of ndarray, shape (n_samples, n_outputs), or None
+    """
+    t, out = draft.tables, []
+    for y, u in parts:
+        e = y - predicted(t, draft.theta, y, u)[0]
+        e[: t.lag] = 0.0
+        if not np.all(np.isfinite(e)):
+            return None
+        out.append(e)
+    return out
