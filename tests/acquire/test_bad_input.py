@@ -5,8 +5,10 @@ import os
 import pytest
 
 from ambid.acquire.recorder import JournalReader, Recorder
+from ambid.acquire.session import Course, run
 from ambid.errors import DeviceError
 from tests.acquire.recorder.signals import block, header
+from tests.acquire.scripted import ScriptedDevice
 
 BLOCKS = 3000
 
@@ -53,3 +55,9 @@ def test_a_damaged_header_costs_nothing_and_all_headers_damaged_are_not_called_a
     damaged.write_bytes(data.replace(b"ambid.journal/1", b"ambid.journal/X"))
     with pytest.raises(DeviceError, match=rf"holds {BLOCKS} sound blocks.*Keep it"):
         JournalReader.open(damaged)
+
+
+def test_numbers_that_come_again_make_up_for_none_that_are_lost():
+    device = ScriptedDevice(gaps={1: 10, 2: -5})
+    report = run(device, Course(mode="levitate", seconds=0.045), taps=[])
+    assert (report.samples, report.lost) == (40, 10)

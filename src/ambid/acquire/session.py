@@ -166,6 +166,7 @@ class _Run:
         self._first: int | None = None
         self._after = 0
         self._samples = 0
+        self._lost = 0  # numbers that were passed over; those that come again make up for none of them
         self._fault: DeviceEvent | None = None
         self._interrupted = False
         self._events: list[DeviceEvent] = []
@@ -204,7 +205,8 @@ class _Run:
             for tap in self._taps:
                 tap.take(replace(frame, block=kept))
             self._samples += len(kept.values)
-            self._after = kept.first + len(kept.values)
+            self._lost += max(0, kept.first - self._after)
+            self._after = max(self._after, kept.first + len(kept.values))
             if self._after >= end:
                 return
 
@@ -251,7 +253,7 @@ class _Run:
         return RunReport(
             samples=self._samples,
             wanted=self._wanted,
-            lost=self._after - first - self._samples,
+            lost=self._lost,
             first=first,
             after=self._after,
             fault=self._fault,
