@@ -13,6 +13,7 @@ from ambid.identify.nonlinear.model import NonlinearModel
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.identify.narmax.model:PolynomialNarmax",
+        "narx": "ambid.identify.networks.narx_model:NeuralNarx",
     }
 )
 """``module:class`` by `NonlinearModel.kind`; imported only when a model of that kind is read."""

@@ -1,0 +1,152 @@
+"""Where the training regressors lie, and how far others are from them: Mahalanobis distance and nearest neighbour.
+
+A convex hull cannot be computed in many dimensions. Instead: the Mahalanobis distance from the middle of the training
+regressors, 1 at the farthest of them; and, because a cloud may have holes, the distance to the nearest of some hundred
+training regressors that were spread over the cloud (farthest first), 1 at the farthest that any training regressor has.
+The first counts inside; the second as well where it says "outside".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_MARKS = 300  # training regressors that stand for all
+_LOOKED_AT = 4000  # of which they are chosen
+_NARROW = 1e-6  # part of the widest direction below which a direction counts as that wide
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """Training regressors in brief.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n_regressors,)
+    whitening : ndarray, shape (n_regressors, n_regressors)
+        |whitening (x - mean)| is the Mahalanobis distance, in that of the farthest training regressor.
+    scale : ndarray, shape (n_regressors,)
+        Deviations, in which neighbours are compared.
+    marks : ndarray, shape (n_marks, n_regressors)
+        Training regressors.
+    reach : float
+        Largest distance of a training regressor to the nearest mark, in deviations.
+    """
+
+    mean: Array
+    whitening: Array
+    scale: Array
+    marks: Array
+    reach: float
+
+    def novelty(self, x: Array) -> Array:
+        """Return how far regressors are from the training: 0 in the middle, 1 at the edge, above 1 outside.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n, n_regressors)
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        from scipy.spatial import KDTree
+
+        out: Array = np.linalg.norm((x - self.mean) @ self.whitening.T, axis=1)
+        sound = np.all(np.isfinite(x), axis=1)
+        near = np.full(x.shape[0], np.nan)
+        if np.any(sound):
+            near[sound] = KDTree(self.marks / self.scale).query(x[sound] / self.scale)[0] / self.reach
+        return np.where(near > 1.0 + 1e-9, np.maximum(out, near), out)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that `from_json` needs.
+
+        Returns
+        -------
+        dict
+        """
+        return {
+            "mean": self.mean.tolist(),
+            "whitening": self.whitening.tolist(),
+            "scale": self.scale.tolist(),
+            "marks": self.marks.tolist(),
+            "reach": self.reach,
+        }
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any], n: int) -> Self:
+        """Read it back.
+
+        Parameters
+        ----------
+        found : Mapping
+        n : int
+            Regressors.
+
+        Returns
+        -------
+        Cloud
+
+        Raises
+        ------
+        ValueError, KeyError, TypeError
+            If something is missing or of another shape.
+        """
+        marks = np.array(found["marks"], dtype=np.float64).reshape(-1, n)
+        return cls(
+            mean=np.array(found["mean"], dtype=np.float64).reshape(n),
+            whitening=np.array(found["whitening"], dtype=np.float64).reshape(n, n),
+            scale=np.array(found["scale"], dtype=np.float64).reshape(n),
+            marks=marks,
+            reach=float(found["reach"]),
+        )
+
+
+def cloud_of(x: Array) -> Cloud:
+    """Return where training regressors lie.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, n_regressors)
+
+    Returns
+    -------
+    Cloud
+    """
+    from scipy.spatial import KDTree
+
+    mean, scale = x.mean(axis=0), x.std(axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    _, s, Vt = np.linalg.svd(np.linalg.qr(x - mean, mode="r"))
+    wide = np.zeros(x.shape[1])
+    wide[: s.size] = s
+    narrow = np.maximum(wide, _NARROW * max(s[0], 1e-300))
+    W = Vt / (narrow / np.sqrt(x.shape[0]))[:, None]
+    far = float(np.max(np.linalg.norm((x - mean) @ W.T, axis=1)))
+    marks = _spread(x[:: max(1, x.shape[0] // _LOOKED_AT)], mean, scale)
+    reach = float(np.max(KDTree(marks / scale).query(x / scale)[0]))
+    return Cloud(
+        mean=mean, whitening=W / far if far > 0 else W, scale=scale, marks=marks, reach=reach if reach > 0 else 1.0
+    )
+
+
+def _spread(x: Array, mean: Array, scale: Array) -> Array:
+    """Choose regressors farthest first (Gonzalez 1985), beginning with the one nearest to the middle."""
+    z = x / scale
+    at = int(np.argmin(np.linalg.norm(z - mean / scale, axis=1)))
+    away = np.full(z.shape[0], np.inf)
+    chosen = []
+    for _ in range(min(_MARKS, z.shape[0])):
+        chosen.append(at)
+        away = np.minimum(away, np.sum((z - z[at]) ** 2, axis=1))
+        at = int(np.argmax(away))
+        if not away[at] > 0:
+            break
+    return np.array(x[chosen])

@@ -1,0 +1,299 @@
+"""A neural NARX model with its scaling and its training cloud (implements `NonlinearModel`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.networks.cloud import Cloud
+from ambid.identify.networks.narx_function import NarxShape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NeuralNarx:
+    """A neural NARX model; the function is that of `NarxShape`, on scaled signals.
+
+    Attributes
+    ----------
+    dt : float
+        s.
+    shape : NarxShape
+    theta : ndarray, shape (n_theta,)
+        Weights, for signals in deviations from `*_level` divided by `*_scale`.
+    u_level, u_scale : ndarray, shape (n_inputs,), SI
+    y_level, y_scale : ndarray, shape (n_outputs,), SI
+    cloud : Cloud
+        Of the training regressors.
+    kind : str
+        ``narx``.
+    """
+
+    dt: float
+    shape: NarxShape
+    theta: Array
+    u_level: Array
+    u_scale: Array
+    y_level: Array
+    y_scale: Array
+    cloud: Cloud
+    kind: str = "narx"
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.shape.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.shape.n_outputs
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.shape.lag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self.shape.names
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other weights.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        NeuralNarx
+        """
+        return replace(self, theta=theta)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """Return one-step-ahead predictions.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            The first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.full(ys.shape, np.nan)
+        out[self.lag :] = self.shape.values(self.theta, self.shape.regressors(ys, us))
+        out = self.y_level + self.y_scale * out
+        return out
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """Return the exact derivative of `predict` by `theta`.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs, n_theta)
+            The first `lag` rows are zero.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.zeros((*ys.shape, self.theta.size))
+        out[self.lag :] = self.shape.slopes(self.theta, self.shape.regressors(ys, us))
+        return out * self.y_scale[:, None]
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """Run freely from the first `lag` measured samples on.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (at least lag, n_outputs), SI
+            Only the first `lag` rows are looked at.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
+            training data.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
+        out: Array = self.y_level + self.y_scale * self.shape.free_run(self.theta, ys, us)[:, : self.n_outputs]
+        out[:head] = whole[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """Return how far the regressors are from those of the training (see `networks.cloud`).
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+            0 in the middle, 1 at the edge, above 1 outside; the first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.full(ys.shape[0], np.nan)
+        out[self.lag :] = self.cloud.novelty(self.shape.regressors(ys, us))
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that `from_json` needs.
+
+        Returns
+        -------
+        dict
+        """
+        s = self.shape
+        sizes = {k: getattr(s, k) for k in ("n_outputs", "n_inputs", "ny", "nu", "nk", "neurons")}
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        return {"dt_s": self.dt, "sizes": sizes, **arrays, "cloud": self.cloud.as_json()}
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back.
+
+        Parameters
+        ----------
+        found : dict
+            That `as_json` made.
+
+        Returns
+        -------
+        NeuralNarx
+
+        Raises
+        ------
+        EstimationError
+            If something is missing or of another shape.
+        """
+        try:
+            shape = NarxShape(**{k: int(v) for k, v in found["sizes"].items()})
+            m, p = shape.n_inputs, shape.n_outputs
+            arrays: dict[str, Any] = {
+                k: finite(found[k], n, k)
+                for k, n in {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": p, "y_scale": p}.items()
+            }
+            cloud = Cloud.from_json(found["cloud"], shape.n_regressors)
+            return cls(dt=float(found["dt_s"]), shape=shape, cloud=cloud, **arrays)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise EstimationError(f"no neural NARX model ({type(error).__name__}: {error}). Write it again") from error
+
+
+def finite(value: Any, n: int, what: str) -> Array:
+    """Return stored numbers, checked.
+
+    Parameters
+    ----------
+    value : sequence of float
+    n : int
+        How many there must be.
+    what : str
+        For the message.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+
+    Raises
+    ------
+    ValueError
+        If one is missing or not finite.
+    """
+    out = np.array(value, dtype=np.float64).reshape(n)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{what} is not finite")
+    return out
+
+
+def scaled(model: Any, u: Array, y: Array) -> tuple[Array, Array]:
+    """Return outputs and inputs in a model's scaled units.
+
+    Parameters
+    ----------
+    model : NeuralNarx or StateNetwork
+    u : ndarray, shape (n_samples, n_inputs), SI
+    y : ndarray, shape (n_samples, n_outputs), SI
+
+    Returns
+    -------
+    y, u : ndarray, shapes (n_samples, n_outputs) and (n_samples, n_inputs)
+
+    Raises
+    ------
+    EstimationError
+        If they are not of the model's shape.
+    """
+    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    n = y.shape[0] if y.ndim else 0
+    if (u.shape, y.shape) != ((n, model.n_inputs), (n, model.n_outputs)):
+        raise EstimationError(
+            f"inputs of shape {u.shape} and outputs of shape {y.shape} for a model of {model.n_inputs} and "
+            f"{model.n_outputs} channels; time is axis 0. Pass (n_samples, n_channels)"
+        )
+    return (y - model.y_level) / model.y_scale, (u - model.u_level) / model.u_scale
+
+
+def with_head(model: Any, u: Array, y: Array) -> tuple[Array, int]:
+    """Return outputs as long as the inputs, of which only the first `lag` rows are taken over.
+
+    Parameters
+    ----------
+    model : NeuralNarx or StateNetwork
+    u : ndarray, shape (n_samples, n_inputs)
+    y : ndarray, shape (at least lag, n_outputs)
+
+    Returns
+    -------
+    y : ndarray, shape (n_samples, n_outputs)
+    head : int
+        Rows taken over.
+
+    Raises
+    ------
+    EstimationError
+        If there are fewer than `lag` rows.
+    """
+    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    head = min(model.lag, u.shape[0])
+    if y.ndim != 2 or y.shape[0] < head:
+        raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
+    whole = np.zeros((u.shape[0], y.shape[1]))
+    whole[:head] = y[:head]
+    return whole, head

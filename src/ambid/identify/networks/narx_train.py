@@ -1,0 +1,188 @@
+"""Training a neural NARX model: least squares of one-step or of simulation errors, with a weak prior on its weights.
+
+Weights of the hidden layer are N(0, prior^2) for scaled signals: where the data speak it does not count; where they do
+not (units that do the same thing), it makes the information matrix regular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.networks.records import Parts
+from ambid.identify.networks.search import triangle_of
+
+Array = NDArray[np.float64]
+
+_BLOCK = 4096
+_LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NarxProblem:
+    """Weighted errors of a neural NARX model over parts of records.
+
+    Attributes
+    ----------
+    shape : NarxShape
+    parts : tuple of (outputs, inputs), scaled
+    weight : ndarray, shape (n_outputs,)
+        One over the errors' standard deviation.
+    prior : float
+        Standard deviation of the hidden layer's weights before the data.
+    free : bool
+        Errors of the free run instead of the predictions.
+    counts : tuple of ndarray, shape (n_samples - lag,), or None
+        How often each sample counts (for the bootstrap).
+    """
+
+    shape: NarxShape
+    parts: Parts
+    weight: Array
+    prior: float
+    free: bool = False
+    counts: tuple[Array, ...] | None = None
+    _rows: list[tuple[Array, Array]] = field(default_factory=list)
+
+    def rows(self) -> list[tuple[Array, Array]]:
+        """Return regressors and outputs of each part, made once: (n_rows, n_regressors) and (n_rows, n_outputs)."""
+        if not self._rows:
+            self._rows.extend((self.shape.regressors(y, u), y[self.shape.lag :]) for y, u in self.parts)
+        return self._rows
+
+    @property
+    def n_errors(self) -> int:
+        """Errors in all."""
+        return sum((y.shape[0] - self.shape.lag) * y.shape[1] for y, _ in self.parts)
+
+    def errors(self, theta: Array) -> list[Array]:
+        """Return the errors of each part, from sample `lag` on, scaled; NaN from where a free run diverges on.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        list of ndarray, shape (n_rows, n_outputs)
+        """
+        s = self.shape
+        if not self.free:
+            return [target - s.values(theta, z) for z, target in self.rows()]
+        return [(y - s.free_run(theta, y, u)[:, : s.n_outputs])[s.lag :] for y, u in self.parts]
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squared weighted errors and of the prior's rows.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        float
+            Infinite where the model diverges.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = float(np.sum(self._prior(theta) ** 2))
+            for k, e in enumerate(self.errors(theta)):
+                squares = np.sum((e * self.weight) ** 2, axis=1)
+                found += float(np.sum(squares if self.counts is None else squares * self.counts[k]))
+        return found if np.isfinite(found) else np.inf
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | r], the prior's rows included.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        ndarray, shape (n_theta + 1, n_theta + 1)
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = [triangle_of([block]) for block in self._blocks(theta)]
+        precision = self._precision()
+        found.append(np.hstack([np.diag(precision), self._prior(theta)[:, None]]))
+        return triangle_of([np.concatenate(found)])
+
+    def _blocks(self, theta: Array) -> Iterator[Array]:
+        s = self.shape
+        for k, (y, u) in enumerate(self.parts):
+            if self.free:
+                z = s.free_run(theta, y, u)
+                whole = s.free_slopes(theta, z)[s.lag :]
+                left = (y - z[:, : s.n_outputs])[s.lag :]
+            else:
+                rows, target = self.rows()[k]
+                left = target - s.values(theta, rows)
+            for first in range(0, left.shape[0], _BLOCK):
+                part = slice(first, first + _BLOCK)
+                J = whole[part] if self.free else s.slopes(theta, rows[part])
+                w = np.broadcast_to(self.weight, left[part].shape)
+                if self.counts is not None:
+                    w = w * np.sqrt(self.counts[k][part, None])
+                yield np.hstack(
+                    [(J * w[:, :, None]).reshape(-1, s.n_theta), (left[part] * w).reshape(-1, 1)]
+                )  # fmt: skip
+
+    def _precision(self) -> Array:
+        """One over the prior's standard deviation of every weight."""
+        n_linear = sum(self.shape.sizes[:2])
+        out = np.full(self.shape.n_theta, 1.0 / self.prior)
+        out[:n_linear] /= _LINEAR_PRIOR
+        return out
+
+    def _prior(self, theta: Array) -> Array:
+        out: Array = -self._precision() * theta
+        return out
+
+
+def linear_start(shape: NarxShape, parts: Parts) -> Array:
+    """Return the weights of the best linear model, the hidden layer's zero.
+
+    Parameters
+    ----------
+    shape : NarxShape
+    parts : tuple of (outputs, inputs), scaled
+
+    Returns
+    -------
+    ndarray, shape (n_theta,)
+    """
+    z = np.concatenate([shape.regressors(y, u) for y, u in parts])
+    target = np.concatenate([y[shape.lag :] for y, _ in parts])
+    known = np.hstack([z, np.ones((z.shape[0], 1))])
+    found = np.linalg.lstsq(known, target, rcond=1e-12)[0]
+    theta = np.zeros(shape.n_theta)
+    L, c, *_ = shape.parts(theta)
+    L[:], c[:] = found[:-1].T, found[-1]
+    return np.concatenate([L.ravel(), c, theta[L.size + c.size :]])
+
+
+def random_start(shape: NarxShape, linear: Array, rng: np.random.Generator) -> Array:
+    """Return weights with a random hidden layer whose units bend inside the data.
+
+    Parameters
+    ----------
+    shape : NarxShape
+    linear : ndarray, shape (n_theta,)
+        Of `linear_start`.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (n_theta,)
+    """
+    theta = linear.copy()
+    n_l, n_c, n_2, n_1, n_b = shape.sizes
+    hidden = rng.standard_normal(n_1) / np.sqrt(max(shape.n_regressors, 1))
+    bias = rng.standard_normal(n_b)
+    theta[n_l + n_c + n_2 :] = np.concatenate([hidden, bias])
+    theta[n_l + n_c : n_l + n_c + n_2] = 0.01 * rng.standard_normal(n_2)
+    return theta

@@ -1,0 +1,228 @@
+"""Levenberg-Marquardt search for the weights of a network, on triangles: rows are reduced by QR before they are joined.
+
+A problem gives its errors and, at a vector, the triangle of [J | r], r = target - prediction, J the slope of the
+prediction, both weighted to unit variance; priors and penalties are rows like others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Tick = Callable[[str], object]
+
+_BLOCK = 4096  # rows that are reduced at once: they stay in the cache
+BLIND = 1e-11  # singular values of the scaled Jacobian below this part of the largest are directions nobody sees
+
+
+class Problem(Protocol):
+    """What is searched in."""
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squared rows.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        float
+            Infinite where the model diverges.
+        """
+        ...
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | r].
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        ndarray, shape (n_theta + 1, n_theta + 1)
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (n_theta,)
+        With the least cost, or with the least held-out error where training went on beyond it.
+    cost : float
+        Of `theta`; infinite where the start already diverges.
+    converged : bool
+    stopped_early : bool
+        Whether `theta` is that of the least held-out error, the training having gone beyond it.
+    seconds, costs, held_out : tuple of float
+        Of each accepted step.
+    """
+
+    theta: Array
+    cost: float
+    converged: bool
+    stopped_early: bool
+    seconds: tuple[float, ...]
+    costs: tuple[float, ...]
+    held_out: tuple[float, ...]
+
+
+def triangle_of(rows: Sequence[Array]) -> Array:
+    """Return the triangle of stacked rows.
+
+    Parameters
+    ----------
+    rows : sequence of ndarray, shape (n_rows, n_columns)
+
+    Returns
+    -------
+    ndarray, shape (at most n_columns, n_columns)
+    """
+    small = [
+        part if part.shape[0] <= part.shape[1] else np.asarray(np.linalg.qr(part, mode="r"))
+        for block in rows
+        for part in (block[k : k + _BLOCK] for k in range(0, block.shape[0], _BLOCK))
+    ]
+    return small[0] if len(small) == 1 else np.asarray(np.linalg.qr(np.concatenate(small), mode="r"))
+
+
+def search(
+    problem: Problem,
+    theta: Array,
+    *,
+    stage: str,
+    most: int = 50,
+    tolerance: float = 1e-8,
+    held_out: Callable[[Array], float] | None = None,
+    slack: float = 0.02,
+    tick: Tick | None = None,
+    keep: Callable[[Array], None] | None = None,
+) -> Found:
+    """Search for the least sum of squares.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (n_theta,)
+        Start.
+    stage : str
+        For `tick`.
+    most : int, optional
+        Iterations.
+    tolerance : float, optional
+        Relative gain below which the search is over.
+    held_out : callable, optional
+        Error on data that are not trained on, of theta, shape (n_theta,); the search ends when it has grown for 6 iterations.
+    slack : float, optional
+        Part by which the held-out error at the end may exceed its least before the weights of the least are taken.
+    tick : callable, optional
+        Called before each iteration.
+    keep : callable, optional
+        Given each better vector, shape (n_theta,).
+
+    Returns
+    -------
+    Found
+    """
+    began, damping, converged = perf_counter(), 1e-3, False
+    cost = problem.cost(theta)
+    seconds, costs = [0.0], [cost]
+    held = [held_out(theta)] if held_out is not None else []
+    best_held, best_theta, worse = (held[0] if held else np.inf), theta, 0
+    for _ in range(most):
+        if tick is not None:
+            tick(stage)
+        if not np.isfinite(cost):
+            break
+        trial, trial_cost, damping, over = _step(problem, theta, cost, damping)
+        if trial is None:
+            converged = over
+            break
+        gained = cost - trial_cost
+        theta, cost = trial, trial_cost
+        if keep is not None:
+            keep(theta)
+        seconds.append(perf_counter() - began)
+        costs.append(cost)
+        if held_out is not None:
+            held.append(held_out(theta))
+            worse = 0 if held[-1] < best_held else worse + 1
+            if held[-1] < best_held:
+                best_held, best_theta = held[-1], theta
+        converged = gained <= tolerance * cost
+        if converged or worse >= 6:
+            break
+    early = bool(held) and held[-1] > (1.0 + slack) * best_held
+    if early:
+        theta, cost, converged = best_theta, problem.cost(best_theta), True
+    return Found(
+        theta=theta,
+        cost=cost,
+        converged=converged,
+        stopped_early=early,
+        seconds=tuple(seconds),
+        costs=tuple(costs),
+        held_out=tuple(held),
+    )
+
+
+def _step(problem: Problem, theta: Array, cost: float, damping: float) -> tuple[Array | None, float, float, bool]:
+    """Return a better vector (None without one), its cost, the next damping, and whether there is nothing to gain."""
+    R = problem.triangle(theta)
+    if not np.all(np.isfinite(R)):
+        return None, cost, damping, False
+    scale = np.linalg.norm(R[:, :-1], axis=0)
+    scale = np.where(scale > 1e-150, scale, 1.0)
+    U, s, Vt = np.linalg.svd(R[:, :-1] / scale, full_matrices=False)
+    along = U.T @ R[:, -1]
+    live = s > BLIND * max(s[0], 1e-300)
+    to_gain = float(np.sum(along[live] ** 2))
+    if to_gain <= 1e-13 * cost:
+        return None, cost, damping, True
+    while damping < 1e9:
+        step = (Vt.T @ (np.where(live, s / (s**2 + damping), 0.0) * along)) / scale
+        trial = theta + step
+        found = problem.cost(trial)
+        if found < cost:
+            return trial, found, max(damping / 10.0, 1e-14), False
+        damping *= 8.0
+    return None, cost, damping, to_gain <= 1e-6 * cost
+
+
+def information_inverse(R: Array) -> tuple[Array | None, float]:
+    """Return the inverse of R'R by singular values, and the condition number of the scaled R.
+
+    Parameters
+    ----------
+    R : ndarray, shape (n_rows, n_theta)
+        Triangle without its last column.
+
+    Returns
+    -------
+    inverse : ndarray, shape (n_theta, n_theta), or None
+        None where a direction is not seen at all.
+    condition : float
+    """
+    if R.shape[0] < R.shape[1] or not np.all(np.isfinite(R)):
+        return None, np.inf
+    scale = np.linalg.norm(R, axis=0)
+    if not np.all(scale > 1e-150):
+        return None, np.inf
+    _, s, Vt = np.linalg.svd(R / scale, full_matrices=False)
+    condition = float(s[0] / max(s[-1], 1e-300))
+    if condition > 1.0 / BLIND:
+        return None, condition
+    half = (Vt.T / s) / scale[:, None]
+    inverse: Array = half @ half.T
+    return (inverse + inverse.T) / 2.0, condition

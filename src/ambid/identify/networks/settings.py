@@ -1,0 +1,56 @@
+"""Settings of the networks, checked: names, ranges, choices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ambid.errors import EstimationError, nearest
+
+
+def checked(
+    structure: str,
+    given: Mapping[str, object],
+    ranges: Mapping[str, tuple[float, float]],
+    choices: Mapping[str, tuple[str, ...]],
+) -> dict[str, object]:
+    """Check settings by name.
+
+    Parameters
+    ----------
+    structure : str
+        For messages.
+    given : Mapping[str, object]
+    ranges : Mapping[str, (low, high)]
+        Numbers; whole ones where both bounds are of type int.
+    choices : Mapping[str, tuple of str]
+
+    Returns
+    -------
+    dict
+        What was given.
+
+    Raises
+    ------
+    EstimationError
+        If one is not known or has no such value.
+    """
+    for name, value in given.items():
+        if name in choices:
+            if value not in choices[name]:
+                near = nearest(str(value), list(choices[name]))
+                raise EstimationError(
+                    f"{structure}: {name} is {value!r}; it must be one of {', '.join(choices[name])}.{near}"
+                )
+        elif name in ranges:
+            low, high = ranges[name]
+            whole = isinstance(low, int) and isinstance(high, int)
+            number = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+            if not number or not low <= value <= high:  # type: ignore[operator]
+                kind = "whole number" if whole else "number"
+                raise EstimationError(f"{structure}: {name} is {value!r}; it must be a {kind} from {low} to {high}")
+        else:
+            known = [*ranges, *choices]
+            raise EstimationError(
+                f"{structure}: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, known)}"
+            )
+    return dict(given)
