@@ -20,7 +20,7 @@ COLUMNS = (
     "mode", "inputs", "values of a sample", "rate", "commands a second", "time", "samples", "lost", "damaged frames",
     "late bytes", *COUNTED, "longest work of a tick", "load of the line",
 )  # fmt: skip
-PERIODS = {"sample": (8, 5, 4), "levitate": (10, 8, 7)}
+PERIODS = {"sample": (8, 6, 5, 4), "levitate": (10, 8, 7)}
 
 
 def line_tables() -> Iterator[Table]:
