@@ -125,7 +125,9 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
         Polynomial; coefficients by least squares.
     """
     n_y, n_u = parts[0][0].shape[1], parts[0][1].shape[1]
-    terms = products(lagged(n_y, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0), s.degree, constant=bool(s.constant))
+    terms = products(
+        lagged(n_y, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0), s.degree, constant=bool(s.constant), odd=s.symmetry == "odd"
+    )
     y, u = [p[0] for p in parts], [p[1] for p in parts]
     found = candidates(terms, y, u, None, s.lag)
     num, theta, err, passes = [], [], {}, 0

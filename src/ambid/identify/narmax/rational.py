@@ -42,7 +42,10 @@ def rational_terms(s: NarmaxSettings, polynomial: Draft, parts: Parts, tick: Tic
     n_y, n_u = parts[0][0].shape[1], polynomial.n_inputs
     y, u = [p[0] for p in parts], [p[1] for p in parts]
     factors = lagged(n_y, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0)
-    up, down = products(factors, s.degree, constant=bool(s.constant)), products(factors, s.degree, constant=False)
+    up, down = (
+        products(factors, s.degree, constant=bool(s.constant), odd=s.symmetry == "odd"),
+        products(factors, s.degree, constant=False),
+    )
     P = candidates(up, y, u, None, s.lag).columns(range(len(up)))
     D = candidates(down, y, u, None, s.lag).columns(range(len(down)))
     num: list[tuple[Term, ...]] = []

@@ -16,6 +16,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "focus": ("prediction", "simulation"),
     "levels": ("auto", "zero", "mean"),
     "output": ("signed", "magnitude"),
+    "symmetry": ("none", "odd"),
 }
 _RANGES: Mapping[str, tuple[int, int]] = {
     "ny": (0, 100),
@@ -36,7 +37,7 @@ class NarmaxSettings:
     Attributes
     ----------
     ny, nu, nk, ne, degree, noise_degree, terms, constant : int
-    criterion, pruning, kind, selection, focus, levels, output : str
+    criterion, pruning, kind, selection, focus, levels, output, symmetry : str
     """
 
     ny: int = 2
@@ -54,6 +55,7 @@ class NarmaxSettings:
     focus: str = "prediction"
     levels: str = "auto"
     output: str = "signed"
+    symmetry: str = "none"
 
     @property
     def lag(self) -> int:

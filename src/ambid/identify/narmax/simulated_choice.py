@@ -55,7 +55,9 @@ def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep
     n_u = parts[0][1].shape[1]
     if parts[0][0].shape[1] > 1:
         raise EstimationError("narmax: selection = simulation is for one output. Use frols, and pruning = simulation")
-    terms = products(lagged(1, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0), s.degree, constant=bool(s.constant))
+    terms = products(
+        lagged(1, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=0), s.degree, constant=bool(s.constant), odd=s.symmetry == "odd"
+    )
     n = sum(max(p[0].shape[0] - s.lag, 1) for p in parts)
     most = min(s.terms, max(n // 5, 1), len(terms))
 

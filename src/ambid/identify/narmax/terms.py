@@ -59,7 +59,7 @@ def lagged(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int)
     return tuple(out)
 
 
-def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True) -> tuple[Term, ...]:
+def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True, odd: bool = False) -> tuple[Term, ...]:
     """Return all products of the factors up to a degree, by degree: the candidates of a polynomial (thesis eq. 3.4).
 
     Parameters
@@ -69,6 +69,8 @@ def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True)
         Of the polynomial.
     constant : bool, optional
         Whether the constant is one of them.
+    odd : bool, optional
+        Only those of an odd number of factors: the model of a plant that is the same the other way round.
 
     Returns
     -------
@@ -79,8 +81,8 @@ def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True)
     EstimationError
         If there are too many.
     """
-    out: list[Term] = [()] if constant else []
-    for d in range(1, degree + 1):
+    out: list[Term] = [()] if constant and not odd else []
+    for d in range(1, degree + 1, 2 if odd else 1):
         for term in combinations_with_replacement(factors, d):
             out.append(tuple(sorted(term)))
             if len(out) > MOST_CANDIDATES:
