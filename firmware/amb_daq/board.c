@@ -71,10 +71,11 @@ static void begin_timers(void)
     TCCR0B = 0;
     TIMSK1 = 0;
     TCCR1B = 0;
-    ICR1 = BOARD_PWM_TOP - 1;
+    TCCR1A = _BV(WGM11);
+    TCCR1B = _BV(WGM13) | _BV(WGM12);
+    ICR1 = BOARD_PWM_TOP - 1; /* taken only in a mode that has it as its top */
     OCR1A = 0;
     TCNT1 = 0;
-    TCCR1A = _BV(WGM11);
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);
     TIMSK2 = 0;
     ASSR = 0;
@@ -366,9 +367,16 @@ uint16_t board_alive(void)
     return now;
 }
 
-/* Interrupts wait from the question until the processor sleeps: none that gives work can slip in between. */
+/* Falling asleep starts a conversion by itself while the converter is on: there is no sleep while ticks want theirs at
+ * fixed times. Interrupts wait from the question until the processor sleeps: none that gives work can slip in between. */
 void board_sleep(uint8_t (*pending)(void))
 {
+    uint8_t now = (uint8_t)beats;
+    if (sampling) {
+        while ((uint8_t)beats == now && !pending())
+            ;
+        return;
+    }
     cli();
     if (!pending()) {
         sleep_enable();

@@ -24,16 +24,16 @@
 #define MSG_SELF_TEST_RESULT 0x05 /* to the host: answer to self_test */
 #define MSG_FAULT 0x06 /* to the host: sent once, at once, when the safe state is entered */
 #define MSG_IDENTIFY 0x10 /* to the controller: who are you; any state; the number of the last command is forgotten */
-#define MSG_CONFIGURE 0x11 /* to the controller: sampling; idle only */
+#define MSG_CONFIGURE 0x11 /* to the controller: sampling; idle only; refused where a sample would not fit into the period at 11 us a byte; a new period makes gains invalid */
 #define MSG_LIMITS 0x12 /* to the controller: what the controller holds to, whatever else it is told; idle or sampling */
-#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks). See firmware/amb_daq/control.h */
+#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. See firmware/amb_daq/control.h */
 #define MSG_SETPOINT 0x14 /* to the controller: set point of the position; idle, sampling or levitating; within limits */
 #define MSG_EXCITATION 0x15 /* to the controller: what is added to the pulse width once excite says so; not while it plays */
 #define MSG_TABLE 0x16 /* to the controller: elements of the excitation table; not while it plays */
-#define MSG_EXCITE 0x17 /* to the controller: begin (1) at the next tick, or end (0) the excitation; driving or levitating */
-#define MSG_START 0x18 /* to the controller: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on) */
+#define MSG_EXCITE 0x17 /* to the controller: begin (1) at the next tick, from its first element also while it plays, or end (0) the excitation; driving or levitating */
+#define MSG_START 0x18 /* to the controller: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the first tick whose checks are passed */
 #define MSG_STOP 0x19 /* to the controller: output off and idle; any state but fault, from which only samples stop */
-#define MSG_CLEAR 0x1a /* to the controller: leave the safe state to idle; fault only, and only if its cause is gone */
+#define MSG_CLEAR 0x1a /* to the controller: leave the safe state to idle; fault only, and only if its cause is gone; out_of_gap, host_silent and overrun always are */
 #define MSG_PING 0x1b /* to the controller: the host is there; any state */
 #define MSG_ASK_STATUS 0x1c /* to the controller: answered by status; any state */
 #define MSG_SELF_TEST 0x1d /* to the controller: answered by self_test_result; idle only */
@@ -73,7 +73,7 @@
 #define CAUSE_INTERLOCK 5 /* the interlock loop is open: cable pulled or emergency stop */
 #define CAUSE_LINE_BREAK 6 /* the receive line is held low, or bytes without stop bit: cable cut */
 #define CAUSE_SELF_TEST 7 /* the self-test failed */
-#define CAUSE_WATCHDOG 8 /* the program hung and was restarted */
+#define CAUSE_WATCHDOG 8 /* the program hung and was restarted; told in state idle, until the next fault */
 
 #define CODE_DONE 0 /* carried out */
 #define CODE_UNKNOWN 1 /* no such command */
@@ -92,12 +92,12 @@
 #define KIND_PRBS 2 /* maximum length sequence of a shift register of `length` bits, one bit each `hold` ticks */
 #define KIND_TABLE 3 /* `length` elements of the table, one each `hold` ticks; element 127 is the amplitude */
 
-#define FAILED_PROGRAM 0x01 /* the program memory does not have the digest it was built with */
+#define FAILED_PROGRAM 0x01 /* the program memory does not have the digest that it had at reset */
 #define FAILED_SUPPLY 0x02 /* supply voltage outside 4.5 to 5.5 V */
 #define FAILED_POSITION 0x04 /* position input at an end of its range */
-#define FAILED_CURRENT 0x08 /* current input not at its value at rest */
+#define FAILED_CURRENT 0x08 /* current input, output off: not still within 32 counts, or outside limits where these are known */
 #define FAILED_INTERLOCK 0x10 /* the interlock loop is open */
-#define FAILED_MEMORY 0x20 /* the stack came near its end */
+#define FAILED_MEMORY 0x20 /* the stack came within 48 bytes of its end, or memory does not hold what is written */
 #define FAILED_PULSE_WIDTH 0x40 /* the pulse width modulation does not run as set */
 
 #define READY_CONFIGURE 0x01 /* configure was given */
@@ -237,7 +237,7 @@ struct msg_status {
     uint8_t cause; /* cause of the last fault since clear */
     uint32_t ticks; /* since start */
     uint32_t fault_tick; /* tick of the last fault */
-    uint16_t overruns; /* ticks that came too early, since reset */
+    uint16_t overruns; /* ticks that came too early, and pulse widths that acted a period later than they should, since reset */
     uint16_t dropped; /* frames that found no room in the transmit buffer, since reset */
     uint16_t rx_errors; /* received frames of wrong CRC, length or code, since reset */
     uint16_t rx_lost; /* received bytes that were lost or had no stop bit, since reset */
@@ -352,10 +352,10 @@ static inline uint8_t write_identify(uint8_t *p, uint8_t id)
     return LENGTH_IDENTIFY;
 }
 
-/* configure: sampling; idle only */
+/* configure: sampling; idle only; refused where a sample would not fit into the period at 11 us a byte; a new period makes gains invalid */
 struct msg_configure {
     uint8_t id; /* number of the command */
-    uint16_t period; /* of a tick, in periods of the pulse width modulation */
+    uint16_t period; /* of a tick, in periods of the pulse width modulation; the output is on only with 8 to 20 */
     uint8_t stream; /* mask of what a sample carries; analog inputs 0 and 1 are always converted, 2 only if it is in the mask */
 };
 static inline struct msg_configure read_configure(const uint8_t *p)
@@ -384,9 +384,9 @@ struct msg_limits {
     uint16_t current_high; /* counts; above: over_current */
     uint16_t duty_low; /* least pulse width, counts */
     uint16_t duty_high; /* largest pulse width, counts */
-    uint16_t duty_off; /* pulse width of no voltage, taken in the safe state, counts */
+    uint16_t duty_off; /* pulse width of no voltage, counts: with the output off, and about which drive works without gains */
     uint16_t host_ms; /* longest silence of the host while the output is on, 20 to 2000 ms */
-    uint16_t lift_ms; /* time after start of levitation in which out_of_gap does not count, 0 to 2000 ms */
+    uint16_t lift_ms; /* time after start of drive or levitation in which out_of_gap does not count, 0 to 2000 ms */
 };
 static inline struct msg_limits read_limits(const uint8_t *p)
 {
@@ -419,7 +419,7 @@ static inline uint8_t write_limits(uint8_t *p, uint8_t id, uint16_t position_low
     return LENGTH_LIMITS;
 }
 
-/* gains: position loop; idle, sampling or levitating (changed between two ticks). See firmware/amb_daq/control.h */
+/* gains: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. See firmware/amb_daq/control.h */
 struct msg_gains {
     uint8_t id; /* number of the command */
     int32_t kp; /* 2^-12 counts of pulse width per count of position */
@@ -544,7 +544,7 @@ static inline uint8_t write_table(uint8_t *p, uint8_t id, uint16_t offset, const
     return (uint8_t)(LENGTH_TABLE + n_values);
 }
 
-/* excite: begin (1) at the next tick, or end (0) the excitation; driving or levitating */
+/* excite: begin (1) at the next tick, from its first element also while it plays, or end (0) the excitation; driving or levitating */
 struct msg_excite {
     uint8_t id; /* number of the command */
     uint8_t on; /* 1 or 0 */
@@ -564,7 +564,7 @@ static inline uint8_t write_excite(uint8_t *p, uint8_t id, uint8_t on)
     return LENGTH_EXCITE;
 }
 
-/* start: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on) */
+/* start: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the first tick whose checks are passed */
 struct msg_start {
     uint8_t id; /* number of the command */
     uint8_t mode; /* mode */
@@ -601,7 +601,7 @@ static inline uint8_t write_stop(uint8_t *p, uint8_t id)
     return LENGTH_STOP;
 }
 
-/* clear: leave the safe state to idle; fault only, and only if its cause is gone */
+/* clear: leave the safe state to idle; fault only, and only if its cause is gone; out_of_gap, host_silent and overrun always are */
 struct msg_clear {
     uint8_t id; /* number of the command */
 };

