@@ -116,6 +116,37 @@ def test_strange_entries_of_daq_are_refused(ambid, folder, entry, parts):
     refused(ambid(*SHORT), *parts)
 
 
+OWN = {"m": "0.3", "k_x": "-6702.0", "k_i": "20.1", "R": "6.0", "L": "0.0803"}
+
+
+def rig_with(folder, values, *changes):
+    """Write the prototype's rig with values of its own, and no bench that is named."""
+    text = PROTOTYPE.replace('bench   = "prototype"', "")
+    for name, value in values.items():
+        text = text.replace(f"{name:3} = {{ unit", f"{name:3} = {{ value = {value}, unit")
+    for sound, changed in changes:
+        assert sound in text, sound
+        text = text.replace(sound, changed)
+    (folder / "p.toml").write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("m", "1e-12"), ("k_x", "-1e300"), ("k_i", "1e300"), ("R", "1e300"), ("L", "1e-300")]
+)
+def test_a_plant_beyond_all_numbers_is_refused_or_played(ambid, folder, name, value):
+    rig_with(folder, OWN | {name: value})
+    outcome = ambid(*SHORT)
+    assert outcome.code in (0, 2), outcome.err
+    if outcome.code:
+        refused(outcome, "rig")
+
+
+def test_the_loop_is_checked_on_the_bench_that_is_named(ambid, folder):
+    assert "stability" not in ambid(*SHORT).err
+    (folder / "p.toml").write_text(PROTOTYPE.replace("kd = 92.57", "kd = 9.0"), encoding="utf-8")
+    assert "the loop is unstable on the bench's plant" in ambid(*SHORT, "--force").err
+
+
 @pytest.mark.parametrize("role", ["voltage", "current", "position"])
 def test_a_gain_too_small_for_any_count_is_refused(ambid, folder, role):
     before, after = PROTOTYPE.split(f"[channels.{role}]\n")

@@ -9,8 +9,9 @@ import numpy as np
 
 from ambid.acquire.board import output_rates
 from ambid.acquire.layout import has_position
-from ambid.acquire.scales import scale_of
+from ambid.acquire.scales import scale_of, who
 from ambid.acquire.settings import ControllerSettings, exact_gains, realised
+from ambid.errors import ModelError, RigError
 from ambid.physics.models import model
 from ambid.rig.rig import Rig
 
@@ -31,12 +32,17 @@ def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, f
     settings : ControllerSettings
         Made from it by `ambid.acquire.settings.controller_settings`.
     parameters : Mapping of str to float, optional
-        Plant on which the loop has to be stable, SI; default: the values that the rig gives.
+        Plant that the controller really stands before, SI; default: the values that the rig gives.
 
     Returns
     -------
     tuple of str
         One line each, with its remedy; empty where nothing is to be said.
+
+    Raises
+    ------
+    RigError
+        If the plant is so absurd that its loop has no finite numbers.
     """
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:
@@ -134,20 +140,26 @@ def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, 
     from ambid.simulate import closed_loop_poles
 
     known = {p.name: p.value for p in rig.parameters if p.value is not None}
-    values = known if parameters is None else parameters
-    if len(values) < len(rig.parameters):
-        missing = ", ".join(p.name for p in rig.parameters if p.name not in values)
-        return [f"the loop was not checked on the plant: {missing} has no value. Give what is known of it"]
+    values, whose = (known, "the rig's own") if parameters is None else (parameters, "the bench's")
+    missing = [p.name for p in rig.parameters if p.name not in values]
+    if missing:
+        return [
+            f"the loop could not be checked for stability, as the rig has no value for {', '.join(missing)}. A rough"
+            " value of each is enough"
+        ]
     loop = realised(settings, rig)
-    largest = float(np.abs(closed_loop_poles(values, loop, settings.rate_hz, of=rig.model)[0]))
+    try:
+        largest = float(np.abs(closed_loop_poles(values, loop, settings.rate_hz, of=rig.model)[0]))
+    except ModelError as failure:
+        raise RigError(f"{who(rig)}: on {whose} plant {failure}") from None
     if largest >= 1.0:
         return [
-            f"the loop is unstable on the rig's own plant at {settings.rate_hz:g} Hz with the controller's delay of"
+            f"the loop is unstable on {whose} plant at {settings.rate_hz:g} Hz with the controller's delay of"
             f" {loop.delay:.2g} samples (largest pole {largest:.4f}). Design [loop] for that rate and delay"
         ]
     if largest > 1.0 - 1.0 / _SLOW_PERIODS:
         return [
-            f"the loop hardly damps the rig's plant: a mode takes {-1.0 / math.log(largest) / settings.rate_hz:.2g} s"
+            f"the loop hardly damps {whose} plant: a mode takes {-1.0 / math.log(largest) / settings.rate_hz:.2g} s"
             f" to fall to a third (largest pole {largest:.5f}). Raise loop.kd or loop.ki"
         ]
     return []

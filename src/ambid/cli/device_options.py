@@ -108,16 +108,16 @@ def opened(
     """
     from ambid.acquire.devices.choose import open_device
 
-    for line in _notes(port, rig):
+    behind = _bench(bench)
+    for line in _notes(port, rig, behind):
         typer.echo(f"ambid: note: {line}", err=True)
-    with open_device(
-        port, rig, bench=_bench(bench), pace="real" if pace == "real-time" else "fastest", seed=seed
-    ) as device:
+    with open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
         yield device
 
 
-def _notes(port: str, rig: Rig) -> tuple[str, ...]:
+def _notes(port: str, rig: Rig, bench: Preset | Rig | None) -> tuple[str, ...]:
     """What is made up for a rig, and what its controller will do only roughly."""
+    from ambid.acquire.devices.benches import bench_parameters
     from ambid.acquire.review import review
     from ambid.acquire.settings import controller_settings, default_daq_notes, with_default_daq
 
@@ -126,7 +126,8 @@ def _notes(port: str, rig: Rig) -> tuple[str, ...]:
     invented = port in ("emulated", "simulated")
     complete = with_default_daq(rig) if invented else rig
     made_up = default_daq_notes(rig) if invented else ()
-    return (*made_up, *review(complete, controller_settings(complete)))
+    plant = bench_parameters(rig, bench) if invented else None  # the truth, whatever the rig knows of it
+    return (*made_up, *review(complete, controller_settings(complete), parameters=plant))
 
 
 def _bench(name: str | None) -> Preset | Rig | None:

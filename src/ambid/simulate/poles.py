@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.errors import ModelError
 from ambid.physics.discretise import discretise
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
@@ -80,8 +81,17 @@ def closed_loop_poles(
     -------
     ndarray, shape (n_poles,), complex
         Sorted by falling modulus.
+
+    Raises
+    ------
+    ModelError
+        If the parameters carry the loop beyond the finite numbers.
     """
-    z = closed_loop_matrix(parameters, loop, rate_hz, of=of)
+    with np.errstate(all="ignore"):
+        z = closed_loop_matrix(parameters, loop, rate_hz, of=of)
+    if not np.isfinite(z).all():
+        given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
+        raise ModelError(f"the loop at {rate_hz:g} Hz is beyond all numbers ({given}). Correct the parameters")
     if loop.ki == 0.0:
         keep = np.arange(z.shape[0]) != z.shape[0] - 3
         z = z[np.ix_(keep, keep)]

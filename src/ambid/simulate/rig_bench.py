@@ -114,7 +114,8 @@ def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | Non
     missing = [name for name in values if name not in parameters]
     if missing:
         raise RigError(
-            f"rig {rig.name!r}: {', '.join(missing)} has no value; a simulation needs every parameter. Give value = ..."
+            f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a simulation needs every parameter. Give"
+            " value = ..."
         )
     if closed and (rig.loop is None or not rig.loop.closed):
         raise RigError(f"rig {rig.name!r} has no [loop] with a gain; a closed loop needs one. Add it, or simulate open")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,6 +81,32 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
         limits=truth.limits or Limits(),
         noise=truth.noise or Noise(),
     )
+
+
+def bench_parameters(rig: Rig, bench: Preset | Rig | None) -> Mapping[str, float]:
+    """Return what is known of the linear plant of the bench behind a rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        Of the device.
+    bench : Preset or Rig or None
+        As `bench_of`.
+
+    Returns
+    -------
+    Mapping of str to float
+        SI, under the names of the model's parameters.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such bench.
+    """
+    truth = _named(rig) if bench is None else bench
+    if isinstance(truth, Preset):
+        return truth.parameters
+    return {p.name: p.value for p in truth.parameters if p.value is not None}
 
 
 def _named(rig: Rig) -> Preset | Rig:
