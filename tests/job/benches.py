@@ -83,7 +83,7 @@ limits = { voltage = 1.0, current = 1.0, position = 1e-3 }
 position = 1e-6
 current = 1e-4
 [daq]
-rate_hz = 5000.0
+rate_hz = 2500.0
 """
 """Stable: nothing has to be levitated."""
 

@@ -1,6 +1,7 @@
 """The right size of an excitation, found on the bench itself: trials from small to large, each judged before the next.
 
-An excitation may use a part of the way from rest to the trips of position and current, and most of the voltage.
+An excitation may use a part of the way from rest to the trips of position and current, and most of the voltage. The
+first trial is so small that a bench which is hard to hold stands it; one that was too large is followed by a smaller.
 """
 
 from __future__ import annotations
@@ -9,8 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from ambid.acquire.device import Device, Mode
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
@@ -18,9 +17,11 @@ from ambid.errors import DeviceError
 from ambid.job.look import Array, Look, Room, ended, looking
 from ambid.rig import Rig
 
-_TRIALS, _FIRST, _GROWTH = 6, 0.08, 4.0  # first: as a part of half the voltage; growth: largest step
-_ENOUGH = 0.75  # of what is wished
-_NEAR = 0.85  # of the way to a trip, or of the voltage: no room left
+_TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
+_ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
+_AIM = 0.9  # of that part
+_VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
+_NEAR = 0.85  # of the way to a trip: no room left
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +80,7 @@ def find_amplitude(
     use: float,
     given: float | None = None,
 ) -> Size:
-    """Find the largest excitation that keeps to its part of the room.
+    """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
 
     Parameters
     ----------
@@ -96,18 +97,20 @@ def find_amplitude(
     use : float
         Part of the room.
     given : float, optional
-        A size that is only tried, V.
+        A size that is only tried, V: it may use all but the last 15 % of the way to a trip.
 
     Returns
     -------
     Size
-        With reasons where a trial tripped, or too much was used.
+        That of the last trial; with reasons where it tripped, or used too much. It may use less than its part where
+        trials have run out.
     """
     low, high = room.voltage
     if given is None and not math.isfinite(high - low):
         why = "the rig has no loop.limits.voltage to choose an amplitude from: give one"
         return Size(amplitude_v=math.nan, used=math.nan, findings=(), reasons=(why,))
     size = _FIRST * (high - low) / 2.0 if given is None else given
+    tried: list[tuple[float, float]] = []  # size, and what it used
     findings: list[str] = []
     while True:
         wave = program(
@@ -118,12 +121,16 @@ def find_amplitude(
         if reasons:
             return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
         worst, used = _used(seen, room, resting, use)
+        tried.append((size, used))
         findings.append(f"{size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}")
-        if given is not None or used >= _ENOUGH * use or len(findings) == _TRIALS:
+        larger_or_smaller = _next_size(tried, use) if given is None else None
+        if larger_or_smaller is None:
             break
-        size *= _GROWTH if used <= 0.0 else min(_GROWTH, 0.9 * use / used)
-    too_much = (f"an excitation of {size:.3g} V uses {100.0 * used:.0f} % of the room: give a smaller one",)
-    return Size(amplitude_v=size, used=used, findings=tuple(findings), reasons=too_much if used > _NEAR else ())
+        size = larger_or_smaller
+    return Size(
+        amplitude_v=size, used=used, findings=tuple(findings),
+        reasons=_too_much(tried, worst, _TOO_MUCH * use if given is None else _NEAR),
+    )  # fmt: skip
 
 
 def fitting_amplitude(
@@ -166,13 +173,50 @@ def fitting_amplitude(
     raise DeviceError(f"{device.info.port}: no amplitude was found: {'; '.join(reasons)}. Give --amplitude")
 
 
+def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
+    """Return the size to try next; None where the last one is good, or another would not be better."""
+    size, used = tried[-1]
+    good = _ENOUGH * use <= used <= _TOO_MUCH * use
+    if good or len(tried) == _TRIALS or (used > use and _at_the_floor(tried)):
+        return None
+    wanted = size * (_GROWTH if used <= 0.0 else min(max(_AIM * use / used, 1.0 / _GROWTH), _GROWTH))
+    # Where more is used than in proportion, the good size lies between two that were tried.
+    below = max((s for s, part in tried if part <= use), default=0.0)
+    above = min((s for s, part in tried if part > use), default=math.inf)
+    return wanted if below < wanted < above else math.sqrt(below * above)
+
+
+def _at_the_floor(tried: list[tuple[float, float]]) -> bool:
+    """Whether a smaller size used hardly less: by less than half of what is in proportion."""
+    if len(tried) < 2 or tried[-1][0] >= tried[-2][0]:
+        return False
+    (larger, before), (smaller, now) = tried[-2:]
+    return now / before > (1.0 + smaller / larger) / 2.0
+
+
+def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tuple[str, ...]:
+    """Say that the last trial used more of the room than `most`; nothing where it did not."""
+    size, used = tried[-1]
+    if used <= most:
+        return ()
+    said = f"an excitation of {size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}, {100.0 * most:.0f} % are"
+    if _at_the_floor(tried):
+        return (
+            f"{said} allowed, and a larger one used hardly more: the bench moves by itself; see to noise and gains",
+        )
+    return (f"{said} allowed: give a smaller one",)
+
+
 def _used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
     """Return which quantity uses most of its room, and how much of it."""
     shares = {role: room.used(role, seen[role], resting[role]) for role in room.trips}
     low, high = room.voltage
     if math.isfinite(high - low):
-        reach = float(np.abs(seen["voltage"] - (low + high) / 2.0).max()) / ((high - low) / 2.0)
-        # A voltage that is nearly all used counts like a position at the part that is wished.
-        shares["voltage"] = reach * use / _NEAR
+        volts = seen["voltage"]
+        rest = min(max(float(volts.mean()), low), high)  # an excitation has no mean; what holds the rotor may have one
+        up, down = float(volts.max()) - rest, rest - float(volts.min())
+        reach = max(up / (high - rest) if high > rest else 1.0, down / (rest - low) if rest > low else 1.0)
+        # A voltage that is used as far as it may be counts like a position at the part that is wished.
+        shares["voltage"] = reach * use / _VOLTAGE
     worst = max(shares, key=lambda role: shares[role])
     return worst, shares[worst]
