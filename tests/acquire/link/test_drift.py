@@ -6,11 +6,13 @@ import pytest
 from ambid.acquire.link.drift import ClockDrift
 
 
-def learned(drift, *, seconds=60.0, rate=2000.0, step=20, seed=0, mean=2e-3, stall=None):
-    """Arrivals of every `step`-th sample with exponential latencies."""
+def learned(drift, *, seconds=60.0, rate=2000.0, step=20, seed=0, mean=2e-3, stall=None, grows=None):
+    """Arrivals of every `step`-th sample with exponential latencies; `grows`: 2 ms more after so many seconds."""
     rng, clock = np.random.default_rng(seed), ClockDrift(rate)
     n = np.arange(0, round(seconds * rate), step)
     arrived = 1234.5 + n / rate / (1.0 + drift) + rng.exponential(mean, n.size)
+    if grows is not None:
+        arrived += 2e-3 * np.minimum(n / rate / grows, 1.0)
     if stall is not None:
         held = (n / rate >= stall[0]) & (n / rate < stall[1])
         arrived[held] = np.maximum(arrived[held], arrived[held].max())  # all come together once the host goes on
@@ -42,8 +44,17 @@ def test_the_offset_is_when_sample_0_was_there():
 
 
 def test_little_is_known_after_a_moment_and_it_says_so():
-    assert np.isnan(learned(50e-6, seconds=1.0).drift)
-    assert learned(50e-6, seconds=3.0).drift_sd > learned(50e-6, seconds=30.0).drift_sd
+    assert np.isnan(learned(50e-6, seconds=9.7).drift)
+    assert np.isnan(learned(50e-6, seconds=9.7).drift_sd)
+    assert learned(50e-6, seconds=10.3).drift_sd > learned(50e-6, seconds=30.0).drift_sd
+
+
+@pytest.mark.parametrize("grows", [2.0, 5.0])
+def test_a_latency_that_grows_in_the_first_seconds_is_never_told_as_a_drift(grows):
+    """After five seconds the line through 2 ms in 5 s looked like 400 ppm, with a hundredth of that as deviation."""
+    for seconds in (3.0, 5.0, 8.0, 10.5, 15.0, 30.0):
+        found = learned(50e-6, seconds=seconds, grows=grows, mean=5e-4)
+        assert np.isnan(found.drift) or abs(found.drift - 50e-6) < 4.0 * found.drift_sd, seconds
 
 
 def test_hours_take_the_memory_of_a_minute():

@@ -14,7 +14,8 @@ import numpy as np
 
 _WINDOW_S = 0.25  # at first; doubled whenever the windows are full
 _WINDOWS = 512
-_LEAST = 8  # windows before anything is said
+_LEAST = 40  # windows before anything is said: a latency that grows at first looks like a drift, known very well
+_FITTED = 7  # windows that a line is drawn through, at least
 _OUTLIER = 4.0  # robust standard deviations above the line: a stall of the host
 _ROUNDS = 6
 
@@ -87,7 +88,7 @@ class ClockDrift:
             middle = np.median(rest[keep])
             spread = 1.4826 * np.median(np.abs(rest[keep] - middle))
             now = rest <= middle + _OUTLIER * max(spread, 1e-7)
-            if now.sum() < _LEAST - 1 or (now == keep).all():
+            if now.sum() < _FITTED or (now == keep).all():
                 break
             keep = now
         return self._told(t[keep], late[keep], float(slope), float(level))

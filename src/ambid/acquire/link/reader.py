@@ -26,13 +26,10 @@ class Chunk:
     data : bytes
     arrived_s : float
         When they were there, by `time.perf_counter`, s.
-    after_loss : int
-        Bytes that were dropped before these because the queue was full.
     """
 
     data: bytes
     arrived_s: float
-    after_loss: int = 0
 
 
 class Reader:
@@ -56,7 +53,7 @@ class Reader:
     def __init__(self, port: Port, *, room: int = _ROOM) -> None:
         self._port, self._room = port, room
         self._chunks: deque[Chunk] = deque()
-        self._held = self._dropped = 0
+        self._held = 0
         self.overruns = self.overrun_bytes = 0
         self.failure: OSError | None = None
         self._stopping = False
@@ -117,11 +114,9 @@ class Reader:
     def _put(self, data: bytes, arrived_s: float) -> None:
         with self._news:
             if self._held + len(data) > self._room:
-                self._dropped += len(data)
                 self.overruns += 1
                 self.overrun_bytes += len(data)
                 return
-            self._chunks.append(Chunk(data=data, arrived_s=arrived_s, after_loss=self._dropped))
+            self._chunks.append(Chunk(data=data, arrived_s=arrived_s))
             self._held += len(data)
-            self._dropped = 0
             self._news.notify_all()
