@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.identify.narmax import PolynomialNarmax, narmax
+from ambid.identify.narmax import Factor, PolynomialNarmax, narmax
+from ambid.identify.narmax.model import Cloud
+from ambid.identify.narmax.recursion import predicted, sensitivities
 from tests.identify.narmax.systems import TRUTH, coefficients, polynomial, rational, record
 
 
@@ -174,6 +176,29 @@ def test_a_sign_that_the_sensor_does_not_see_is_found() -> None:
         narmax([record(u, x)], {"output": "magnitude"})
     with pytest.raises(EstimationError, match="focus"):
         narmax([data], {"output": "magnitude", "focus": "prediction"})
+
+
+def test_slopes_of_magnitudes_are_exact() -> None:
+    rng = np.random.default_rng(7)
+    u = np.repeat(rng.choice([-1.0, 1.0], 30), 8)[:, None]
+    y = np.abs(rng.standard_normal((240, 1)))
+    zero = np.zeros(2)
+    for output in ("magnitude", "mean magnitude"):
+        model = PolynomialNarmax(
+            dt=1.0, n_inputs=1, numerators=(((Factor("y", 0, 1),), (Factor("y", 0, 2),) * 3, (Factor("u", 0, 1),)),),
+            denominators=((),), theta=np.array([0.7, -0.02, 0.4]), u_level=zero[:1], u_scale=np.ones(1),
+            y_level=zero[:1], y_scale=np.ones(1), cloud=Cloud(mean=np.zeros(3), whitening=np.eye(3)), output=output,
+        )  # fmt: skip
+        t, theta = model.tables, model.theta
+        for free in (False, True):
+            out, z = predicted(t, theta, y, u, free=free)
+            assert np.nanmin(out) >= 0
+            S = sensitivities(t, theta, z, free=free)
+            for k in range(3):
+                h = np.zeros(3)
+                h[k] = 1e-7
+                slope = predicted(t, theta + h, y, u, free=free)[0] - predicted(t, theta - h, y, u, free=free)[0]
+                np.testing.assert_allclose(S[t.lag :, :, k], slope[t.lag :] / 2e-7, atol=1e-6)
 
 
 def test_levels_are_taken_off_only_where_signals_stand_far_from_zero() -> None:

@@ -26,7 +26,8 @@ def run(
     `place` (n_terms, 2) holds output and 1 for the denominator. Predicts from the measured outputs and writes
     innovations into z, or with `free` writes its own outputs into z. `out` (n_samples, n_outputs) is NaN where nothing
     is predicted, and from where the recursion diverges on. With `folded` only the magnitude of the output is measured:
-    it gets the sign that is predicted, and `out` is the magnitude of the prediction.
+    it gets the sign that is predicted, and `out` is the magnitude of the prediction; with 2 it is the mean of this
+    magnitude and that of the output before.
     """
     lag, n_y, n_u, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, n_e = z.shape[0], n_y + n_u
@@ -54,11 +55,15 @@ def run(
             if recursive and not abs(x) < _FAR:
                 out[t:, :] = np.nan
                 return
-            out[t, o] = abs(x) if folded == 1 else x
+            out[t, o] = x
+            if folded == 1:
+                out[t, o] = abs(x)
+            elif folded == 2:
+                out[t, o] = 0.5 * (abs(x) + abs(z[t - 1, o]))
             if free == 1:
                 z[t, o] = x
             else:
-                if folded == 1:
+                if folded > 0:
                     z[t, o] = np.copysign(z[t, o], x)
                 z[t, n_e + o] = z[t, o] - x
 
@@ -126,9 +131,13 @@ def slopes(
                     if a != 0.0:
                         for k in range(n_k):
                             out[t, o, k] += a * out[t - back[v], source, k]
-    if shape[4] == 1:
-        for t in range(lag, n):
+    if shape[4] > 0:
+        share = 1.0 if shape[4] == 1 else 0.5
+        for t in range(n - 1, lag - 1, -1):  # backwards, for the slope before is needed as it is
             for o in range(n_y):
-                if np.copysign(1.0, z[t, o]) < 0:
-                    for k in range(n_k):
-                        out[t, o, k] = -out[t, o, k]
+                now = share * np.copysign(1.0, z[t, o])
+                before = 0.5 * np.copysign(1.0, z[t - 1, o]) if shape[4] == 2 and free == 1 and t > lag else 0.0
+                for k in range(n_k):
+                    out[t, o, k] *= now
+                    if before != 0.0:
+                        out[t, o, k] += before * out[t - 1, o, k]

@@ -36,8 +36,8 @@ class Draft:
         Of one output, at most.
     passes : int
         Over the data, in the choice of process terms.
-    folded : bool
-        Whether only the magnitude of the output is measured.
+    folded : int
+        As in `recursion.Tables`.
     """
 
     numerators: tuple[tuple[Term, ...], ...]
@@ -47,7 +47,7 @@ class Draft:
     err: dict[tuple[int, Term], float] = field(default_factory=dict)
     n_candidates: int = 0
     passes: int = 0
-    folded: bool = False
+    folded: int = 0
 
     @property
     def tables(self) -> Tables:

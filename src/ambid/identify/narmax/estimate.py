@@ -115,10 +115,10 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
 
 
 def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
-    if s.output != "magnitude":
+    if s.output == "signed":
         return
     if (records[0].n_inputs, records[0].n_outputs) != (1, 1):
-        raise EstimationError("narmax: output = magnitude is for one input and one output. Choose one of each")
+        raise EstimationError(f"narmax: output = {s.output} is for one input and one output. Choose one of each")
     for r, x in enumerate(records):
         if np.min(x.y) < 0:
             raise EstimationError(

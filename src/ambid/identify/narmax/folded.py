@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ambid.identify.narmax.choose import Draft
+from ambid.identify.narmax.model import OUTPUTS
 from ambid.identify.narmax.search import search
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Factor, Term
@@ -51,7 +52,7 @@ def linear_folded(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
     for start in _starts(order, delays, parts):
         if tick is not None:
             tick("sign of the output")
-        draft = Draft(numerators=(terms,), denominators=((),), theta=start, n_inputs=1, folded=True)
+        draft = Draft(numerators=(terms,), denominators=((),), theta=start, n_inputs=1, folded=OUTPUTS.index(s.output))
         found = search(draft.tables, start, parts, one, free=True, most=30)
         if best is None or found.cost < least:
             best, least = draft.with_theta(found.theta), found.cost

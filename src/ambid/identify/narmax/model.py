@@ -18,6 +18,8 @@ from ambid.identify.narmax.terms import Term, term_from_json, term_name, term_to
 
 Array = NDArray[np.float64]
 
+OUTPUTS = ("signed", "magnitude", "mean magnitude")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cloud:
@@ -54,9 +56,11 @@ class PolynomialNarmax:
     y_level, y_scale : ndarray, shape (n_outputs,), SI
     cloud : Cloud
         Of the lagged inputs and outputs in training.
-    magnitude : bool
-        Whether the outputs are magnitudes of what the equation describes. Past outputs get the sign that was predicted
-        for them, the first ones that to which the linear part is driven by the first inputs.
+    output : {"signed", "magnitude", "mean magnitude"}
+        Whether the outputs are those of the equation, their magnitudes, or the mean of the magnitudes now and one
+        sample ago, as a counter gives it. Past outputs get the sign that was predicted for them, the first ones that
+        to which the linear part is driven by the first inputs; a one-step prediction takes the measured mean for the
+        magnitude itself.
     """
 
     dt: float
@@ -69,7 +73,7 @@ class PolynomialNarmax:
     y_level: Array
     y_scale: Array
     cloud: Cloud
-    magnitude: bool = False
+    output: str = "signed"
 
     @property
     def kind(self) -> str:
@@ -84,7 +88,7 @@ class PolynomialNarmax:
     @cached_property
     def tables(self) -> Tables:
         """The terms as the compiled recursions want them."""
-        return tables(self.numerators, self.denominators, self.n_inputs, folded=self.magnitude)
+        return tables(self.numerators, self.denominators, self.n_inputs, folded=OUTPUTS.index(self.output))
 
     @property
     def lag(self) -> int:
@@ -239,7 +243,7 @@ class PolynomialNarmax:
         return {
             "dt_s": self.dt,
             "n_inputs": self.n_inputs,
-            "magnitude": self.magnitude,
+            "output": self.output,
             "numerators": [[term_to_json(x) for x in terms] for terms in self.numerators],
             "denominators": [[term_to_json(x) for x in terms] for terms in self.denominators],
             **arrays,
@@ -296,8 +300,8 @@ def _read(found: dict[str, Any]) -> dict[str, Any]:
     )
     if len(den) != n_y or np.any(used.column >= 2 * n_y + n_u):
         raise ValueError("terms name channels that the model does not have")
-    if not isinstance(found["magnitude"], bool):
-        raise ValueError("magnitude is neither true nor false")
+    if found["output"] not in OUTPUTS:
+        raise ValueError(f"output is none of {', '.join(OUTPUTS)}")
     dt = float(found["dt_s"])
     return {
         "dt": dt,
@@ -305,7 +309,7 @@ def _read(found: dict[str, Any]) -> dict[str, Any]:
         "numerators": num,
         "denominators": den,
         "cloud": cloud,
-        "magnitude": found["magnitude"],
+        "output": found["output"],
         **arrays,
     }
 

@@ -29,8 +29,8 @@ class Tables:
         Output, and 1 for a term of the denominator.
     noisy : bool
         Whether a term holds innovations.
-    folded : bool
-        Whether only the magnitude of the outputs is measured.
+    folded : int
+        1 where only the magnitude of the outputs is measured, 2 where it is its mean over a sampling interval.
     """
 
     n_outputs: int
@@ -41,7 +41,7 @@ class Tables:
     terms: Table
     place: Table
     noisy: bool
-    folded: bool = False
+    folded: int = 0
 
     def shape(self, free: bool) -> Table:
         """Return what the recursions are told beside the tables.
@@ -55,11 +55,11 @@ class Tables:
         -------
         ndarray of int, shape (5,)
         """
-        return np.array([self.lag, self.n_outputs, self.n_inputs, int(free), int(self.folded)], dtype=np.int64)
+        return np.array([self.lag, self.n_outputs, self.n_inputs, int(free), self.folded], dtype=np.int64)
 
 
 def tables(
-    numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int, *, folded: bool = False
+    numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int, *, folded: int = 0
 ) -> Tables:
     """Return the tables of a model; coefficients stand output by output, numerator before denominator.
 
@@ -68,8 +68,8 @@ def tables(
     numerators, denominators : sequence of sequence of Term
         By output.
     n_inputs : int
-    folded : bool, optional
-        Whether only the magnitude of the outputs is measured.
+    folded : int, optional
+        As in `Tables`.
 
     Returns
     -------
@@ -91,7 +91,7 @@ def tables(
     return Tables(
         n_outputs=n_y,
         n_inputs=n_inputs,
-        lag=max((f.lag for f in factors), default=0),
+        lag=max((f.lag for f in factors), default=0) or int(folded == 2),
         column=np.array([first[f.kind] + f.channel for f in factors], dtype=np.int64),
         back=np.array([f.lag for f in factors], dtype=np.int64),
         terms=numbers,

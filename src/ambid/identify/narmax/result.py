@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.narmax.choose import Draft
-from ambid.identify.narmax.model import PolynomialNarmax, cloud_of, lagged_signals
+from ambid.identify.narmax.model import OUTPUTS, PolynomialNarmax, cloud_of, lagged_signals
 from ambid.identify.narmax.recursion import predicted, sensitivities
 from ambid.identify.narmax.scaled import Scaled
 from ambid.identify.narmax.search import BLIND, evaluated, triangle
@@ -140,7 +140,7 @@ def _model(records: Sequence[IOData], scaled: Scaled, draft: Draft) -> Polynomia
         y_level=scaled.y_level,
         y_scale=scaled.y_scale,
         cloud=cloud_of([lagged_signals(t, predicted(t, draft.theta, y, u)[1]) for y, u in scaled.parts]),
-        magnitude=draft.folded,
+        output=OUTPUTS[draft.folded],
     )
     return model.with_theta(draft.theta * model.unit)
 

@@ -15,7 +15,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "selection": ("frols", "simulation", "all"),
     "focus": ("prediction", "simulation"),
     "levels": ("auto", "zero", "mean"),
-    "output": ("signed", "magnitude"),
+    "output": ("signed", "magnitude", "mean magnitude"),
     "symmetry": ("none", "odd"),
 }
 _RANGES: Mapping[str, tuple[int, int]] = {
@@ -106,7 +106,7 @@ def narmax_settings(given: Mapping[str, object], *, n_inputs: int) -> NarmaxSett
             raise EstimationError(
                 f"narmax: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, known)}"
             )
-    if given.get("output") == "magnitude":
+    if given.get("output", "signed") != "signed":
         given = {**_for_magnitude(given)}
     s = NarmaxSettings(**{**given, **({} if n_inputs else {"nu": 0, "nk": 1})})  # type: ignore[arg-type]
     if not s.ny and not s.nu:
@@ -128,5 +128,5 @@ def _for_magnitude(given: Mapping[str, object]) -> Mapping[str, object]:
     """A sign that is not measured is found by simulation: what that needs is set, and anything else refused."""
     for name, value in _WITH_MAGNITUDE.items():
         if given.get(name, value) != value:
-            raise EstimationError(f"narmax: output = magnitude needs {name} = {value}; it is {given[name]!r}")
+            raise EstimationError(f"narmax: output = {given['output']} needs {name} = {value}; it is {given[name]!r}")
     return {**_WITH_MAGNITUDE, **given}

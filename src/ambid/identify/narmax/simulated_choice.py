@@ -88,7 +88,7 @@ def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep
 
 def _start(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
     """A linear model by simulation errors."""
-    if s.output == "magnitude":
+    if s.output != "signed":
         return linear_folded(s, parts, tick)
     draft = process_terms(replace(s, degree=1, selection="all", ne=0), parts, None)
     return _searched(draft, parts)

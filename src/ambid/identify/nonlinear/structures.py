@@ -68,7 +68,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
             "selection": "frols, simulation (by what terms do for the free run), all (every candidate); frols",
             "focus": "prediction or simulation: which errors the coefficients make small at last; prediction",
             "levels": "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
-            "output": "signed, or magnitude where the sensor does not see the sign; signed",
+            "output": "magnitude, or mean magnitude (over a sample), where the sensor sees no sign; signed",
             "symmetry": "odd where the plant is the same the other way round: terms of odd degree alone; none",
         },
         home="ambid.identify.narmax.estimate:narmax",
