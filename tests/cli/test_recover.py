@@ -1,5 +1,8 @@
 """``ambid recover``: what a recording that could not finish has left becomes a record, and what is missing is said."""
 
+import gzip
+
+import h5py
 import numpy as np
 import pytest
 
@@ -87,6 +90,93 @@ def test_a_record_that_exists_is_written_over_only_with_force(left, ambid):
     assert (left / "run.h5").read_text() == "precious"
     assert ambid("recover", "run.h5.journal", "--force").code == 0
     assert len(values_of("run.h5")) == BLOCKS * ROWS
+
+
+@pytest.mark.parametrize("name", ["run.h5", "run.csv", "run.csv.gz"])
+def test_a_record_that_holds_the_journal_is_said_to_and_the_journal_goes(left, ambid, name):
+    """As after a power cut between the two: the record has its name, the journal is not removed yet."""
+    ambid("recover", "run.h5.journal", "-o", name)
+    before = (left / name).read_bytes()
+    found = ambid("recover", "run.h5.journal", "-o", name)
+    assert (found.code, found.err) == (0, "")
+    said = f"{name} holds that already: nothing is to be done. run.h5.journal"
+    assert found.out.splitlines()[1] == f"{said} is kept; --delete removes it"
+    found = ambid("recover", "run.h5.journal", "-o", name, "--delete")
+    assert (found.code, found.err) == (0, "")
+    assert found.out.splitlines()[1] == f"{said} removed"
+    assert [p.name for p in left.iterdir()] == [name]
+    assert (left / name).read_bytes() == before
+
+
+def changed_value(path):
+    with h5py.File(path, "r+") as file:
+        file["channels/1"][7] += 1.0
+
+
+def changed_name(path):
+    with h5py.File(path, "r+") as file:
+        file["channels/1"].attrs["name"] = "other"
+
+
+def changed_start(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["start_s"] = 1.0
+
+
+def changed_rate(path):
+    with h5py.File(path, "r+") as file:
+        file.attrs["rate_hz"] = 1.0
+
+
+def changed_events(path):
+    with h5py.File(path, "r+") as file:
+        text = file["acquisition"].asstr()[()]
+        del file["acquisition"]
+        file["acquisition"] = text.replace('"events": [', '"events": [1')
+
+
+def a_column_more(path):
+    with h5py.File(path, "r+") as file:
+        n = len(file["channels"])
+        file.copy("channels/0", file["channels"], str(n))
+
+
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.mark.parametrize(
+    "change", [changed_value, changed_name, changed_start, changed_rate, changed_events, a_column_more, cut_off]
+)
+def test_a_record_that_holds_anything_else_keeps_the_journal(left, ambid, change):
+    ambid("recover", "run.h5.journal")
+    change(left / "run.h5")
+    before = (left / "run.h5").read_bytes()
+    found = ambid("recover", "run.h5.journal", "--delete")
+    assert (found.code, found.out) == (2, "")
+    assert "run.h5 exists already" in found.err
+    assert (left / "run.h5.journal").exists()
+    assert (left / "run.h5").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.csv.gz"])
+def test_a_text_with_another_digit_keeps_the_journal(left, ambid, name):
+    ambid("recover", "run.h5.journal", "-o", "run.csv")
+    text = (left / "run.csv").read_text()
+    other = text[:-3] + ("1" if text[-3] != "1" else "2") + text[-2:]
+    (left / name).write_bytes(gzip.compress(other.encode()) if name.endswith(".gz") else other.encode())
+    assert ambid("recover", "run.h5.journal", "-o", name, "--delete").code == 2
+    assert (left / "run.h5.journal").exists()
+
+
+def test_a_damaged_journal_stays_although_the_record_holds_what_is_left_of_it(left, ambid):
+    damaged(left)
+    ambid("recover", "run.h5.journal")
+    found = ambid("recover", "run.h5.journal", "--delete")
+    assert found.code == 0
+    assert "run.h5 holds that already with 1 block damaged" in found.out
+    assert "is kept: not all of it is in the record" in found.out
+    assert (left / "run.h5.journal").exists()
 
 
 def test_another_name_and_another_format(left, ambid):

@@ -36,7 +36,8 @@ def command(
     """Make the record of a recording that was killed or whose power was cut, from the journal that it left.
 
     Every block that the recorder had acknowledged comes back; what is damaged or missing is counted, and becomes rows
-    without values, which --gaps of the other verbs treats.
+    without values, which --gaps of the other verbs treats. A record that is there is left as it is: where it holds
+    just what the journal does, that is said, and --delete removes the journal.
     """
     if output is not None and len(journals) > 1:
         raise AmbidError(
@@ -59,7 +60,7 @@ def command(
 
 def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -> bool:
     """Make the record of one journal, say what was found, and return whether nothing of it was damaged."""
-    from ambid.acquire.recorder import JournalReader, record_path, recorded_from
+    from ambid.acquire.recorder import JournalReader, record_path, recorded_already, recorded_from
     from ambid.acquire.recorder.disk import sync_folder
     from ambid.errors import DeviceError
 
@@ -68,7 +69,8 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
     path = record_path(journal) if output is None else output
     Outputs(journal).claim(path, "-o")
     with JournalReader.open(journal) as reader, progress("recover"):
-        made = recorded_from(reader, path, force=force)
+        there = recorded_already(reader, path) if path.exists() and not force else None
+        made = there or recorded_from(reader, path, force=force)
         if made is None:
             raise DeviceError(f"journal {journal} holds no sound block: nothing was acknowledged. Remove it")
         gone = delete and not made.keep_journal
@@ -76,7 +78,8 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
             journal.unlink()
             sync_folder(journal)
     typer.echo(f"{journal}: {_found(made)}")
-    typer.echo(f"{path} written{_lacks(made)}.{_fate(journal, delete=delete, gone=gone)}")
+    done = f"written{_lacks(made)}" if there is None else f"holds that already{_lacks(made)}: nothing is to be done"
+    typer.echo(f"{path} {done}.{_fate(journal, delete=delete, gone=gone)}")
     return not made.keep_journal
 
 

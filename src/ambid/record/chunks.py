@@ -61,6 +61,37 @@ def write_chunks(
         raise RecordError(f"{path} cannot be written: {why}. Check folder and disk") from failure
 
 
+def check_chunks(
+    record: Record, n_samples: int, chunks: Iterable[Array], path: str | Path, texts: Mapping[str, str]
+) -> None:
+    """Hold a file against a record whose values come in pieces: whether it is what `write_chunks` would write.
+
+    Parameters
+    ----------
+    record, n_samples, chunks, path, texts
+        As `write_chunks` takes them. History and provenance are not looked at.
+
+    Raises
+    ------
+    RecordError
+        If the file holds anything else, cannot be read, or the pieces are more or fewer than announced.
+    """
+    path = Path(path)
+    pieces = _counted(chunks, n_samples)
+    if path.name.lower().endswith((".csv", ".csv.gz")):
+        found = 0
+        for text in _csv_texts(record, pieces):
+            found = crc32(text, found)
+        _check_csv(path, found)
+        return
+    _check_hdf5_head(path, record, texts)
+    sums = [0] * len(record.channels)
+    for values in pieces:
+        for k in range(len(sums)):
+            sums[k] = crc32(np.ascontiguousarray(values[:, k]).tobytes(), sums[k])
+    _check_hdf5(path, n_samples, sums)
+
+
 def _counted(chunks: Iterable[Array], n_samples: int) -> Iterator[Array]:
     """Pass on what comes, and refuse more or fewer samples than announced."""
     got = 0
@@ -110,25 +141,49 @@ def _check_hdf5(path: Path, n_samples: int, sums: list[int]) -> None:
         raise _unlike(path) from failure
 
 
+def _check_hdf5_head(path: Path, record: Record, texts: Mapping[str, str]) -> None:
+    import h5py
+
+    wanted = [(c.name, c.unit, c.source_unit) for c in record.channels]
+    try:
+        with h5py.File(path, "r") as file:
+            channels = [file["channels"][str(k)].attrs for k in range(len(file["channels"]))]
+            found = [(a["name"], a["unit"], a["source_unit"]) for a in channels]
+            same = found == wanted and (file.attrs["rate_hz"], file.attrs["start_s"]) == (
+                record.rate_hz,
+                record.start_s,
+            )
+            same = same and all(file[name].asstr()[()] == text for name, text in texts.items())
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError) as failure:
+        raise _unlike(path) from failure
+    if not same:
+        raise _unlike(path)
+
+
 def _write_csv(
     record: Record, n_samples: int, chunks: Iterable[Array], path: Path, texts: Mapping[str, str]
 ) -> Callable[[], None]:
     del n_samples, texts
-    found, at = 0, 0
+    found = 0
     with _text_file(path, "w") as file:
-
-        def put(lines: list[str]) -> None:
-            nonlocal found
-            data = ("\n".join(lines) + "\n").encode()
+        for data in _csv_texts(record, chunks):
             file.write(data)
             found = crc32(data, found)
-
-        put(head_lines(record))
-        for values in chunks:
-            time = record.start_s + np.arange(at, at + len(values)) / record.rate_hz
-            put([_row(t, row) for t, row in zip(time.tolist(), values.tolist(), strict=True)])
-            at += len(values)
     return lambda: _check_csv(path, found)
+
+
+def _csv_texts(record: Record, chunks: Iterable[Array]) -> Iterator[bytes]:
+    """Yield the text of a CSV file, piece by piece."""
+    yield _lines(head_lines(record))
+    at = 0
+    for values in chunks:
+        time = record.start_s + np.arange(at, at + len(values)) / record.rate_hz
+        yield _lines([_row(t, row) for t, row in zip(time.tolist(), values.tolist(), strict=True)])
+        at += len(values)
+
+
+def _lines(lines: list[str]) -> bytes:
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _row(time: float, row: list[float]) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from ambid.acquire.recorder.convert import Recorded, Survey, read_acquisition, recorded_from, survey
+from ambid.acquire.recorder.convert import Recorded, read_acquisition, recorded_already, recorded_from
 from ambid.acquire.recorder.header import Event, JournalHeader, journal_path, record_path
 from ambid.acquire.recorder.reader import Damage, JournalReader
 from ambid.acquire.recorder.recorder import Recorder
+from ambid.acquire.recorder.survey import Survey, survey
 
 __all__ = [
     "Damage",
@@ -18,6 +19,7 @@ __all__ = [
     "journal_path",
     "read_acquisition",
     "record_path",
+    "recorded_already",
     "recorded_from",
     "survey",
 ]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,9 +18,10 @@ import numpy as np
 
 from ambid.acquire.recorder.disk import sync_folder
 from ambid.acquire.recorder.header import Event, JournalHeader
-from ambid.acquire.recorder.reader import Damage, JournalReader
+from ambid.acquire.recorder.reader import JournalReader
+from ambid.acquire.recorder.survey import Survey, survey
 from ambid.errors import DeviceError, RecordError
-from ambid.record.chunks import write_chunks
+from ambid.record.chunks import check_chunks, write_chunks
 from ambid.record.csv_format import head_lines
 from ambid.record.record import Array, Channel, Record, Step
 from ambid.track.stream.block import Block
@@ -30,46 +31,6 @@ FORMATS = (".h5", ".hdf5", ".csv", ".csv.gz")
 _ROWS = 1 << 16  # that are held at once
 _GAP_ROWS = 10_000_000  # of NaN, that are always allowed
 _GAP_SHARE = 10  # and so many times the samples
-
-
-@dataclass(slots=True, kw_only=True)
-class Survey:
-    """What a journal holds.
-
-    Attributes
-    ----------
-    blocks, samples : int
-        Blocks, and rows of them that have a place in the record.
-    first, end : int
-        Number of the first sample, and of the one behind the last.
-    start_s : float
-        Time of the first sample, s.
-    gaps, gap_samples : int
-        Places where samples are missing, and how many.
-    misplaced : int
-        Rows whose numbers were there before.
-    stamp_error_s : float
-        Largest difference between a block's time and that of its number at the rate of the header, s.
-    events : list of Event
-    damage : Damage
-    """
-
-    blocks: int = 0
-    samples: int = 0
-    first: int = 0
-    end: int = 0
-    start_s: float = 0.0
-    gaps: int = 0
-    gap_samples: int = 0
-    misplaced: int = 0
-    stamp_error_s: float = 0.0
-    events: list[Event] = field(default_factory=list)
-    damage: Damage = field(default_factory=Damage)
-
-    @property
-    def rows(self) -> int:
-        """Rows of the record, those of NaN included."""
-        return self.end - self.first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,42 +87,6 @@ def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
             raise DeviceError(str(failure)) from None
 
 
-def survey(reader: JournalReader) -> Survey:
-    """Look through a journal.
-
-    Parameters
-    ----------
-    reader : JournalReader
-
-    Returns
-    -------
-    Survey
-    """
-    found = Survey()
-    rate = reader.header.rate_hz
-    for item in reader.items():
-        if isinstance(item, Event):
-            found.events.append(item)
-            continue
-        n = len(item.values)
-        if found.blocks == 0:
-            found.first = found.end = item.first
-            found.start_s = item.time_s if np.isfinite(item.time_s) else item.first / rate
-        found.blocks += 1
-        if item.first > found.end:
-            found.gaps += 1
-            found.gap_samples += item.first - found.end
-        old = min(max(found.end - item.first, 0), n)
-        found.misplaced += old
-        found.samples += n - old
-        found.end = max(found.end, item.first + n)
-        if not old and np.isfinite(item.time_s):
-            due = found.start_s + (item.first - found.first) / rate
-            found.stamp_error_s = max(found.stamp_error_s, abs(item.time_s - due))
-    found.damage = reader.damage
-    return found
-
-
 def recorded_from(
     reader: JournalReader,
     path: Path,
@@ -200,12 +125,11 @@ def recorded_from(
     _check_gaps(found, reader.path)
     check_target(path, reader.header, force=force)
     record = _record(reader.header, found, extra)
-    acquisition = {"header": reader.header.as_json(), "events": [asdict(e) for e in found.events]}
     # Named after the journal, which is locked: what a killed conversion leaves is written over by the next one.
     beside = path.with_name(f".{reader.path.name}-{path.name}")
     try:
         rows = _rows(reader, found, progress)
-        check = write_chunks(record, found.rows, rows, beside, {"acquisition": json.dumps(acquisition)})
+        check = write_chunks(record, found.rows, rows, beside, _texts(reader.header, found))
         _sync_file(beside)
         check()
         _put_in_place(beside, path, force=force)
@@ -215,6 +139,32 @@ def recorded_from(
                           ) from None  # fmt: skip
     finally:
         beside.unlink(missing_ok=True)
+    return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
+
+
+def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
+    """Hold a record that is there against a journal: the power may have gone after the one and before the other's end.
+
+    Parameters
+    ----------
+    reader : JournalReader
+    path : Path
+        Of the record.
+
+    Returns
+    -------
+    Recorded or None
+        None unless the record reads back as every value, column and event that the journal gives.
+    """
+    found = survey(reader)
+    if not found.samples or not path.is_file() or not path.name.lower().endswith(FORMATS):
+        return None
+    try:
+        _check_gaps(found, reader.path)
+        record = _record(reader.header, found, {})
+        check_chunks(record, found.rows, _rows(reader, found, None), path, _texts(reader.header, found))
+    except (RecordError, DeviceError):
+        return None
     return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
 
 
@@ -246,6 +196,11 @@ def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[Event, ...]
     except (OSError, KeyError, ValueError) as failure:
         raise DeviceError(f"{path} holds no acquisition ({failure}). Name a file that a recorder wrote") from None
     return JournalHeader.from_json(found["header"]), tuple(Event(**e) for e in found["events"])
+
+
+def _texts(header: JournalHeader, found: Survey) -> dict[str, str]:
+    """What a recorded HDF5 file holds beside its record."""
+    return {"acquisition": json.dumps({"header": header.as_json(), "events": [asdict(e) for e in found.events]})}
 
 
 def _record(header: JournalHeader, found: Survey, extra: Mapping[str, object]) -> Record:
