@@ -82,6 +82,7 @@ def _table(opened: Bench) -> Table:
             "Polynomial NARX of degree 3, lags to 5, 286 candidates, Akaike's criterion over 50 terms for both; making"
             " the candidates is within the time. Same terms: those of the peer, one for one in the order of choice."
         ),
+        remarks=("The peer ends where the criterion rises for the first time, ambid where it is least.",),
         data={"cases": data},
     )
 
