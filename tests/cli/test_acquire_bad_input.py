@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from contextlib import suppress
 from importlib.resources import files
 from io import FileIO
@@ -88,6 +89,68 @@ def test_a_record_is_not_replayed_onto_itself(ambid, folder):
     words = ("acquire", "--port", "replay:a.h5", "--rig", "p.toml", "-o", "./a.h5", "--force", "--seconds", "0.02")
     refused(ambid(*words), "is also read; writing would destroy it")
     assert (folder / "a.h5").read_bytes() == before
+
+
+def replayed(folder, change=None):
+    """Write a record of 100 rows in counts, and return the words that replay it."""
+    rows = [f"{k / 2000:.4f},512.0,{510 + k % 3}.0,{400 + k % 7}.0\n" for k in range(100)]
+    text = "time [s],position [1],current [1],duty [1]\n" + "".join(rows if change is None else change(rows))
+    (folder / "r.csv").write_text(text, encoding="utf-8")
+    return ("acquire", "--port", "replay:r.csv", "--rig", "p.toml", "-o", "a.h5", "--seconds", "0.05")
+
+
+def test_a_record_in_other_units_than_the_rigs_is_not_replayed(ambid, folder):
+    words = replayed(folder)
+    text = (folder / "r.csv").read_text(encoding="utf-8")
+    (folder / "r.csv").write_text(text.replace("duty [1]", "duty [V]"), encoding="utf-8")
+    refused(ambid(*words), "column 'duty' is in [V]", "takes [1], counts")
+    assert not (folder / "a.h5").exists()
+
+
+def test_a_record_of_another_rate_than_the_rigs_is_told(ambid, folder):
+    words = replayed(folder)
+    assert "taken at" not in ambid(*words).err
+    (folder / "p.toml").write_text(PROTOTYPE.replace("rate_hz = 2000.0", "rate_hz = 1000.0"), encoding="utf-8")
+    done = ambid(*words, "--force")
+    assert done.code == 0
+    assert "r.csv was taken at 2000 Hz, which it keeps; the rig says 1000 Hz" in done.err
+
+
+def test_a_journal_that_is_kept_is_told_and_a_replay_is_not_called_a_device(ambid, folder):
+    words = replayed(folder, lambda rows: rows[:60] + rows[20:60])
+    done = ambid(*words)
+    assert done.code == 0
+    assert (folder / "a.h5.journal").exists()
+    assert "note: a.h5.journal is kept: it holds 40 samples" in done.err
+    assert "ambid recover a.h5.journal" in done.err
+    assert "a.h5: 60 samples" in done.out
+    assert "the record that is replayed runs back" in " ".join(done.out.split())
+    assert "Restart" not in done.out
+
+
+def test_a_replay_that_is_over_before_it_has_settled_is_told(ambid, folder):
+    refused(ambid(*replayed(folder), "--settle", "100"), "ended after 0.05 s, within the 100 s of --settle")
+
+
+def test_values_too_large_for_sums_are_judged(ambid, folder):
+    words = replayed(folder, lambda rows: [row.replace(",512.0,", ",1e300,") for row in rows])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = ambid(*words)
+    assert done.code == 0, done.err
+    assert "position goes from 1e+300 to 1e+300: too large" in " ".join(done.out.split())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell limits the size of files")
+def test_a_full_disk_is_told_once_and_in_the_end_what_is_kept(folder):
+    program = [sys.executable, "-c", "from ambid.cli import main; main()", *SHORT, "--seconds", "4"]
+    told = ["sh", "-c", 'ulimit -f 60; exec "$0" "$@"', *program]
+    done = subprocess.run(told, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    first, last = (line for line in done.stderr.splitlines() if "note" not in line)
+    assert "largest size" in first
+    assert "largest size" not in last
+    assert "'ambid recover a.h5.journal -o NAME'" in last
 
 
 @pytest.mark.parametrize("port", ["", "  "])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -40,22 +41,39 @@ def verdict(report: QualityReport, info: DeviceInfo) -> tuple[str, ...]:
     lines = list(_stream(report, info))
     if report.samples >= _FEWEST:
         for column in report.columns:
+            if not math.isfinite(column.rms):
+                lines.append(_absurd(column))
+                continue
             lines += _range(column) if column.role in MEASURED else _ordered(column, report.excited)
             lines += _content(column, report) if column.role in MEASURED else []
     return tuple(lines)
 
 
+def _absurd(column: ColumnQuality) -> str:
+    return (
+        f"{column.name} goes from {column.least:.4g} to {column.most:.4g}: too large for its mean and spread to be"
+        " numbers. Look at what gives it"
+    )
+
+
 def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[str]:
+    replay = info.kind == "replay"  # what was is over: nothing of it is mended at a line or a device
     if report.lost:
         share = report.lost / (report.lost + report.samples)
-        yield (
-            f"{report.lost} samples lost in {report.gaps} gaps ({share:.2%}): the line or the host is too slow. Lower"
-            " daq.rate_hz, or free the machine"
+        yield f"{report.lost} samples lost in {report.gaps} gaps ({share:.2%}): " + (
+            "they are missing in the record that is replayed. Read it with --gaps"
+            if replay
+            else "the line or the host is too slow. Lower daq.rate_hz, or free the machine"
         )
     if report.repeated:
-        yield f"{report.repeated} samples came twice and were left out: the device counts wrongly. Restart it"
+        yield f"{report.repeated} samples came twice and were left out: " + (
+            "the time of the record that is replayed runs back. Look at its time column"
+            if replay
+            else "the device counts wrongly. Restart it"
+        )
     if report.damaged:
-        yield f"{report.damaged} samples hold a value that is no number: left out. Look at the device"
+        where = "record that is replayed" if replay else "device"
+        yield f"{report.damaged} samples hold a value that is no number: left out. Look at the {where}"
     off = abs(report.measured_hz - report.rate_hz)
     # only hardware keeps the time of this world; NaN compares false
     if info.kind == "serial" and off > _RATE * report.rate_hz and off > _SURE * report.measured_sd:

@@ -142,6 +142,10 @@ class Quality:
         frame : Frame
             Values of shape (n_samples, n_columns), in the device's units.
         """
+        with np.errstate(all="ignore"):  # what is too large for sums makes them no number: the verdict says so
+            self._add(frame)
+
+    def _add(self, frame: Frame) -> None:
         first, x = frame.block.first, frame.block.values
         if self._first is None:
             self._first = self._next = first
@@ -175,6 +179,10 @@ class Quality:
         QualityReport
             With what is not good enough, in words.
         """
+        with np.errstate(all="ignore"):
+            return self._report()
+
+    def _report(self) -> QualityReport:
         measured, sd = self._rate.slope()
         made = QualityReport(
             samples=self._moments.count,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ambid.cli import INTERRUPTED
+from ambid.cli.acquire_end import finish, left, tell
 from ambid.cli.acquire_wish import Wish, start_of_track, told
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, course_mode, opened
 from ambid.cli.interrupts import Stop, signals
-from ambid.cli.options import FAILED_CHECK, band_of, json_path
+from ambid.cli.options import band_of, json_path
 from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter
 from ambid.cli.watch import watching
 from ambid.errors import AmbidError
 
@@ -129,12 +129,12 @@ def command(
 
                 done, track_end = followed(wish, device, course, start, json, stop, live=not quiet)
     except KeyboardInterrupt:
-        typer.echo(f"ambid: interrupted{_left(record, before)}", err=True)
+        typer.echo(f"ambid: interrupted{left(record, _changed(record) != before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
-    _tell(done, wish, table=json != "-")
+    tell(done, wish, table=json != "-")
     if track_end is not None:
         track_end()
-    _finish(done, wish, stop, strict=strict)
+    finish(done, wish, stop, strict=strict)
 
 
 def _course(wish: Wish, device: Device, stop: Stop, watch: Watch) -> Course:
@@ -207,50 +207,5 @@ def _record(wish: Wish, device: Device, course: Course, stop: Stop, watch: Watch
     )  # fmt: skip
 
 
-def _tell(done: Acquired, wish: Wish, *, table: bool) -> None:
-    """Say what was recorded; where standard output is of the track, only what is not good of it."""
-    if done.recorded is None:
-        return
-    if table:
-        from ambid.report.acquire_text import acquired_text
-
-        typer.echo(acquired_text(done, wish.record, paint=painter()))
-    else:
-        for line in done.quality.verdict:
-            typer.echo(f"ambid: note: {line}", err=True)
-
-
-def _finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
-    """Tell what ended the run early, and end with the exit code."""
-    stored = done.run.samples - done.not_stored
-    kept = f"{wish.record} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
-    if done.run.fault is not None:
-        from ambid.acquire.causes import fault_words
-
-        raise AmbidError(f"{wish.port}: the controller went to its safe state: {fault_words(done.run.fault)}; {kept}")
-    if done.not_stored:
-        why = str(done.troubles[0]) if done.troubles else "the disk took too long"
-        raise AmbidError(f"{done.not_stored} samples are not in {wish.record}: {why}")
-    if stop.number is not None:
-        typer.echo(f"ambid: interrupted; {kept}", err=True)
-        raise typer.Exit(stop.code)
-    if done.recorded is None:
-        raise AmbidError(f"{wish.port}: no sample came. Look at cable and supply")
-    if not done.run.complete and not done.run.lost:
-        typer.echo(f"ambid: note: {wish.port} ended after {done.run.samples} of {done.run.wanted} samples", err=True)
-    if strict and (not done.run.complete or done.quality.verdict):
-        raise typer.Exit(FAILED_CHECK)
-
-
 def _changed(record: Path) -> int | None:
     return record.stat().st_mtime_ns if record.exists() else None
-
-
-def _left(record: Path, before: int | None) -> str:
-    """Say where what was recorded is, after a second signal tore the run off."""
-    from ambid.acquire.recorder.header import journal_path
-
-    journal = journal_path(record)
-    if _changed(record) != before:
-        return f"; {record} holds what came before it"
-    return f"; get what came with 'ambid recover {journal}'" if journal.exists() else "; nothing was recorded"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from ambid.acquire.device import Device, Mode
     from ambid.physics.presets import Preset
     from ambid.rig import Rig
+
+_SAME_RATE = 1e-3  # a rate from a time column is rounded
 
 Port = Annotated[
     str,
@@ -112,6 +115,8 @@ def opened(
     for line in _notes(port, rig, behind):
         typer.echo(f"ambid: note: {line}", err=True)
     with open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
+        for line in _replay_notes(device, rig):
+            typer.echo(f"ambid: note: {line}", err=True)
         yield device
 
 
@@ -128,6 +133,18 @@ def _notes(port: str, rig: Rig, bench: Preset | Rig | None) -> tuple[str, ...]:
     made_up = default_daq_notes(rig) if invented else ()
     plant = bench_parameters(rig, bench) if invented else None  # the truth, whatever the rig knows of it
     return (*made_up, *review(complete, controller_settings(complete), parameters=plant))
+
+
+def _replay_notes(device: Device, rig: Rig) -> tuple[str, ...]:
+    """Say where a record that is replayed has another rate than the rig: it keeps its own."""
+    rate = device.info.rate_hz
+    wanted = rig.daq.rate_hz if rig.daq is not None else rig.record.rate_hz
+    if device.info.kind != "replay" or wanted is None or math.isclose(rate, wanted, rel_tol=_SAME_RATE):
+        return ()
+    return (
+        f"{device.info.port} was taken at {rate:.6g} Hz, which it keeps; the rig says {wanted:g} Hz. Make sure that it"
+        " is of this bench",
+    )
 
 
 def _bench(name: str | None) -> Preset | Rig | None:

@@ -116,7 +116,7 @@ def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Pain
         Lines without the last line's end.
     """
     q, counters = done.quality, done.counters
-    stored = done.run.samples - done.not_stored
+    stored = done.run.samples - done.not_stored - q.repeated
     whole = "" if stored == done.run.wanted else f" of {done.run.wanted} wanted"
     head = (
         f"{path}: {stored} samples{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from"

@@ -13,10 +13,13 @@ import numpy as np
 from ambid.acquire.device import Column, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.played import Pace, PlayedDevice
 from ambid.errors import DeviceError, RecordError
-from ambid.record import read_rows
+from ambid.physics.models import model
+from ambid.record import Record, read_rows
+from ambid.rig.load import role_units
 from ambid.rig.rig import Rig
 from ambid.track.stream.block import Block
 from ambid.track.stream.replay import Replay, blocks_of
+from ambid.units import UNKNOWN
 
 
 class ReplayDevice(PlayedDevice):
@@ -38,7 +41,7 @@ class ReplayDevice(PlayedDevice):
     Raises
     ------
     DeviceError
-        If the record has not the rig's columns, or its rows cannot be numbered.
+        If the record has not the rig's columns, they are in other units, or its rows cannot be numbered.
     """
 
     def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real", block_samples: int | None = None) -> None:
@@ -50,6 +53,7 @@ class ReplayDevice(PlayedDevice):
                 f"record {path} has no column {missing[0]!r}, which the rig wants; it has {', '.join(record.names)}."
                 " Correct the rig, or take another record"
             )
+        _check_units(record, rig, f"record {path}")
         super().__init__(record.rate_hz, pace, block_samples)
         roles = {c.column: c.role for c in rig.channels}
         others = {name: name if name == "excitation" else "extra" for name in record.names if name not in roles}
@@ -108,3 +112,20 @@ class ReplayDevice(PlayedDevice):
             f"{self._where} refuses {what}; a record can be listened to, not acted on. Use mode 'sample', or a"
             " simulated device"
         )
+
+
+def _check_units(record: Record, rig: Rig, where: str) -> None:
+    """Refuse a column whose unit is not the one that the rig's calibration begins with; one without unit may pass."""
+    wanted = role_units(model(rig.model))
+    for c in rig.channels:
+        channel, of = record.channel(c.column), c.calibration
+        if c.unit is not None or channel.unit == UNKNOWN:
+            continue
+        counts = "1" if rig.daq is not None else channel.unit  # a gain of a controller's rig is for counts
+        unit = wanted.get(c.role, channel.unit) if of is None else of.unit_in or counts
+        if channel.unit != unit:
+            raise DeviceError(
+                f"{where}: column {c.column!r} is in [{channel.source_unit or channel.unit}]; channels.{c.role} of the"
+                f" rig takes [{unit}]{', counts' if unit == '1' else ''}. Replay it with the rig that it was taken"
+                " with, or correct the calibration"
+            )
