@@ -96,6 +96,9 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     except KeyboardInterrupt:
         work.status = "stalled"
         work.warnings.insert(0, "interrupted: the best model so far")
+    else:
+        if work.status == "stalled":
+            work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
     work.timing_s["all"] = perf_counter() - began
     one = np.ones(scaled.n_outputs)
     if not evaluated(work.draft.tables, work.draft.theta, scaled.parts, one, free=False).finite:
@@ -247,13 +250,15 @@ def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: T
         return _searched(scaled, fewer, work, tick, free=False)
 
     best = pruned(draft)
+    ended = work.status
     richer = with_all_noise(s, draft)
     if richer is not draft and draft.tables.noisy:
         # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
         # these are there can the surplus process terms go one by one.
         other = pruned(pruned(_searched(scaled, richer, work, tick, free=False), noise=False))
         if _value(s, scaled, other, weight) < _value(s, scaled, best, weight):
-            best = other
+            best, ended = other, work.status
+    work.status = ended
     _keep(work, scaled, best)
     return best
 
