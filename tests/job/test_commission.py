@@ -1,12 +1,14 @@
 """Guided commissioning: it comes to its end on a good bench, and stops with the right reason on others."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ambid.acquire.device import SelfTest
 from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import commission as room
@@ -76,6 +78,29 @@ def test_what_it_found_is_the_truth(finished):
         if p.name in TRUTH:
             assert abs(p.value - TRUTH[p.name]) < 4.0 * p.sd
             assert abs(p.value / TRUTH[p.name] - 1.0) < 0.05
+
+
+def test_what_it_says_has_digits_and_units_for_people(finished):
+    _, done, _, _ = finished
+    said = {s.name: s.findings for s in done.steps}
+    assert said["self-test"][1] == "supply 5 V, position 921 and current 510.8 counts"
+    assert re.fullmatch(r"position at rest 1 mm, noise \d\.\d um rms", said["rest"][0])
+    assert re.fullmatch(r"current -?[\d.]+ [um]A, [\d.]+ mA rms", said["levitate"][1])
+    m, k_x = said["identify"][:2]
+    assert re.fullmatch(r"m = (299|30[01])\.\d ± \d\.\d g \(95 % interval ± [\d.]+ %\)", m)
+    assert re.fullmatch(r"k_x = -6\.\d{3} ± 0\.0\d\d kN/m \(95 % interval ± [\d.]+ %\)", k_x)
+
+
+def test_what_a_controller_measured_in_itself_is_said_in_words():
+    measured = {"supply_mv": 5006.0, "free_bytes": 206.0, "position": 102.0, "current": 511.0}
+    words = "supply 5.006 V, 206 bytes of memory never used, position 102 and current 511 counts"
+    device = SimpleNamespace(
+        self_test=lambda: SelfTest(failed=(), numbers={**measured, "heat": 3.0}),
+        info=SimpleNamespace(kind="serial", port="/dev/ttyACM0", identity={"major": 1, "uid": 7}),
+    )
+    step = room.bench.self_test(device)
+    assert step.findings == ("serial device at /dev/ttyACM0: major 1", f"{words}, heat 3")
+    assert step.numbers["supply_mv"] == 5006.0
 
 
 def test_what_it_leaves_can_be_read(finished):
@@ -167,7 +192,7 @@ def test_a_noisy_sensor_stops_it_at_rest(tmp_path):
 
 def test_current_with_the_output_off_stops_it_at_rest(tmp_path):
     device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 150))
-    stopped_at("rest", ran(tmp_path, device), "0.36", "output off", "channels.current")
+    stopped_at("rest", ran(tmp_path, device), "364 mA", "output off", "channels.current")
 
 
 def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):

@@ -68,8 +68,10 @@ def check_chunks(
 
     Parameters
     ----------
-    record, n_samples, chunks, path, texts
+    record, n_samples, path, texts
         As `write_chunks` takes them. History and provenance are not looked at.
+    chunks : iterable of ndarray, shape (n, n_channels)
+        As `write_chunks` takes them.
 
     Raises
     ------

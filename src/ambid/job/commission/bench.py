@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
@@ -10,12 +12,14 @@ from ambid.acquire.device import Device
 from ambid.acquire.session import Course
 from ambid.job.amplitude import Trial, find_amplitude
 from ambid.job.commission.step import EXCITATION, Step, Wishes
-from ambid.job.look import Look, Room, ended
+from ambid.job.look import Array, Look, Room, ended
+from ambid.report.numbers import sized
 
 _SD_AT_REST = 0.02  # of the trips' width: noise of a sensor with the output off
 _ZERO, _NEAR_ZERO = 0.10, 0.03  # of the trips' width: current that is shown with the output off
 _WANDER = 0.25  # of the trips' width: how far the rotor may stray without excitation
 _NEAR = 0.85  # of the voltage: no room left
+_UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
 
 
 def self_test(device: Device) -> Step:
@@ -32,11 +36,13 @@ def self_test(device: Device) -> Step:
         Passed if nothing failed.
     """
     found = device.self_test()
-    told = tuple(f"{name} {value:g}" for name, value in found.numbers.items())
     who = ", ".join(f"{k} {v}" for k, v in device.info.identity.items() if k in ("protocol", "major", "minor", "board"))
     return Step(
         name="self-test",
-        findings=(f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else ""), ", ".join(told)),
+        findings=(
+            f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else ""),
+            _measured(found.numbers),
+        ),
         reasons=found.failed,
         numbers=found.numbers,
     )
@@ -61,31 +67,30 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
     reasons = list(ended(report, "the look at rest"))
-    findings: list[str] = []
     cautions: list[str] = []
-    numbers: dict[str, float] = {}
-    for role, unit in (("position", "m"), ("current", "A")):
-        if role not in seen or not seen[role].size:
-            continue
-        mean, sd = float(seen[role].mean()), float(seen[role].std())
-        findings.append(f"{role} at rest {mean:.4g} {unit}, noise {sd:.2g} {unit} rms")
-        numbers |= {f"{role}_mean": mean, f"{role}_sd": sd}
+    shown = {role: _mean_sd(seen[role]) for role in ("position", "current") if role in seen and seen[role].size}
+    for role, (mean, sd) in shown.items():
+        unit = _UNITS[role]
         low, high = room.trips[role]
         width = high - low
         if math.isfinite(width) and sd > _SD_AT_REST * width:
             reasons.append(
-                f"the {role} sensor's noise is {sd:.2g} {unit} rms with the output off, {100 * sd / width:.0f} % of the"
-                " way between the trips: look at wiring, ground and the filter at the input"
+                f"the {role} sensor's noise is {sized(sd, unit, 2)} rms with the output off, {100 * sd / width:.0f} %"
+                " of the way between the trips: look at wiring, ground and the filter at the input"
             )
         if sd == 0.0:
             cautions.append(f"{role} does not move by one count: a quiet sensor, or none")
         if role == "current" and math.isfinite(width) and abs(mean) > _NEAR_ZERO * width:
             (reasons if abs(mean) > _ZERO * width else cautions).append(
-                f"{mean:.3g} A are shown with the output off, {100 * abs(mean) / width:.0f} % of the way between the"
-                " trips: correct the offset of channels.current, or see that the power stage does switch off"
+                f"{sized(mean, unit)} are shown with the output off, {100 * abs(mean) / width:.0f} % of the way between"
+                " the trips: correct the offset of channels.current, or see that the power stage does switch off"
             )
+    findings = tuple(
+        f"{role} at rest {sized(mean, _UNITS[role])}, noise {sized(sd, _UNITS[role], 2)} rms"
+        for role, (mean, sd) in shown.items()
+    )
     return Step(
-        name="rest", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
+        name="rest", findings=findings, reasons=tuple(reasons), cautions=tuple(cautions), numbers=_numbers(shown)
     )
 
 
@@ -110,12 +115,8 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     reasons = list(ended(report, "levitation"))
     if not seen["position"].size:
         return Step(name="levitate", reasons=tuple(reasons) or ("no sample came after lift-off",))
-    findings: list[str] = []
-    numbers: dict[str, float] = {}
-    for role, unit in (("position", "m"), ("current", "A"), ("voltage", "V")):
-        mean, sd = float(seen[role].mean()), float(seen[role].std())
-        findings.append(f"{role} {mean:.4g} {unit}, {sd:.2g} {unit} rms")
-        numbers |= {f"{role}_mean": mean, f"{role}_sd": sd}
+    shown = {role: _mean_sd(seen[role]) for role in _UNITS}
+    for role, (_, sd) in shown.items():
         if role != "voltage" and sd == 0.0:
             reasons.append(
                 f"{role} does not move by one count while the rotor hovers: no sensor there? Look at its cable and"
@@ -125,17 +126,20 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     stray = float(np.ptp(seen["position"]))
     if math.isfinite(high - low) and stray > _WANDER * (high - low):
         reasons.append(
-            f"the rotor strays by {stray:.3g} m without excitation, {100 * stray / (high - low):.0f} % of the way"
+            f"the rotor strays by {sized(stray, 'm')} without excitation, {100 * stray / (high - low):.0f} % of the way"
             " between the trips: the loop is badly damped or the sensor disturbed; change the gains of [loop]"
         )
     v_low, v_high = room.voltage
     centre, half = (v_low + v_high) / 2, (v_high - v_low) / 2
-    if math.isfinite(half) and abs(numbers["voltage_mean"] - centre) > _NEAR * half:
+    if math.isfinite(half) and abs(shown["voltage"][0] - centre) > _NEAR * half:
         reasons.append(
-            f"hovering takes {numbers['voltage_mean']:.3g} V of {v_low:g} to {v_high:g} V: nothing is left to excite"
+            f"hovering takes {shown['voltage'][0]:.3g} V of {v_low:g} to {v_high:g} V: nothing is left to excite"
             " with; change bias, set point or supply"
         )
-    return Step(name="levitate", findings=tuple(findings), reasons=tuple(reasons), numbers=numbers)
+    findings = tuple(
+        f"{role} {sized(mean, _UNITS[role])}, {sized(sd, _UNITS[role], 2)} rms" for role, (mean, sd) in shown.items()
+    )
+    return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown))
 
 
 def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
@@ -167,3 +171,24 @@ def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) 
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
     return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers)
+
+
+def _measured(numbers: Mapping[str, float]) -> str:
+    """Say what a self-test measured, in words and units; what is not known here stands at the end as it is named."""
+    left = dict(numbers)
+    told = []
+    if "supply_mv" in left:
+        told.append(f"supply {left.pop('supply_mv') / 1e3:.4g} V")
+    if "free_bytes" in left:
+        told.append(f"{left.pop('free_bytes'):g} bytes of memory never used")
+    counts = [f"{role} {left.pop(role):.4g}" for role in ("position", "current") if role in left]
+    told += [" and ".join(counts) + " counts"] if counts else []
+    return ", ".join(told + [f"{name} {value:g}" for name, value in left.items()])
+
+
+def _mean_sd(values: Array) -> tuple[float, float]:
+    return float(values.mean()), float(values.std())
+
+
+def _numbers(shown: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    return {f"{role}_{what}": x for role, pair in shown.items() for what, x in zip(("mean", "sd"), pair, strict=True)}

@@ -11,6 +11,7 @@ from ambid.job.acquire import Acquired
 from ambid.job.commission.step import Step, Wishes
 from ambid.job.look import ended
 from ambid.job.track_live import LiveTrack
+from ambid.report.numbers import quantity
 
 _SATURATED = 1e-3  # of the samples at the end of a converter's range
 _RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree")
@@ -80,7 +81,7 @@ def identification(estimate: Estimate, wishes: Wishes) -> Step:
             continue
         half = (p.ci95[1] - p.ci95[0]) / 2.0
         wide = half / abs(p.value) if p.value else math.inf
-        findings.append(f"{p.name} = {p.value:.5g} ± {p.sd:.2g} {p.unit} (95 % interval ± {100 * wide:.2g} %)")
+        findings.append(f"{p.name} = {quantity(p.value, p.sd, p.unit).text} (95 % interval ± {100 * wide:.2g} %)")
         numbers |= {p.name: p.value, f"{p.name}_sd": p.sd}
         if not p.identifiable:
             reasons.append(f"{p.name} is not identifiable from this record: excite more, or fix what is known")
