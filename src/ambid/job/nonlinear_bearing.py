@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Magnet = MagnetLaw | Literal["auto", "single", "pair"]
 
 _P_LEAST = 1e-3  # as for the linear model
+_OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
 
 
@@ -39,7 +40,8 @@ def identify_nonlinear(
     held: Sequence[Record | str | Path] = (),
     parameters: Sequence[Parameter] = (),
     eddy: bool = False,
-    drift: bool | Literal["auto"] = "auto",
+    drift: bool = False,
+    off_below: float | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -67,9 +69,13 @@ def identify_nonlinear(
         i_knee, i0, g, a, x_offset, i_offset, v_offset (SI). g is fixed at 9.81 for one magnet and 0 for a pair;
         i_offset, and for one magnet x_offset, at 0.
     eddy : bool
-        The force has a pole a/(s + a) (thesis eq. 1.4).
-    drift : bool or "auto"
-        A slowly walking force takes up what the law leaves over; "auto": where the likelihood pays for it.
+        The force has a pole a/(s + a) (thesis eq. 1.4), found up to about twice the sampling rate in rad/s.
+    drift : bool
+        A slowly walking force takes up what the law leaves over. One magnet then no longer has to carry the weight
+        at rest, which is the surest thing that its records say; so it is off unless asked for.
+    off_below : float, optional
+        Voltage in V at or below which the stage is off: while the current then dies through a diode, the coil's
+        voltage is not known (1 V rms is taken for it).
     from_s, to_s : float, optional
         Part of the moving records to use, in s; overrides the rig's, which does not apply to held ones.
     rate_hz : float, optional
@@ -99,8 +105,8 @@ def identify_nonlinear(
         raise EstimationError(f"the rig's model is {rig.model!r}; a nonlinear bearing wants 'one-axis'")
     say("read")
     bare = replace(rig, record=replace(rig.record, from_s=None, to_s=None))
-    taken = [_taken(r, rig, from_s, to_s, rate_hz, gaps, held=False) for r in records]
-    taken += [_taken(r, bare, None, None, rate_hz, gaps, held=True) for r in held]
+    taken = [_taken(r, rig, from_s, to_s, rate_hz, gaps, off_below, held=False) for r in records]
+    taken += [_taken(r, bare, None, None, rate_hz, gaps, off_below, held=True) for r in held]
     clipped = [t[2] for t in taken if t[2]]
     known = _known(rig, parameters)
     laws = _laws(magnet, [t[0] for t in taken if not t[0].held])
@@ -119,7 +125,7 @@ def identify_nonlinear(
 
 def _taken(
     record: Record | str | Path, rig: Rig, from_s: float | None, to_s: float | None, rate_hz: float | None,
-    gaps: str | None, *, held: bool,
+    gaps: str | None, off_below: float | None, *, held: bool,
 ) -> tuple[BearingRecord, Mapping[str, object], str]:  # fmt: skip
     """A record as the predictor sees it, what is remembered of it, and a warning where the voltage was limited."""
     import numpy as np
@@ -136,9 +142,10 @@ def _taken(
         if beyond:
             u = np.clip(u, low, high)
             warning = f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
+    loose = np.where(u <= off_below, _OFF_SD, 0.0) if off_below is not None else np.zeros(u.size)
     y = np.column_stack([bench["position"], bench["current"]])
     taken = BearingRecord(
-        name=name, rate_hz=bench.rate_hz, u=u, y=y, valid=np.ones(y.shape, dtype=np.bool_), held=held
+        name=name, rate_hz=bench.rate_hz, u=u, loose=loose, y=y, valid=np.ones(y.shape, dtype=np.bool_), held=held
     )  # fmt: skip
     remembered = {"samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
                   "file": bench.provenance.get("file"), "held": held}  # fmt: skip
@@ -245,8 +252,8 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
     import numpy as np
 
     from ambid.identify.estimate import EstimatedParameter
-    from ambid.identify.nonlinear_bearing.problem import SIGNED, UNITS
-    from ambid.identify.nonlinear_bearing.uncertainty import identifiable
+    from ambid.identify.nonlinear_bearing.problem import UNITS
+    from ambid.identify.uncertainty import WEAK
 
     law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
     sds = np.sqrt(np.diag(known.covariance(robust=robust)))
@@ -257,7 +264,7 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
         j = known.names.index(n.name) if n.estimated else -1
         sd, value = float(sds[j]) if n.estimated else 0.0, values[n.name]
         prior = np.isfinite(n.prior_sd)
-        size = n.magnitude if n.name in SIGNED else value
+        size = max(n.magnitude, abs(value)) if n.signed else value
         share = None
         if prior and n.estimated:
             share = float(np.clip(1.0 - known.information[j, j] / n.prior_sd**2, 0.0, 1.0))
@@ -270,7 +277,7 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
                 sd=sd,
                 ci95=(value - 1.96 * sd, value + 1.96 * sd),
                 role=role,
-                identifiable=not n.estimated or identifiable(sd / abs(size)),
+                identifiable=not n.estimated or sd < WEAK * abs(size),
                 data_share=share,
             )
         )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.identify.nonlinear_bearing.problem import BODY, BearingProblem, BearingRecord, Number
+from ambid.identify.nonlinear_bearing.problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.physics.coenergy_law import MagnetLaw, law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.presets import Preset, preset
@@ -40,8 +40,9 @@ def as_seen(done: Simulation, name: str = "record") -> BearingRecord:
     record = done.record
     y = np.column_stack([record["position"], record["current"]])
     return BearingRecord(
-        name=name, rate_hz=record.rate_hz, u=np.array(record["voltage"]), y=y, valid=np.ones(y.shape, dtype=bool)
-    )
+        name=name, rate_hz=record.rate_hz, u=np.array(record["voltage"]), loose=np.zeros(y.shape[0]), y=y,
+        valid=np.ones(y.shape, dtype=bool),
+    )  # fmt: skip
 
 
 def truth_of(bench: Preset) -> dict[str, float]:
@@ -57,7 +58,7 @@ def problem_of(
 ) -> BearingProblem:  # fmt: skip
     """A problem whose numbers start at the truth."""
     numbers = tuple(
-        Number(name=n, value=truth[n], estimated=n in estimated, magnitude=MAGNITUDE.get(n, 1.0))
+        Number(name=n, value=truth[n], estimated=n in estimated, signed=n in SIGNED, magnitude=MAGNITUDE.get(n, 1.0))
         for n in (*law.names, *BODY)
     )
     settings = {"eddy": False, "drift": False, "free_delay": frozenset(), **more}

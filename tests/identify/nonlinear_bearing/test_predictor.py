@@ -38,7 +38,7 @@ def gradient_agrees(problem, vector):
 @pytest.mark.parametrize("kind", ["pair", "saturated", "drift", "eddy", "delay"])
 def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
     record, truth = bench
-    record = replace(record, u=record.u[:400], y=record.y[:400], valid=record.valid[:400])
+    record = replace(record, u=record.u[:400], loose=record.loose[:400], y=record.y[:400], valid=record.valid[:400])
     law, estimated = MagnetLaw(pair=True), set(PAIR)
     settings = {}
     truth = {**truth, "c": 5.0, "g": 0.3}
@@ -67,7 +67,11 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
     i = 0.96 + 0.1 * np.cos(np.arange(n) / 30) + 5e-3 * rng.standard_normal(n)
     valid = np.ones((n, 2), dtype=bool)
     valid[100:120, 0] = False  # a sensor that is lost for a while
-    moving = BearingRecord(name="moving", rate_hz=1000.0, u=4.2 * i, y=np.column_stack([x, i]), valid=valid)
+    loose = np.zeros(n)
+    loose[200:220] = 1.0  # a stage that was switched off
+    moving = BearingRecord(
+        name="moving", rate_hz=1000.0, u=4.2 * i, loose=loose, y=np.column_stack([x, i]), valid=valid
+    )
     held = replace(moving, name="held", rate_hz=200.0, held=True, u=moving.u + rng.standard_normal(n))
     law = MagnetLaw(gap="exponential", saturation=True, rise=True)
     estimated = {"L_g", "zeta", "sigma", "L_leak", "L_rise", "i_knee", "m", "R", "c", "a", "v_offset"}

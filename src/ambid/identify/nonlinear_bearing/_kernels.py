@@ -199,12 +199,13 @@ def _bend(
 
 @njit(cache=True, nogil=True)
 def _spread(
-    z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
-    h: float, slopes: bool, w: Array, dw: Array, A: Array, dA: Array, F: Array, dF: Array, T: Array, dT: Array,
-    E: Array, dE: Array, T2: Array, H: Array,
+    z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags,
+    level2: Array, q2: Array, h: float, slopes: bool, w: Array, dw: Array, A: Array, dA: Array, F: Array, dF: Array,
+    T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
 ) -> None:  # fmt: skip
     """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the plant linearised at rest.
 
+    `q2` is `level2`, force, voltage and drift, with what is not known of the voltage of this sample.
     F = I + h A + (h A)^2/2 and E = h (I + h A/2) B, A without the terms that are products with the velocity or with
     di/dt: they move the gain a little, not the predictor's mean, which the full equations carry.
     """
@@ -270,7 +271,7 @@ def _spread(
                     dP[a, b, j] += dP[b, a, j] + noise
                     dP[b, a, j] = dP[a, b, j]
                 for d in range(2):
-                    dP[a, b, n_a + 2 + d] += 2.0 * q2[d] * E[a, d] * E[b, d]
+                    dP[a, b, n_a + 2 + d] += 2.0 * level2[d] * E[a, d] * E[b, d]
                     dP[b, a, n_a + 2 + d] = dP[a, b, n_a + 2 + d]
         if flags[3]:
             dP[last, last, n_a + 4] += 2.0 * q2[2]
@@ -333,15 +334,16 @@ def _correct(
 
 @njit(cache=True, nogil=True)
 def predict(
-    u: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers, chain: Array,
+    u: Array, loose: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers, chain: Array,
     noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, slopes: bool, e: Array, s: Array,
     rows: Array,
 ) -> bool:  # fmt: skip
     """Run the predictor over one record; False where a gap closes or numbers cease to be finite.
 
-    `u` (n,), `y` (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,) and `P` hold
-    the state before sample `first`, and move along. `noise2` holds the squares of the levels of position, current,
-    force, voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows` (4 n, p + 1)
+    `u` (n,), `loose` (n,) variance of what is not known of it, `y` (n, 2) position and current, `valid` (n, 2): which
+    of them are measured. `z` (n_states,) and `P` hold the state before sample `first`, and move along. `noise2` holds
+    the squares of the levels of position, current, force, voltage and drift (of one sample). `e`, `s` (n, 2) get
+    innovations and their variances; `rows` (4 n, p + 1)
     the rows of the likelihood, where `slopes` wants them.
     """
     n, n_a = z.size, active.size
@@ -352,7 +354,7 @@ def predict(
     dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
     F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
     col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
-    none = np.zeros((2, p + 1))
+    none, q2 = np.zeros((2, p + 1)), np.zeros(3)
     phi = th[15]
     for k in range(first, u.size):
         for c in range(2):
@@ -373,7 +375,12 @@ def predict(
         late, now = u[k - whole - 1], u[k - whole]
         volts[0], volts[1] = phi * late + (1.0 - phi) * now, 6.0 * phi * (1.0 - phi) * (now - late)
         volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
-        _spread(z, S, P, dP, th, active, chain, flags, noise2[2:], h, slopes, w, dw, A, dA, F, dF, T, dT, E, dE, T2, H)
+        for d in range(3):
+            q2[d] = noise2[2 + d]
+        q2[1] += max(loose[k - whole - 1], loose[k - whole])
+        _spread(
+            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, h, slopes, w, dw, A, dA, F, dF, T, dT, E, dE, T2, H
+        )
         _advance(z, S, th, active, chain, flags, volts, h, steps, slopes, w, dw, g, A, G, room)
         low, high = z[0] + th[1], th[1] - z[0]
         if not flags[0] and (low <= 0.0 or (flags[1] and high <= 0.0)):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -22,10 +21,10 @@ from ambid.identify.threads import one_thread
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 
-Switch = bool | Literal["auto"]
-
 _NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole number is tried
-_SHORT = 12  # iterations with which a law or an extension is first tried
+_SHORT = 12  # iterations with which a whole delay is tried
+_TRIED = 15  # iterations with which laws are compared
+_STRETCH = 4000  # samples of each record on which laws are compared
 
 
 def estimate_bearing(
@@ -36,7 +35,7 @@ def estimate_bearing(
     delay: float | None = None,
     extend: bool = True,
     eddy: bool = False,
-    drift: Switch = "auto",
+    drift: bool = False,
     tick: Callable[[], None] | None = None,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several records at once.
@@ -52,11 +51,12 @@ def estimate_bearing(
     delay : float or None
         Of the voltage in samples of the first record; None: found.
     extend : bool
-        Whether rising leakage and saturation are tried beyond the laws given (BIC decides).
+        Whether rising leakage is tried beyond the laws given (BIC decides). Saturation is not: with one magnet, a lag
+        in a sensor or a wandering force looks like it; it has to be asked for.
     eddy : bool
         Force behind a pole a/(s + a).
-    drift : bool or "auto"
-        A force that walks slowly (what the law leaves over); "auto": where the likelihood pays for it.
+    drift : bool
+        A force that walks slowly: what the law leaves over.
     tick : callable, optional
         Called after each evaluation; KeyboardInterrupt ends in the best so far.
 
@@ -72,23 +72,44 @@ def estimate_bearing(
     free = [r for r in records if not r.held]
     if not free:
         raise EstimationError("every record holds the rotor; masses and forces want one in which it moves")
+    tick = _remembered(tick)
     with one_thread():
         linear = linear_start(free[0], known, delay, laws[0])
-        fits = [_first(records, known, law, linear, delay, eddy=eddy, drift=drift is True, tick=tick) for law in laws]
+        short = [_short(r) for r in records]
+        fits = [_first(short, known, law, linear, delay, eddy=eddy, drift=drift, tick=tick) for law in laws]
         fits = [f for f in fits if f.status != "failed"]
         if not fits:
             raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
         fit = min(fits, key=lambda f: f.criterion)
-        for option in ("rise", "saturation") if extend else ():
-            if not getattr(fit.problem.law, option):
-                law = fit.problem.law
-                richer = replace(law, rise=True) if option == "rise" else replace(law, saturation=True)
-                fit = _extended(fit, richer, known, records, linear, tick)
-        if drift == "auto":
-            fit = _with_drift(fit, tick)
-        if delay is None:
-            fit = _with_fraction(fit, tick)
-        return fit if fit.status == "converged" else _better(fit, search(fit.problem, fit.vector, tick=tick))
+        if extend and not fit.problem.law.rise:
+            fit = _extended(fit, replace(fit.problem.law, rise=True), known, short, linear, tick)
+        whole = replace(fit.problem, records=tuple(records))
+        fit = search(whole, fit.vector, tick=tick)
+        return fit if delay is not None or fit.status == "failed" else _with_fraction(fit, tick)
+
+
+def _remembered(tick: Callable[[], None] | None) -> Callable[[], None]:
+    """An interruption ends every search that comes after it, too."""
+    interrupted = False
+
+    def again() -> None:
+        nonlocal interrupted
+        if interrupted:
+            raise KeyboardInterrupt
+        try:
+            if tick is not None:
+                tick()
+        except KeyboardInterrupt:
+            interrupted = True
+            raise
+
+    return again
+
+
+def _short(record: BearingRecord) -> BearingRecord:
+    """The first part of a record: enough to choose a law and to come near."""
+    n = _STRETCH if not record.held else record.u.size
+    return replace(record, u=record.u[:n], loose=record.loose[:n], y=record.y[:n], valid=record.valid[:n])
 
 
 def _first(
@@ -112,7 +133,7 @@ def _first(
         skip=int(max(delays.values())) + 8,
     )
     problem = with_noise(problem, linear.values)
-    return search(problem, problem.start(), tick=tick)
+    return search(problem, problem.start(), iterations=_TRIED, tick=tick)
 
 
 def _with_eddy(numbers: tuple[Number, ...], known: Mapping[str, Parameter], *, on: bool) -> tuple[Number, ...]:
@@ -140,18 +161,8 @@ def _extended(
     if "L_rise" in new:
         numbers = tuple(replace(n, value=values["L_rise"]) if n.name == "L_rise" else n for n in numbers)
     problem = replace(fit.problem, law=law, numbers=numbers)
-    found = search(problem, _carried(fit, problem), tick=tick)
+    found = search(problem, _carried(fit, problem), iterations=_TRIED, tick=tick)
     return found if fit.criterion - found.criterion > len(new) * np.log(fit.problem.n_used) else fit
-
-
-def _with_drift(fit: BearingFit, tick: Callable[[], None] | None) -> BearingFit:
-    """Let a force walk where what the law leaves over asks for it (BIC)."""
-    if fit.problem.drift:
-        return fit
-    problem = replace(fit.problem, drift=True)
-    found = search(problem, _carried(fit, problem), tick=tick)
-    added = problem.size - fit.problem.size
-    return found if fit.criterion - found.criterion > added * np.log(fit.problem.n_used) else fit
 
 
 def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
@@ -209,7 +220,3 @@ def _whole(
         return fit
     back = search(exact, vector, iterations=_SHORT, tick=tick)
     return back if back.status == "converged" and back.criterion - fit.criterion < price else fit
-
-
-def _better(a: BearingFit, b: BearingFit) -> BearingFit:
-    return b if b.criterion <= a.criterion and b.status != "failed" else a

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.nonlinear_bearing.problem import NOISE_PRIOR_SD, SIGNED, BearingProblem
+from ambid.identify.nonlinear_bearing.problem import NOISE_PRIOR_SD, BearingProblem
 
 Array = NDArray[np.float64]
 Status = Literal["converged", "stalled", "failed"]
@@ -129,8 +129,9 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
     rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
     steps = problem.substeps * max(1, round(0.25 * max(problem.delays) / record.rate_hz))
     done = predict(
-        record.u, record.y, record.valid & np.array([not record.held, True]), problem.skip, whole, theta,
-        np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes, e, s, rows,
+        record.u, record.loose**2, record.y, record.valid & np.array([not record.held, True]), problem.skip, whole,
+        theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes,
+        e, s, rows,
     )  # fmt: skip
     if not done:
         return None
@@ -180,7 +181,7 @@ def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
             r.append((values[n.name] - n.value) / n.prior_sd)
             row[j] = chain[j] / n.prior_sd
             J.append(row)
-        elif n.name not in SIGNED:
+        elif not n.signed:
             r.append((vector[j] - np.log(n.value)) / NOISE_PRIOR_SD)
             row[j] = 1.0 / NOISE_PRIOR_SD
             J.append(row)

@@ -21,7 +21,7 @@ BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset")
 """Numbers after those of the magnet, in the order of the kernels."""
 
 SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset"})
-"""Numbers that may have either sign; all others are positive, or zero where they are fixed."""
+"""Numbers that may have either sign with any law; the others are positive, or zero where they are fixed."""
 
 UNITS: Mapping[str, str] = {
     "k": "N m^2/A^2", "s": "m", "L_g": "H", "zeta": "m", "sigma": "1/A^2", "L_leak": "H", "L_rise": "H", "i_knee": "A",
@@ -47,6 +47,8 @@ class BearingRecord:
     rate_hz : float
     u : ndarray, shape (n_samples,), V
         Voltage, held over a sample.
+    loose : ndarray, shape (n_samples,), V
+        Standard deviation of what is not known of the voltage; zero where it is what was logged.
     y : ndarray, shape (n_samples, 2)
         Position in m and current in A.
     valid : ndarray, shape (n_samples, 2), bool
@@ -58,6 +60,7 @@ class BearingRecord:
     name: str
     rate_hz: float
     u: Array
+    loose: Array
     y: Array
     valid: NDArray[np.bool_]
     held: bool = False
@@ -75,14 +78,18 @@ class Number:
     estimated : bool
     prior_sd : float
         Infinite without a prior.
+    signed : bool
+        Whether it may have either sign (`SIGNED`, and the s of one magnet, which is that of a position); else it is
+        positive, and the vector holds its logarithm.
     magnitude : float
-        Scale of a number that may have either sign.
+        Scale of a signed number.
     """
 
     name: str
     value: float
     estimated: bool
     prior_sd: float = np.inf
+    signed: bool = False
     magnitude: float = 1.0
 
 
@@ -160,7 +167,7 @@ class BearingProblem:
         """Return the vector at the numbers' own values and the centres of the noise, in shape (size,)."""
         vector = np.zeros(self.size)
         for j, n in enumerate(self.estimated):
-            vector[j] = n.value / n.magnitude if n.name in SIGNED else np.log(n.value)
+            vector[j] = n.value / n.magnitude if n.signed else np.log(n.value)
         first = len(self.estimated)
         vector[first : first + len(self.rates)] = [self.delays[r] for r in self.rates]
         for r, place in enumerate(self.noise_slices):
@@ -180,7 +187,7 @@ class BearingProblem:
         """
         found = {n.name: n.value for n in self.numbers}
         for n, v in zip(self.estimated, vector.tolist(), strict=False):
-            found[n.name] = v * n.magnitude if n.name in SIGNED else float(np.exp(v))
+            found[n.name] = v * n.magnitude if n.signed else float(np.exp(v))
         return found
 
     def chain(self, vector: Array) -> Array:
@@ -195,7 +202,7 @@ class BearingProblem:
         ndarray, shape (n_estimated,)
         """
         values = self.values(vector)
-        return np.array([n.magnitude if n.name in SIGNED else values[n.name] for n in self.estimated])
+        return np.array([n.magnitude if n.signed else values[n.name] for n in self.estimated])
 
     def delay_at(self, vector: Array, rate_hz: float) -> float:
         """Return the delay in samples at a rate.

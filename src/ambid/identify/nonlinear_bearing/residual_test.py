@@ -71,22 +71,12 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
         part[:, : slopes.shape[2]] = slopes[:, c]
         part[:, slopes.shape[2] + c * n_l : slopes.shape[2] + (c + 1) * n_l] = lagged
         part[:, -1] = target[:, c]
-    with_slopes = _inside(rows)
-    without = _inside(np.delete(rows, np.s_[slopes.shape[2] : -1], axis=1))
-    statistic = max(with_slopes - without, 0.0)
+    # the rows of R that belong to the lagged innovations: what they explain beyond the sensitivities
+    R: Array = np.asarray(np.linalg.qr(rows, mode="r"))
+    statistic = float(np.sum(R[slopes.shape[2] : -1, -1] ** 2))
     spread = np.std(target, axis=0)
     correlation = np.abs(lagged.T @ target) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
     rms = [float(np.sqrt(np.nanmean(found.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
     return WhitenessTest(
         p=float(chi2.sf(statistic, n_l * n_o)), largest=float(correlation.max()), innovation_sd=(rms[0], rms[1])
     )
-
-
-def _inside(rows: Array) -> float:
-    """Squared length of the last column inside the span of the others."""
-    R: Array = np.asarray(np.linalg.qr(rows, mode="r"))
-    norm = np.linalg.norm(R[:, :-1], axis=0)
-    norm[norm == 0] = 1.0
-    u, s, _ = np.linalg.svd(R[:, :-1] / norm, full_matrices=False)
-    part = u[:, s > 1e-10 * s[0]].T @ R[:, -1]
-    return float(part @ part)

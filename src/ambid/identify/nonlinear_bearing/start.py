@@ -184,7 +184,12 @@ def start_numbers(
     leak = max(lin["L"] - own, 0.1 * lin["L"])
     typical = float(np.sqrt(np.mean(current**2)))
     guess |= {"L_leak": leak, "L_rise": 0.3 * leak, "i_knee": 0.5 * typical}
-    magnitude = {"g": 9.81, "x_offset": float(np.std(position)), "i_offset": 0.1 * typical}
+    magnitude = {
+        "g": 9.81,
+        "s": 0.1 * float(np.mean(np.abs(position))),
+        "x_offset": float(np.std(position)),
+        "i_offset": 0.1 * typical,
+    }
     magnitude["v_offset"] = 0.1 * float(np.std(free[0].u))
     return tuple(
         _number(name, known.get(name), guess[name], law, magnitude.get(name, 1.0)) for name in (*law.names, *BODY)
@@ -193,18 +198,21 @@ def start_numbers(
 
 def _number(name: str, known: Parameter | None, guess: float, law: MagnetLaw, magnitude: float) -> Number:
     """One number: as the user says, else free where the law has it."""
+    signed = name in SIGNED or (name == "s" and not law.pair)
     off = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
     if not off.get(name, True):
         return Number(name=name, value=1.0 if name == "i_knee" else 0.0, estimated=False)
     if known is None:
         estimated = name not in ("c", "g", "a", "i_offset") and not (name == "x_offset" and not law.pair)
         value = guess if estimated or name in ("g", "a") else 0.0
-        return Number(name=name, value=value, estimated=estimated, magnitude=magnitude)
+        return Number(name=name, value=value, estimated=estimated, signed=signed, magnitude=magnitude)
     value = guess if known.value is None else known.value
-    if known.role != "fixed" and name not in SIGNED and not value > 0.0:
+    if known.role != "fixed" and not signed and not value > 0.0:
         value = abs(guess) or 1.0
     sd = np.inf if known.sd is None else known.sd
-    return Number(name=name, value=value, estimated=known.role != "fixed", prior_sd=sd, magnitude=magnitude)
+    return Number(
+        name=name, value=value, estimated=known.role != "fixed", prior_sd=sd, signed=signed, magnitude=magnitude
+    )
 
 
 def with_noise(problem: BearingProblem, values: Mapping[str, float]) -> BearingProblem:

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.nonlinear_bearing.likelihood import BearingFit
-from ambid.identify.nonlinear_bearing.problem import SIGNED
-from ambid.identify.uncertainty import WEAK, inverse_information
+from ambid.identify.uncertainty import inverse_information
 
 Array = NDArray[np.float64]
 
@@ -24,23 +23,17 @@ class BearingUncertainty:
         Estimated numbers.
     information, robust : ndarray, shape (n, n), SI
         Covariance from the Fisher information (priors and noise levels included), and the sandwich over stretches.
-    relative : ndarray, shape (n,)
-        Standard deviations of the logarithm of numbers that are positive; of signed ones over their natural size.
     delay_sd : dict of float to float
         By rate, in samples, where it was estimated.
     inflation : float
         Largest ratio of robust to information standard deviation.
-    data_only : ndarray, shape (n,)
-        `relative` without the priors of the numbers.
     """
 
     names: tuple[str, ...]
     information: Array
     robust: Array
-    relative: Array
     delay_sd: dict[float, float]
     inflation: float
-    data_only: Array
 
     def covariance(self, *, robust: bool) -> Array:
         """Return the covariance; the robust one is nowhere smaller than that of the information.
@@ -60,15 +53,13 @@ class BearingUncertainty:
         return np.asarray(self.robust * np.outer(wider, wider))
 
 
-def uncertainty(fit: BearingFit, *, robust: bool | None = None) -> BearingUncertainty:
+def uncertainty(fit: BearingFit) -> BearingUncertainty:
     """Compute the covariances of a fit.
 
     Parameters
     ----------
     fit : BearingFit
         Not failed.
-    robust : bool, optional
-        Whether `relative` is that of the robust covariance; None: as the larger.
 
     Returns
     -------
@@ -85,24 +76,11 @@ def uncertainty(fit: BearingFit, *, robust: bool | None = None) -> BearingUncert
     unit = np.outer(chain, chain)
     information, wide = whole[:n, :n] * unit, sandwich[:n, :n] * unit
     ratio = np.sqrt(np.diag(wide) / np.maximum(np.diag(information), 1e-300))
-    used = np.sqrt(np.diag(information)) * (np.maximum(ratio, 1.0) if robust is not False else 1.0)
-    size = np.array(
-        [number.magnitude if number.name in SIGNED else c for number, c in zip(problem.estimated, chain, strict=True)]
-    )
-    prior = np.array([1.0 / number.prior_sd for number in problem.estimated]) ** 2  # of the natural number
-    left = 1.0 / np.maximum(1.0 / np.maximum(np.diag(information), 1e-300) - prior, 1e-300)
     extra = [float(np.sqrt(whole[n + j, n + j])) for j in range(len(problem.rates))]
     return BearingUncertainty(
         names=tuple(number.name for number in problem.estimated),
         information=information,
         robust=wide,
-        relative=used / size,
         delay_sd=dict(zip(problem.rates, extra, strict=True)),
         inflation=float(ratio.max()),
-        data_only=np.sqrt(left) / size,
     )
-
-
-def identifiable(relative: float) -> bool:
-    """Return whether a number with the given `relative` standard deviation counts as shown by the data."""
-    return relative < WEAK

@@ -1,0 +1,124 @@
+"""The job of the nonlinear bearing: records and rig in, curves with bands out."""
+
+import numpy as np
+import pytest
+
+from ambid.errors import EstimationError
+from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.physics.coenergy_law import law_numbers
+from ambid.physics.parameters import Parameter
+from ambid.physics.presets import preset
+from ambid.rig import load_rig
+from ambid.simulate import simulate
+
+RIG = """schema = "ambid.rig/1"
+name = "ball under one magnet"
+model = "one-axis"
+[channels.voltage]
+column = "voltage"
+[channels.current]
+column = "current"
+[channels.position]
+column = "position"
+[parameters]
+m = {{ value = 60, unit = "g", role = "{role}" }}
+"""
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    path = tmp_path_factory.mktemp("rig") / "ball.toml"
+    path.write_text(RIG.format(role="fixed"), encoding="utf-8")
+    return load_rig(path)
+
+
+@pytest.fixture(scope="module")
+def balls():
+    """Two records of a levitated ball at 8 to 12 mm."""
+    bench, done = preset("levitated-ball"), []
+    for seed in (1, 2):
+        n = 5000
+        rng = np.random.default_rng(seed)
+        setpoint = np.repeat(rng.uniform(8e-3, 12e-3, 10), n // 10)
+        kick = np.repeat(rng.choice([-0.5, 0.5], n // 10), 10)
+        done.append(
+            simulate(
+                bench.plant, kick, rate_hz=bench.rate_hz, seed=seed, loop=bench.loop, limits=bench.limits,
+                noise=bench.noise, operating_point=bench.operating_point, setpoint=setpoint,
+            ).record
+        )  # fmt: skip
+    return done
+
+
+@pytest.fixture(scope="module")
+def estimate(balls, rig):
+    return identify_nonlinear(balls, rig)
+
+
+def test_the_law_is_chosen_and_right(estimate):
+    truth = law_numbers(preset("levitated-ball").plant.magnet.coenergy)
+    assert estimate.status == "converged"
+    assert estimate.law.gap == "hyperbolic"
+    assert not estimate.law.saturation
+    for name in ("k", "L_leak"):
+        p = estimate.parameter(name)
+        assert abs(p.value - truth[name]) < 4 * p.sd
+        assert p.value == pytest.approx(truth[name], rel=0.03)
+    assert abs(estimate.parameter("s").value) < 3e-4
+    assert estimate.parameter("m").role == "fixed"
+    assert estimate.checks["carries_its_weight"].passed
+
+
+def test_curves_have_bands_that_hold_the_truth(estimate):
+    magnet = preset("levitated-ball").plant.magnet.coenergy
+    x, i = np.array([8e-3, 10e-3, 12e-3]), np.array([0.76, 0.95, 1.14])
+    found = estimate.curves(x, i)
+    for curve, exact in (
+        (found.k_i, magnet.force_per_current), (found.k_x, magnet.displacement_coefficient),
+        (found.L, lambda x, i: magnet.inductance(x)), (found.force, magnet.force),
+    ):  # fmt: skip
+        truth = np.array([exact(a, b) for a, b in zip(x, i, strict=True)])
+        assert np.all(np.abs(curve.value - truth) < 4 * curve.sd)
+        assert curve.value == pytest.approx(truth, rel=0.02)
+        assert np.all((curve.low < curve.value) & (curve.value < curve.high))
+    assert found.inside.all()
+
+
+def test_extrapolation_is_flagged(estimate):
+    assert not estimate.curves([2e-3, 10e-3], [0.95, 3.0]).inside.any()
+
+
+def test_bands_are_those_of_the_delta_method(estimate):
+    # by finite differences of the whole curve in every estimated number
+    x, i = np.array([9e-3]), np.array([0.9])
+    names, values = estimate.covariance_names, estimate.values
+    slopes = []
+    for name in names:
+        h = 1e-5 * (abs(values[name]) or 1e-3)
+        up, down = ({**values, name: values[name] + d} for d in (h, -h))
+        slopes.append((estimate.law.table(x, i, up)[0] - estimate.law.table(x, i, down)[0])[0] / (2 * h))
+    variance = np.einsum("jc,jk,kc->c", np.array(slopes), estimate.covariance, np.array(slopes))
+    found = estimate.curves(x, i)
+    sds = [found.force.sd[0], found.k_x.sd[0], found.k_i.sd[0], found.L.sd[0]]
+    assert np.sqrt(variance) == pytest.approx(sds, rel=1e-4)
+
+
+def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
+    stages = []
+
+    def tick(stage):
+        stages.append(stage)
+        if stages.count("identify") == 4:
+            raise KeyboardInterrupt
+
+    found = identify_nonlinear(balls[:1], rig, magnet="single", tick=tick)
+    assert found.status == "stalled"
+    assert stages.count("identify") == 4
+    assert any("did not converge" in w for w in found.warnings)
+
+
+def test_what_is_asked_wrongly_is_refused(balls, rig):
+    with pytest.raises(EstimationError, match="has no number"):
+        identify_nonlinear(balls, rig, parameters=[Parameter(name="gap", unit="m")])
+    with pytest.raises(EstimationError, match="holds the rotor"):
+        identify_nonlinear([], rig, held=balls, magnet="single")

@@ -1,0 +1,115 @@
+"""One nonlinear model over all measured records of the levitated ball: gravity balance, laboratory's inductance, mass.
+
+The balance uses no fit: where the ball stands, f = dL/dz i^2/2 = m g and k_i/m = 2 g/i0 (z grows away: negative), i0
+the mean current of all samples near that position.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.parameters import Parameter
+
+MAGLEV = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
+pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")
+
+MASS, GRAVITY, RESISTANCE = 0.06054, 9.81, 4.17
+LEVITATION = ("stairs_a", "stairs_b", "updown_c", "sine_d", "sine_e")
+COIL = ("1", "2", "3", "4", "20mm")
+RIG = """schema = "ambid.rig/1"
+name = "maglev, upper coil"
+model = "one-axis"
+[channels.voltage]
+column = "duty_upper"
+table = "{table}"
+[channels.current]
+column = "current_upper"
+[channels.position]
+column = "position"
+[parameters]
+m = {{ value = 60.54, unit = "g", role = "fixed" }}
+c = {{ value = 0.0, unit = "N s/m", role = "fixed" }}
+R = {{ unit = "ohm" }}
+[record]
+from = 2.0
+"""
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """The laboratory's table, with the dead zone up to a duty of 0.048 that it describes beside it."""
+    folder = tmp_path_factory.mktemp("rig")
+    head, first, *rest = (MAGLEV / "duty_to_voltage.csv").read_text(encoding="utf-8").splitlines()
+    (folder / "table.csv").write_text("\n".join([head, first, "0.048,0.043", *rest]) + "\n", encoding="utf-8")
+    path = folder / "maglev.toml"
+    path.write_text(RIG.format(table="table.csv"), encoding="utf-8")
+    return path
+
+
+def over_all(rig, **wishes):
+    return identify_nonlinear(
+        [MAGLEV / f"levitate_{n}.csv" for n in LEVITATION], rig,
+        held=[MAGLEV / f"coil_steps_{n}.csv" for n in COIL], off_below=0.0431, **wishes,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def estimate(rig):
+    return over_all(rig)
+
+
+def standing(z):
+    """Mean current of all moving records within 0.3 mm of a position."""
+    every = np.concatenate(
+        [np.genfromtxt(MAGLEV / f"levitate_{n}.csv", delimiter=",", skip_header=1)[2000:, 2:4] for n in LEVITATION]
+    )
+    return float(every[np.abs(every[:, 0] - z) < 0.3e-3, 1].mean())
+
+
+@pytest.mark.parametrize("z", [8e-3, 10e-3, 12e-3])
+def test_force_per_current_is_that_of_the_gravity_balance(estimate, z):
+    i0 = standing(z)
+    at = estimate.curves(z, i0)
+    assert at.k_i.value[0] / MASS == pytest.approx(-2 * GRAVITY / i0, rel=0.10)
+    assert at.force.value[0] == pytest.approx(-MASS * GRAVITY, rel=0.05)
+    assert at.k_x.value[0] < 0  # a negative spring
+    assert at.inside[0]
+
+
+def test_inductance_is_the_laboratorys(estimate):
+    z, i = (a.ravel() for a in np.meshgrid(np.linspace(8e-3, 12e-3, 9), np.linspace(0.75, 1.15, 5)))
+    ell = estimate.curves(z, i).L
+    laboratory = 0.0654 + 0.0404 * np.exp(-158.5 * z) + 0.0329 * np.arctan(5.297 * i - 1.042)
+    assert ell.value == pytest.approx(laboratory, rel=0.07)
+    assert np.all(np.diff(ell.value.reshape(5, 9), axis=1) < 0)  # falls with the distance
+
+
+def test_stiffness_follows_from_the_same_energy(estimate):
+    # k_x = -L'' i^2/2 of the laboratory's L, which this fit has not seen
+    i0 = standing(10e-3)
+    laboratory = -0.5 * 0.0404 * 158.5**2 * np.exp(-1.585) * i0**2
+    assert estimate.curves(10e-3, i0).k_x.value[0] == pytest.approx(laboratory, rel=0.10)
+    assert estimate.values["R"] == pytest.approx(RESISTANCE, rel=0.03)
+
+
+def test_delays_of_a_sample_and_a_half_and_of_the_slow_records(estimate):
+    fast, slow = estimate.delay["1000 Hz"], estimate.delay["200 Hz"]
+    assert 1.2 < fast.samples + fast.fraction < 1.7
+    assert slow.samples + slow.fraction < 0.5
+
+
+def test_the_model_error_is_owned_up_to(estimate):
+    assert estimate.status == "converged"
+    assert estimate.covariance_method == "robust"
+    assert not estimate.checks["residuals_white"].passed
+    assert estimate.checks["carries_its_weight"].passed
+    assert any("robust" in w for w in estimate.warnings)
+
+
+def test_a_free_mass_is_right_or_flagged(rig):
+    estimate = over_all(rig, magnet=MagnetLaw(gap="hyperbolic"), parameters=[Parameter(name="m", unit="kg")])
+    m = estimate.parameter("m")
+    assert m.ci95[0] < MASS < m.ci95[1] or not m.identifiable
