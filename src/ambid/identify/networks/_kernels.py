@@ -63,16 +63,18 @@ def run_states(
 @njit(cache=True, nogil=True, error_model="numpy")
 def slope_states(
     A: Array, K: Array, heads: Table, G: Array, W1: Array, b1: Array, W2: Array, anchored: int,
-    dA: Array, dB: Array, dK: Array, dG: Array, u: Array, X: Array, E: Array, s: Array, out: Array,
+    D: Array, used: Table, u: Array, X: Array, E: Array, s: Array, out: Array,
 ) -> None:  # fmt: skip
     """Write the slopes of the predictions, out (n_samples, p, P); s (n, P): slopes of the state, first to last.
 
-    Columns: directions of the matrices (dA, ...), W1 row by row, b1, W2 row by row; any more are passed on with s.
+    Columns: directions D (n, n + m + p + q, P1) of [A | B | K | G], W1 row by row, b1,
+    W2 row by row; any more are passed on with s. `used` (n, n + m + p + q) is 0 where no direction changes an entry.
     """
     N, m, n, p, h, q = u.shape[0], u.shape[1], X.shape[1], heads.size, W1.shape[0], G.shape[1]
-    P1, P, nz = dA.shape[0], s.shape[1], X.shape[1] + u.shape[1] - 1
+    P1, P, nz = D.shape[2], s.shape[1], X.shape[1] + u.shape[1] - 1
     F, new = np.empty((n, n)), np.zeros((n, P))
     phi, by_a, by_b, f = np.zeros(h), np.zeros(h), np.zeros(h), np.zeros(q)
+    v = np.zeros(n + m + p + q)
     for t in range(N):
         for i in range(p):
             for c in range(P):
@@ -105,6 +107,14 @@ def slope_states(
                     g += G[i, j] * W2[j, k]
                 for j in range(n):
                     F[i, j] += g * by_a[k] * W1[k, j]
+        for j in range(n):
+            v[j] = X[t, j]
+        for j in range(m):
+            v[n + j] = u[t, j]
+        for j in range(p):
+            v[n + m + j] = E[t, j]
+        for j in range(q):
+            v[n + m + p + j] = f[j]
         for i in range(n):
             for c in range(P):
                 new[i, c] = 0.0
@@ -113,17 +123,11 @@ def slope_states(
                 if w != 0.0:
                     for c in range(P):
                         new[i, c] += w * s[j, c]
-            for c in range(P1):
-                w = 0.0
-                for j in range(n):
-                    w += dA[c, i, j] * X[t, j]
-                for j in range(m):
-                    w += dB[c, i, j] * u[t, j]
-                for j in range(p):
-                    w += dK[c, i, j] * E[t, j]
-                for j in range(q):
-                    w += dG[c, i, j] * f[j]
-                new[i, c] += w
+            for j in range(v.size):
+                if used[i, j] == 1:
+                    w = v[j]
+                    for c in range(P1):
+                        new[i, c] += D[i, j, c] * w
             for k in range(h):
                 g = 0.0
                 for j in range(q):
@@ -134,7 +138,9 @@ def slope_states(
                 for j in range(m - 1):
                     new[i, P1 + k * nz + n + j] += g * by_a[k] * u[t, j]
                 new[i, P1 + h * nz + k] += g * by_b[k]
-        s[:] = new
+        for i in range(n):
+            for c in range(P):
+                s[i, c] = new[i, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -84,7 +84,8 @@ class NarxShape:
         Returns
         -------
         tuple of ndarray
-            Of shapes (n_outputs, n_regressors), (n_outputs,), (n_outputs, neurons), (neurons, n_regressors), (neurons,).
+            Of shapes (n_outputs, n_regressors), (n_outputs,), (n_outputs, neurons), (neurons, n_regressors) and
+            (neurons,).
         """
         p, d, h = self.n_outputs, self.n_regressors, self.neurons
         L, c, W2, W1, b1 = np.split(np.ascontiguousarray(theta), np.cumsum(self.sizes)[:-1])

@@ -98,8 +98,8 @@ class NeuralNarx:
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape, np.nan)
         out[self.lag :] = self.shape.values(self.theta, self.shape.regressors(ys, us))
-        out = self.y_level + self.y_scale * out
-        return out
+        found: Array = self.y_level + self.y_scale * out
+        return found
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """Return the exact derivative of `predict` by `theta`.

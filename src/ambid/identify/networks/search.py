@@ -104,6 +104,8 @@ def search(
     stage: str,
     most: int = 50,
     tolerance: float = 1e-8,
+    enough: float = 0.0,
+    damping: float = 1e-3,
     held_out: Callable[[Array], float] | None = None,
     slack: float = 0.02,
     tick: Tick | None = None,
@@ -122,8 +124,13 @@ def search(
         Iterations.
     tolerance : float, optional
         Relative gain below which the search is over.
+    enough : float, optional
+        Gain below which it is over; with errors of unit variance, the square of a step in standard deviations.
+    damping : float, optional
+        At the beginning, for columns of unit length; small where the start is good.
     held_out : callable, optional
-        Error on data that are not trained on, of theta, shape (n_theta,); the search ends when it has grown for 6 iterations.
+        Error on data that are not trained on, of theta, shape (n_theta,); the search ends when it has grown
+        for 6 iterations.
     slack : float, optional
         Part by which the held-out error at the end may exceed its least before the weights of the least are taken.
     tick : callable, optional
@@ -135,7 +142,7 @@ def search(
     -------
     Found
     """
-    began, damping, converged = perf_counter(), 1e-3, False
+    began, converged = perf_counter(), False
     cost = problem.cost(theta)
     seconds, costs = [0.0], [cost]
     held = [held_out(theta)] if held_out is not None else []
@@ -160,7 +167,7 @@ def search(
             worse = 0 if held[-1] < best_held else worse + 1
             if held[-1] < best_held:
                 best_held, best_theta = held[-1], theta
-        converged = gained <= tolerance * cost
+        converged = gained <= max(tolerance * cost, enough)
         if converged or worse >= 6:
             break
     early = bool(held) and held[-1] > (1.0 + slack) * best_held

@@ -13,6 +13,7 @@ from ambid.identify.nonlinear.model import NonlinearModel
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.identify.narmax.model:PolynomialNarmax",
+        "nn": "ambid.identify.networks.state_model:StateNetwork",
         "narx": "ambid.identify.networks.narx_model:NeuralNarx",
     }
 )

@@ -75,6 +75,25 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
         feedback="with noise model",
     ),
     NonlinearStructure(
+        name="nn",
+        summary="state-space network whose weights are A and B (thesis fig. 5.9), beside a network G(x, u)",
+        settings={
+            "form": "one-axis (entries of thesis eq. 4.8), free, auto (one-axis where units are V, m, A); auto",
+            "states": "of the form free; chosen by Bayes' criterion. one-axis has 3",
+            "connections": "of one-axis: thesis (five), damped (a22 as well), all (second and third row); thesis",
+            "neurons": "hidden units of G(x, u); 0",
+            "residual": "anchored (no slope of G at the operating point) or orthogonal (to A and B on the data); anchored",
+            "prior": "standard deviation of G's weights before the data, scaled; 3",
+            "starts": "random starts of G; 3",
+            "noise": "output, innovations (predictor gain), auto (gain where errors are not white); auto",
+            "shooting": "samples of a shot in multiple shooting, for unstable plants; 0 for none",
+            "descent": "iterations of the thesis's steepest descent, shown beside; 10",
+            "iterations": "of each training, at most; 50",
+        },
+        home="ambid.identify.networks.nn:nn",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
         name="narx",
         summary="neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
         settings={

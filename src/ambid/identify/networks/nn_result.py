@@ -1,0 +1,139 @@
+"""The fit that comes out of the training of a state-space network: model in SI, covariance, noise, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.networks.cloud import cloud_of
+from ambid.identify.networks.failed import failed_fit, provenance
+from ambid.identify.networks.nn_train import State
+from ambid.identify.networks.records import Scaled
+from ambid.identify.networks.search import information_inverse
+from ambid.identify.networks.start import carried_to_continuous
+from ambid.identify.networks.state_model import StateNetwork
+from ambid.identify.nonlinear.fit import NonlinearFit
+
+if TYPE_CHECKING:
+    from ambid.identify.networks.nn import Work
+
+Array = NDArray[np.float64]
+
+
+def finished(
+    records: Sequence[IOData], used: Mapping[str, Any], data: Scaled, work: Work, *, seed: int
+) -> NonlinearFit:
+    """Return the fit of a trained network.
+
+    Parameters
+    ----------
+    records : sequence of IOData
+    used : Mapping[str, object]
+        Settings.
+    data : Scaled
+    work : Work
+        With a network.
+    seed : int
+
+    Returns
+    -------
+    NonlinearFit
+        Failed where the network does not run on its own records.
+    """
+    assert work.state is not None
+    problem = work.state.problem(data)
+    state = work.state.moved(problem, work.state.vector)
+    model = None if state is None else _model(records, data, state)
+    if state is None or model is None:
+        reason = "the network does not stay finite on the records that it was trained on: check the columns"
+        return failed_fit("nn", records, used, seed, reason, work.timing_s)
+    covariance, condition = _covariance(state, data)
+    warnings = [*work.warnings, *_cautions(records, state)]
+    if covariance is None:
+        warnings.append(
+            f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
+            "Fewer states or connections, or more excitation"
+        )
+    work.timing_s["all"] = sum(work.timing_s.values())
+    freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
+    noise = state.noise * state.n_rows / freedom
+    return NonlinearFit(
+        structure="nn",
+        settings=dict(used),
+        model=model,
+        covariance=covariance,
+        covariance_from="" if covariance is None else "laplace" if state.layout.neurons else "information",
+        n_estimated=int(state.theta.size),
+        noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
+        seed=seed,
+        status=work.status,
+        curves=tuple(work.curves),
+        warnings=tuple(warnings),
+        timing_s=dict(work.timing_s),
+        details={**work.details, **_details(state, model, condition)},
+        **provenance(records),
+    )
+
+
+def _model(records: Sequence[IOData], data: Scaled, state: State) -> StateNetwork | None:
+    """The model with the cloud of its own states in training; None where it leaves the finite numbers there."""
+    nowhere = cloud_of(np.zeros((1, state.layout.n + state.layout.n_inputs)))
+    model = StateNetwork(
+        layout=state.layout,
+        theta=state.theta * state.layout.unit,
+        u_level=data.u_level,
+        u_scale=data.u_scale,
+        y_level=data.y_level,
+        y_scale=data.y_scale,
+        cloud=nowhere,
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        z = np.concatenate([model.regressors(x.u, x.y) for x in records])
+    if not np.all(np.isfinite(z)) or not np.all(np.isfinite(model.theta)):
+        return None
+    return StateNetwork(
+        **{k: getattr(model, k) for k in ("layout", "theta", "u_level", "u_scale", "y_level", "y_scale")},
+        cloud=cloud_of(z),
+    )
+
+
+def _covariance(state: State, data: Scaled) -> tuple[Array | None, float]:
+    """Inverse information of the weights, the first states taken into account; SI as the weights are."""
+    R = state.problem(data).triangle(state.vector)[:, :-1]
+    P, condition = information_inverse(R)
+    if P is None:
+        return None, condition
+    unit, k = state.layout.unit, state.theta.size
+    return P[:k, :k] * unit[:, None] * unit, condition
+
+
+def _cautions(records: Sequence[IOData], state: State) -> list[str]:
+    found = []
+    told_open = not records[0].n_inputs or all(x.open_loop for x in records)
+    if not told_open and not state.layout.gain:
+        found.append(
+            "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
+            "records are open loop: say noise = innovations, or --open-loop if there was no feedback"
+        )
+    return found
+
+
+def _details(state: State, model: StateNetwork, condition: float) -> dict[str, object]:
+    found: dict[str, object] = {
+        "form": state.layout.form,
+        "gain": state.layout.gain,
+        "A": model.A.tolist(),
+        "B": model.B.tolist(),
+        "K": state.K.tolist(),
+        "condition": condition,
+    }
+    if state.layout.form == "one-axis":
+        return found
+    m = state.layout.matrices(state.theta)
+    both = carried_to_continuous(state.layout, m.A, m.B[:, :-1])
+    found["continuous"] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
+    return found

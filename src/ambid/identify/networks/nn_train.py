@@ -1,0 +1,383 @@
+"""The stages of training a state-space network: weights and first states by Levenberg-Marquardt, gain, hidden layer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.networks.layout import Layout
+from ambid.identify.networks.records import Scaled
+from ambid.identify.networks.residual import Orthogonal, Ridge, orthogonal_to_physics
+from ambid.identify.networks.search import Tick, search
+from ambid.identify.networks.segments import Penalty, StateProblem, shots
+from ambid.identify.networks.start import carried_to_continuous, widened
+from ambid.identify.networks.thesis_training import trained_one_step
+from ambid.identify.nonlinear.fit import LearningCurve
+
+Array = NDArray[np.float64]
+Trained = tuple["State", LearningCurve, bool] | None
+
+_ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
+_ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
+_LAGS = 20  # of the test for whiteness
+_LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class State:
+    """A network on its way.
+
+    Attributes
+    ----------
+    layout : Layout
+    theta : ndarray, shape (n_theta,), scaled
+    x0 : ndarray, shape (n_records, n), scaled
+        First states.
+    noise : ndarray, shape (n_outputs, n_outputs), scaled
+        Covariance of its errors.
+    n_rows : int
+        Samples in all.
+    penalties : tuple of Penalty
+    """
+
+    layout: Layout
+    theta: Array
+    x0: Array
+    noise: Array
+    n_rows: int
+    penalties: tuple[Penalty, ...] = ()
+
+    @classmethod
+    def of(cls, layout: Layout, theta: Array, data: Scaled) -> State:
+        """Return a network that starts each record from its first outputs.
+
+        Parameters
+        ----------
+        layout : Layout
+        theta : ndarray, shape (n_theta,)
+        data : Scaled
+
+        Returns
+        -------
+        State
+        """
+        x0 = np.zeros((len(data.parts), layout.n))
+        for k, (y, _) in enumerate(data.parts):
+            x0[k, layout.head_table] = y[0]
+        n = sum(y.shape[0] for y, _ in data.parts)
+        return cls(layout=layout, theta=theta, x0=x0, noise=np.eye(layout.p), n_rows=n)
+
+    @property
+    def K(self) -> Array:
+        """Gain, shape (n, n_outputs)."""
+        return self.layout.matrices(self.theta).K
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the determinant of the errors' covariance: what maximum likelihood makes small."""
+        return float(np.linalg.slogdet(self.noise + _LEAST**2 * np.eye(self.layout.p))[1])
+
+    @property
+    def bic(self) -> float:
+        """Bayes' criterion."""
+        return self.n_rows * self.score + self.layout.n_theta * float(np.log(self.n_rows))
+
+    def without_gain(self) -> State:
+        """Return the same network without gain.
+
+        Returns
+        -------
+        State
+        """
+        layout, theta = widened(self.layout, self.theta, gain=False)
+        return replace(self, layout=layout, theta=theta)
+
+    def problem(self, data: Scaled, length: int | None = None, jump: Array | None = None) -> StateProblem:
+        """Return the problem whose errors have unit covariance here.
+
+        Parameters
+        ----------
+        data : Scaled
+        length : int, optional
+            Samples of a shot.
+        jump : ndarray, shape (n,), optional
+            One over the deviation of jumps between shots.
+
+        Returns
+        -------
+        StateProblem
+        """
+        noise = self.noise + _LEAST**2 * np.eye(self.layout.p)
+        return StateProblem(
+            layout=self.layout,
+            shots=shots(data.parts, length),
+            weight=np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(noise)).T),
+            jump=np.ones(self.layout.n) if jump is None else jump,
+            penalties=self.penalties,
+        )
+
+    def moved(self, problem: StateProblem, v: Array) -> State | None:
+        """Return the network at another vector, with the covariance of its errors; None where it diverges.
+
+        Parameters
+        ----------
+        problem : StateProblem
+            Over whole records.
+        v : ndarray, shape (n_theta + n_records n,)
+
+        Returns
+        -------
+        State or None
+        """
+        theta, x0 = problem.split(v)
+        with np.errstate(over="ignore", invalid="ignore"):
+            e = np.concatenate(problem.errors(v)[1])
+            noise = e.T @ e / e.shape[0]
+        return replace(self, theta=theta, x0=x0, noise=noise) if np.all(np.isfinite(noise)) else None
+
+    @property
+    def vector(self) -> Array:
+        """Weights and first states, shape (n_theta + n_records n,)."""
+        return np.concatenate([self.theta, self.x0.ravel()])
+
+
+def added_gain(state: State, data: Scaled, K: Array) -> State | None:
+    """Return the network with a predictor gain; None if it diverges on the data with every try.
+
+    Parameters
+    ----------
+    state : State
+    data : Scaled
+    K : ndarray, shape (n, n_outputs), scaled
+
+    Returns
+    -------
+    State or None
+    """
+    layout, theta = widened(state.layout, state.theta, gain=True)
+    penalties = tuple(replace(p, layout=layout) for p in state.penalties if isinstance(p, (Ridge, Orthogonal)))
+    wide = replace(state, layout=layout, theta=theta, penalties=penalties)
+    k = len(layout.entries)
+    heads = np.zeros((layout.n, layout.p))
+    heads[layout.head_table, range(layout.p)] = 0.5
+    best: State | None = None
+    for gain in (K, 0.5 * K, heads, 0.0 * K):
+        theta = wide.theta.copy()
+        theta[k : layout.n_directions] = gain.ravel()
+        problem = wide.problem(data)
+        tried = wide.moved(problem, np.concatenate([theta, wide.x0.ravel()]))
+        if tried is not None and (best is None or tried.score < best.score):
+            best = tried
+    return best
+
+
+def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Tick | None) -> Trained:
+    """Search for weights and first states, over whole records; None where the start diverges.
+
+    Parameters
+    ----------
+    state : State
+    data : Scaled
+    stage : str
+    iterations : int
+    tick : callable or None
+
+    Returns
+    -------
+    (State, LearningCurve, converged) or None
+    """
+    at = state.moved(state.problem(data), state.vector)
+    if at is None:
+        return None
+    seconds, errors, offset, converged = [], [], 0.0, False
+    damping = 1e-3 if state.layout.neurons else 1e-9  # physics alone begins near: Gauss-Newton at once
+    for k in range(_ROUNDS):
+        before, problem = at.score, at.problem(data)
+        found = search(
+            problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
+            damping=damping, tick=tick,
+        )  # fmt: skip
+        seconds += [offset + t for t in found.seconds]
+        errors += [_relative(c, at) for c in found.costs]
+        offset = seconds[-1]
+        after = at.moved(problem, found.theta)
+        converged = found.converged
+        if after is None:
+            break
+        at = after
+        if abs(before - at.score) < 0.02:
+            break
+    what = "prediction" if state.layout.gain else "simulation"
+    curve = LearningCurve(
+        method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds), training=np.array(errors)
+    )
+    return at, curve, converged
+
+
+def _relative(cost: float, at: State) -> float:
+    """Root mean square error in deviations of the outputs, from a weighted sum of squares."""
+    size = np.exp(at.score / at.layout.p / 2)
+    return float(np.sqrt(cost / (at.n_rows * at.layout.p)) * size)
+
+
+def descended(state: State, data: Scaled, iterations: int) -> tuple[tuple[LearningCurve, ...], dict[str, object]]:
+    """Train one-step errors of the network's states as the thesis does, and by Gauss-Newton, from weights of zero.
+
+    Parameters
+    ----------
+    state : State
+        Its predicted states are trained on; measured ones in their place where there are.
+    data : Scaled
+    iterations : int
+
+    Returns
+    -------
+    curves : tuple of LearningCurve
+    entries : dict
+        A and B in SI, by training; continuous in the form ``one-axis``.
+    """
+    problem = state.problem(data)
+    X = [x[:-1] for x in problem.errors(state.vector)[0]]
+    if state.layout.p == state.layout.n:
+        X = [y[:, np.argsort(state.layout.heads)] for y, _ in data.parts]
+    slow, fast, curves = trained_one_step(X, [s.u for s in problem.shots], iterations)
+    found: dict[str, object] = {}
+    n, size = state.layout.n, np.array(state.layout.scale)
+    for name, M in (("steepest descent", slow), ("Gauss-Newton", fast)):
+        A, B = M[:, :n], M[:, n:-1]
+        if state.layout.form == "one-axis":
+            both = carried_to_continuous(state.layout, A, B)
+        else:
+            both = A * size[:n, None] / size[:n], B * size[:n, None] / size[n:]
+        found[name] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
+    return curves, found
+
+
+def shooting(state: State, data: Scaled, length: int, *, iterations: int, tick: Tick | None) -> Trained:
+    """Search over shots with continuity penalties, whose weights are found on the way (multiple shooting).
+
+    Parameters
+    ----------
+    state : State
+    data : Scaled
+    length : int
+        Samples of a shot.
+    iterations : int
+    tick : callable or None
+
+    Returns
+    -------
+    (State, LearningCurve, converged) or None
+        A network with gain again: without one, the predictor of an unstable plant does not stay.
+    """
+    problem = state.problem(data)
+    X = np.concatenate([x[:-1] for x in problem.errors(state.vector)[0]])
+    plain = state.without_gain()
+    short = plain.problem(data, length)
+    at = np.cumsum([0, *(s.y.shape[0] for s in short.shots)])[:-1]
+    v = np.concatenate([plain.theta, X[at].ravel()])
+    seconds, errors, offset, jump, converged = [], [], 0.0, np.full(plain.layout.n, 10.0), False
+    for _ in range(_ROUNDS + 1):
+        short = plain.problem(data, length, jump)
+        found = search(short, v, stage="multiple shooting", most=iterations, tolerance=1e-6, tick=tick)
+        v, converged = found.theta, found.converged
+        seconds += [offset + t for t in found.seconds]
+        errors += [_relative(c, plain) for c in found.costs]
+        offset = seconds[-1]
+        jump, plain = _reweighted(plain, short, v)
+    theta, x0 = short.split(v)
+    first = x0[[k for k, s in enumerate(short.shots) if not s.goes_on]]
+    again = added_gain(replace(plain, theta=theta, x0=first), data, state.K)
+    if again is None:
+        return None
+    curve = LearningCurve(
+        method="Levenberg-Marquardt, multiple shooting", seconds=np.array(seconds), training=np.array(errors)
+    )
+    return again, curve, converged
+
+
+def _reweighted(state: State, problem: StateProblem, v: Array) -> tuple[Array, State]:
+    """Weights of jumps, and the errors' covariance, as they come out."""
+    X, E = problem.errors(v)
+    _, x0 = problem.split(v)
+    gaps = [x0[k] - X[k - 1][-1] for k in range(1, len(X)) if problem.shots[k].goes_on]
+    e = np.concatenate(E)
+    size = np.sqrt(np.mean(np.square(gaps), axis=0)) if gaps else np.ones(state.layout.n)
+    return 1.0 / np.maximum(size, 1e-6), replace(state, noise=e.T @ e / e.shape[0])
+
+
+def added_network(
+    state: State,
+    data: Scaled,
+    neurons: int,
+    prior: float,
+    anchored: bool,
+    *,
+    seed: list[int],
+    iterations: int,
+    tick: Tick | None,
+) -> Trained:
+    """Add a hidden layer to the physics and train both.
+
+    Parameters
+    ----------
+    state : State
+        With or without a hidden layer, which is begun anew.
+    data : Scaled
+    neurons : int
+    prior : float
+        Deviation of the hidden layer's weights before the data.
+    anchored : bool
+        Else orthogonal to what the free weights explain.
+    seed : list of int
+    iterations : int
+    tick : callable or None
+
+    Returns
+    -------
+    (State, LearningCurve, converged) or None
+    """
+    bare, bare_theta = widened(state.layout, state.theta, neurons=0)
+    layout, theta = widened(bare, bare_theta, neurons=neurons, anchored=anchored)
+    rng = np.random.default_rng(seed)
+    d, k = layout.n + layout.n_inputs, layout.n_directions
+    theta[k : k + neurons * d] = rng.standard_normal(neurons * d) / np.sqrt(d)
+    theta[k + neurons * d : k + neurons * (d + 1)] = rng.standard_normal(neurons)
+    penalties: list[Penalty] = [Ridge(layout=layout, prior=prior)]
+    if not anchored:
+        problem = state.problem(data)
+        X, E = problem.errors(state.vector)
+        noise = np.full(layout.n, float(np.sqrt(np.mean(np.concatenate(E) ** 2))))
+        penalties.append(
+            orthogonal_to_physics(layout, [x[:-1] for x in X], [s.u[:, :-1] for s in problem.shots], noise)
+        )
+    new = replace(state, layout=layout, theta=theta, penalties=tuple(penalties))
+    return trained(new, data, stage="hidden layer", iterations=iterations, tick=tick)
+
+
+def white(state: State, data: Scaled) -> bool:
+    """Say whether the errors are white (Ljung and Box 1978, all outputs together).
+
+    Parameters
+    ----------
+    state : State
+    data : Scaled
+
+    Returns
+    -------
+    bool
+    """
+    from scipy.stats import chi2
+
+    problem = state.problem(data)
+    total, p = 0.0, state.layout.p
+    for e in problem.errors(state.vector)[1]:
+        w = (e - e.mean(axis=0)) @ problem.weight
+        n = w.shape[0]
+        for lag in range(1, _LAGS + 1):
+            r = w[lag:].T @ w[:-lag] / n
+            total += n * (n + 2) * float(np.sum(r**2)) / (n - lag)
+    freedom = _LAGS * p**2 * len(data.parts)
+    return total < float(chi2.ppf(0.999, freedom))
