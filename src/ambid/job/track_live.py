@@ -7,11 +7,9 @@ or what a given start is checked with; it is then tracked like the rest.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from threading import Event as Signal
-from threading import Thread
 from types import MappingProxyType
 from typing import Literal
 
@@ -19,25 +17,25 @@ import numpy as np
 
 from ambid.acquire.causes import fault_words
 from ambid.acquire.device import Device, DeviceEvent
-from ambid.acquire.session import Course, RunReport, Tap, run
+from ambid.acquire.session import Course, RunReport, Tap
 from ambid.acquire.view import BenchView
 from ambid.errors import AmbidError, DeviceError
 from ambid.identify.estimate import Estimate
 from ambid.job.bench_rows import BenchRows
 from ambid.job.follow import Flag, follow
+from ambid.job.live_run import LOOK_S, LiveRun, RingTap
 from ambid.job.track_start import start_of
 from ambid.physics.models import model
 from ambid.record import Channel, Record
 from ambid.rig import Rig
 from ambid.track.lines import Track, TrackHeader, TrackLine
-from ambid.track.stream.block import Array, Block, Frame
+from ambid.track.stream.block import Block
 from ambid.track.stream.replay import Replay
 from ambid.track.stream.ring import BlockRing
 
 _BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
 _QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy
 _BLOCKS_PER_S = 250  # that a port gives at most, however few samples each of them holds
-_LOOK_S = 0.1
 _CHECKED_S = 0.5  # of the stream that a given start is checked with
 _IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is to be identified
 
@@ -133,8 +131,8 @@ def track_live(
     with BlockRing.create(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
-        ring_tap = _RingTap(ring, view, waits=device.info.kind != "serial")
-        runner = _Runner(device, course, ring_tap, taps, on_event, on_run, on_trouble, stopped, ring)
+        ring_tap = RingTap(ring, view, waits=device.info.kind != "serial")
+        runner = LiveRun(device, course, ring_tap, taps, on_event, on_run, on_trouble, stopped, ring)
         with runner:
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
             begin = start_of(
@@ -153,110 +151,14 @@ def _wanted_s(start: object, start_s: float | None, rate_hz: float) -> float:
     return max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / rate_hz) if start_s is None else start_s
 
 
-class _RingTap:
-    """Puts what a device samples into the ring, seen through the rig, numbered from its first sample.
-
-    A bench of this world waits for nobody: blocks that find the ring full are counted. One that is only played runs
-    ahead of the tracker, and is held up instead. Samples that a calibration does not cover go in as NaN, which the
-    tracker rejects and counts.
-    """
-
-    def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
-        self._ring, self._view, self._waits = ring, view, waits
-        self._origin: int | None = None
-        self.over = Signal()  # nobody reads the ring any more
-
-    def take(self, frame: Frame) -> None:
-        block = self._seen(frame.block)
-        if self._origin is None:
-            self._origin = block.first
-        while self._waits and not self.over.is_set() and not self._ring.wait_for_room(_LOOK_S):
-            pass
-        self._ring.put(replace(block, first=block.first - self._origin), frame.arrived_s)
-
-    def _seen(self, raw: Block) -> Block:
-        try:
-            return self._view.block(raw)
-        except AmbidError:
-            return replace(raw, values=np.concatenate([self._row(raw, k) for k in range(len(raw.values))]))
-
-    def _row(self, raw: Block, k: int) -> Array:
-        try:
-            return self._view.block(replace(raw, values=raw.values[k : k + 1])).values
-        except AmbidError:
-            return np.full((1, len(self._view.units)), np.nan)
-
-
-class _Runner:
-    """The run of the device, in a thread of its own; leaving the context ends it."""
-
-    def __init__(
-        self,
-        device: Device,
-        course: Course,
-        ring_tap: _RingTap,
-        taps: Sequence[Tap],
-        on_event: Callable[[DeviceEvent], object] | None,
-        on_run: Callable[[RunReport], object] | None,
-        on_trouble: Callable[[AmbidError], object] | None,
-        stopped: Callable[[], bool],
-        ring: BlockRing,
-    ) -> None:
-        self._job = (device, course, (*taps, ring_tap), on_event)  # who records is never behind the tracker
-        self._ring_tap = ring_tap
-        self._on_run, self._on_trouble, self._stopped = on_run, on_trouble, stopped
-        self._ring, self._stop = ring, Signal()
-        self._report: RunReport | None = None
-        self._failure: BaseException | None = None
-        self._thread = Thread(target=self._run, name="acquisition", daemon=True)
-
-    def __enter__(self) -> _Runner:
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: object, error: object, trace: object) -> None:
-        _, _, taps, _ = self._job
-        self._ring_tap.over.set()
-        try:
-            if isinstance(error, AmbidError) and len(taps) > 1 and self._thread.is_alive():
-                if self._on_trouble is not None:
-                    self._on_trouble(error)
-                while self._thread.is_alive():  # a wait that Ctrl-C can end
-                    self._thread.join(_LOOK_S)
-        finally:
-            self._stop.set()
-            self._thread.join()
-            if self._on_run is not None and self._report is not None:
-                self._on_run(self._report)
-                self._on_run = None
-
-    def report(self) -> RunReport:
-        """Return what came of the run; raise what ended it."""
-        if self._failure is not None:
-            raise self._failure
-        assert self._report is not None
-        return self._report
-
-    def _run(self) -> None:
-        device, course, taps, on_event = self._job
-        try:
-            self._report = run(
-                device, course, taps=taps, on_event=on_event, stopped=lambda: self._stop.is_set() or self._stopped()
-            )
-        except BaseException as failure:
-            self._failure = failure
-        finally:
-            self._ring.end()
-
-
 class _Lead:
     """The beginning of the stream: read before tracking begins, and tracked with the rest."""
 
-    def __init__(self, ring: BlockRing, runner: _Runner, wanted_s: float, view: BenchView, port: str) -> None:
+    def __init__(self, ring: BlockRing, runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
         self._ring, self._read = ring, list[Block]()
         wanted = round(wanted_s * view.rate_hz) + 1
         while not self._read or self._end() < wanted:
-            frame = ring.read(_LOOK_S)
+            frame = ring.read(LOOK_S)
             if frame is not None:
                 self._read.append(frame.block)
             elif ring.ended and not ring.filled:
@@ -281,7 +183,7 @@ class _Lead:
         """Yield what was read, from a number on, and then what comes."""
         yield from self.source.replay.since(first)
         while True:
-            frame = self._ring.read(_LOOK_S)
+            frame = self._ring.read(LOOK_S)
             if frame is not None:
                 yield frame.block
             elif self._ring.ended and not self._ring.filled:
@@ -290,7 +192,7 @@ class _Lead:
     def _end(self) -> int:
         return self._read[-1].first + len(self._read[-1].values)
 
-    def _too_short(self, runner: _Runner, wanted_s: float, rate_hz: float) -> None:
+    def _too_short(self, runner: LiveRun, wanted_s: float, rate_hz: float) -> None:
         runner.__exit__(None, None, None)
         report = runner.report()
         if report.interrupted:

@@ -68,7 +68,7 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
     reasons = list(ended(report, "the look at rest"))
     cautions: list[str] = []
-    shown = {role: _mean_sd(seen[role]) for role in ("position", "current") if role in seen and seen[role].size}
+    shown = {role: _mean_sd(x) for role, x in seen.items() if role in ("position", "current") and x.size}
     for role, (mean, sd) in shown.items():
         unit = _UNITS[role]
         low, high = room.trips[role]

@@ -7,9 +7,7 @@ to there stays in the folder.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from ambid.identify.estimate import Estimate
 from ambid.job._progress import Tick, silent
 from ambid.job.acquire import Acquired, Progress, acquire
 from ambid.job.commission import bench, result
+from ambid.job.commission.folder import check_folder, whole_file, write_text
 from ambid.job.commission.step import EXCITATION, STEPS, Step, StepName, Wishes
 from ambid.job.look import Room, looking
 from ambid.job.physical import identify, load, signals_of
@@ -30,9 +29,6 @@ from ambid.rig import Rig, rig_text
 from ambid.track.lines_json import TrackWriter
 
 SCHEMA = "ambid.commission/1"
-FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl", "commission.json")
-"""What a commissioning leaves in its folder."""
-
 _LIMIT = 1.5  # acceptable model error of tracking
 
 
@@ -91,7 +87,7 @@ def commission(
     rig : Rig
         The bench, with ``[loop]`` and ``[daq]``.
     folder : str or Path
-        Where the files go; it has to exist, and none of `FILES` may be in it: see `check_folder`.
+        Where the files go; it has to exist, and none of `folder.FILES` may be in it: see `folder.check_folder`.
     wishes : Wishes, optional
         What is to be reached.
     on_begin, on_step : callable, optional
@@ -119,42 +115,19 @@ def commission(
     check_folder(place)
     guide = _Guide(device, rig, place, wishes or Wishes(), on_progress, on_event, stopped, tick or silent)
     guide.check()
-    _write(place / "rig.toml", rig_text(rig, place))
+    write_text(place / "rig.toml", rig_text(rig, place))
     done: list[Step] = []
     for name, do in guide.steps(confirm or _agreed):
         if on_begin is not None:
             on_begin(name)
         step = _done(name, do)
         done.append(step)
-        _write(place / "commission.json", _summary(done, device, guide.wishes))
+        write_text(place / "commission.json", _summary(done, device, guide.wishes))
         if on_step is not None:
             on_step(step)
         if not step.passed:
             break
     return Commissioned(steps=tuple(done), estimate=guide.estimate, folder=place)
-
-
-def check_folder(folder: str | Path) -> None:
-    """Refuse a folder that holds an earlier commissioning.
-
-    Parameters
-    ----------
-    folder : str or Path
-
-    Raises
-    ------
-    AmbidError
-        If it is no folder, may not be written, or one of `FILES`, or what a killed recording left, is in it.
-    """
-    place = Path(folder)
-    if not place.is_dir():
-        raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
-    if not os.access(place, os.W_OK):
-        raise AmbidError(f"folder {place} may not be written. Choose another folder")
-    there = [name for name in FILES if (place / name).exists()]
-    there += sorted(path.name for path in place.glob("*.journal"))
-    if there:
-        raise AmbidError(f"{place} holds {', '.join(there)} of an earlier commissioning. Take an empty folder")
 
 
 def _agreed(name: StepName) -> bool:
@@ -278,7 +251,7 @@ class _Guide:
         self.estimate = identify(
             self._place / "record.h5", self._rig, validate=self._place / "second.h5", tick=self._tick
         )
-        _write(self._place / "estimate.json", self.estimate.dumps())
+        write_text(self._place / "estimate.json", self.estimate.dumps())
         return result.identification(self.estimate, self.wishes)
 
     def _report(self) -> Step:
@@ -294,7 +267,7 @@ class _Guide:
         run = replay(self.estimate, signals_of(used, model(self.estimate.model)))
         evidence = Evidence(estimate=self.estimate, run=run, start_s=used.start_s)
         made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        _write(self._place / "report.html", report_html(evidence, made=made))
+        write_text(self._place / "report.html", report_html(evidence, made=made))
         return Step(name="report", findings=(f"{self._place / 'report.html'}",))
 
     def _track(self, amplitude_v: float) -> Step:
@@ -304,7 +277,7 @@ class _Guide:
             self._device, self._rig, course, start=self.estimate, limit=_LIMIT, on_event=self._on_event,
             stopped=self._stopped,
         )  # fmt: skip
-        with _whole(self._place / "track.jsonl") as beside, TrackWriter(beside) as writer:
+        with whole_file(self._place / "track.jsonl") as beside, TrackWriter(beside) as writer:
             writer.header(done.track.header)
             for line in done.track.lines:
                 writer.line(line)
@@ -325,21 +298,3 @@ def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
         },
         indent=1,
     )
-
-
-def _write(path: Path, text: str) -> None:
-    with _whole(path) as beside:
-        beside.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Let a file be written under another name, and put it in place whole."""
-    beside = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        yield beside
-        os.replace(beside, path)
-    except OSError as failure:
-        raise AmbidError(f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk") from None
-    finally:
-        beside.unlink(missing_ok=True)
