@@ -13,6 +13,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 _ARRAY = re.compile(r"\b(NDArray|ndarray|ArrayLike|\w*Array)\b")
 _SHAPE = re.compile(r"\bshape|\(\s*[\w][\w .+*/-]*,[^()]*\)")
+_AS = re.compile(r"As `(\w+)\.(\w+)`")
 _NOT_FOR_CALLERS = {"NotImplementedError", "AssertionError"}
 
 
@@ -81,8 +82,20 @@ def _class_complaints(node: ast.ClassDef) -> Iterator[str]:
             continue
         if member.name == "__init__" and not exception:
             yield from _parameter_complaints(member, node.name, [doc, Docstring.read(ast.get_docstring(member) or "")])
-        elif not member.name.startswith("_"):
+        elif not member.name.startswith("_") and not promised_by(member, text):
             yield from _function_complaints(member, f"{node.name}.{member.name}", method=True)
+
+
+def promised_by(method: Function, class_text: str) -> str:
+    """Path of the contract whose docstring a method refers to, ``As `Device.start`.``; the class names it in full.
+
+    Empty where the method refers to none, to another method, or to a contract that its class does not name.
+    """
+    found = _AS.match(ast.get_docstring(method) or "")
+    if found is None or found[2] != method.name:
+        return ""
+    named = re.search(rf"`(ambid(?:\.\w+)*\.{found[1]})`", class_text)
+    return named[1] if named else ""
 
 
 def _function_complaints(node: Function, name: str, *, method: bool = False) -> Iterator[str]:

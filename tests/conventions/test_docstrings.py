@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conventions.docstring_rules import module_complaints
+from tests.conventions.docstring_rules import module_complaints, promised_by
 from tests.conventions.sources import PACKAGE, ROOT, module_name, package_files, parsed, rooms, shown
 
 PUBLIC_FILES = [
@@ -46,6 +46,27 @@ def _exported_from_private_modules(module):
 
 def _has_code(path):
     return bool(parsed(path).body)
+
+
+def promises(tree):
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            for member in node.body:
+                if isinstance(member, ast.FunctionDef) and (path := promised_by(member, ast.get_docstring(node) or "")):
+                    yield member, path
+
+
+def test_a_docstring_that_refers_to_a_contract_finds_the_method_there_with_the_same_parameters():
+    met = 0
+    for path in PUBLIC_FILES:
+        for method, contract in promises(parsed(path)):
+            module, _, name = contract.rpartition(".")
+            promised = inspect.unwrap(getattr(getattr(importlib.import_module(module), name), method.name))
+            assert promised.__doc__
+            own = [a.arg for a in (*method.args.args, *method.args.kwonlyargs)]
+            assert list(inspect.signature(promised).parameters) == own, f"{shown(path)}: {method.name}"
+            met += 1
+    assert met > 5
 
 
 def test_the_walk_meets_the_package():
@@ -140,6 +161,32 @@ def test_a_missing_part_is_found(old, new, complaint):
     assert old in GOOD
     found = list(module_complaints(ast.parse(GOOD.replace(old, new, 1))))
     assert any(complaint in line for line in found), found
+
+
+REFERRING = '''
+"""A module."""
+
+class Bench:
+    """A bench. See `ambid.acquire.device.Device` for what its methods promise."""
+
+    def start(self, mode: str) -> None:
+        """As `Device.start`."""
+        raise DeviceError("refused")
+'''
+
+
+def test_a_method_may_refer_to_the_contract_that_its_class_names():
+    assert list(module_complaints(ast.parse(REFERRING))) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("See `ambid.acquire.device.Device`", "See it"), ("`Device.start`", "`Device.stop`"), ("As `", "Like `")],
+    ids=["not named", "another method", "no reference"],
+)
+def test_a_method_that_refers_to_nothing_is_found(old, new):
+    found = list(module_complaints(ast.parse(REFERRING.replace(old, new, 1))))
+    assert any("'mode' is not documented" in line for line in found)
 
 
 def test_only_the_named_are_looked_at():

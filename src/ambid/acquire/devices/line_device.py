@@ -136,17 +136,7 @@ class LineDevice(ABC):
             self._end()
 
     def self_test(self) -> SelfTest:
-        """Let the controller look at itself; idle only.
-
-        Returns
-        -------
-        SelfTest
-
-        Raises
-        ------
-        DeviceError
-            If it is not idle, or the line is lost.
-        """
+        """As `Device.self_test`."""
         found = self._ask("self_test")
         about = {e.name: e.about for e in table().bits["failed"]}
         failed = tuple(about[name] for name in table().names_of_bits("failed", found["failed"]))
@@ -154,17 +144,7 @@ class LineDevice(ABC):
         return SelfTest(failed=failed, numbers=MappingProxyType(numbers))
 
     def start(self, mode: Mode) -> None:
-        """Begin.
-
-        Parameters
-        ----------
-        mode : {"sample", "drive", "levitate"}
-
-        Raises
-        ------
-        DeviceError
-            If the controller refuses, or the line is lost.
-        """
+        """As `Device.start`."""
         if mode not in _MODES:
             raise DeviceError(f"{self._where} has no mode {mode!r}; there are {', '.join(_MODES)}. Give one of them")
         before = self.state
@@ -179,18 +159,7 @@ class LineDevice(ABC):
         self._stream.enter(_MODES[mode], unless_fault=True)  # it may have tripped in its first tick
 
     def excite(self, program: Program | None) -> None:
-        """Play an excitation from the next tick on.
-
-        Parameters
-        ----------
-        program : Program or None
-            None ends it.
-
-        Raises
-        ------
-        DeviceError
-            If the controller refuses, or the line is lost.
-        """
+        """As `Device.excite`."""
         on = self.state in ("driving", "levitating")
         if program is not None and not on:
             raise DeviceError(
@@ -209,23 +178,7 @@ class LineDevice(ABC):
             self._ask("excite", {"on": 1})
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next block.
-
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for it, s.
-
-        Returns
-        -------
-        Frame or None
-            None if none came in time, or at the end.
-
-        Raises
-        ------
-        DeviceError
-            If the line is lost and all that came is read, or the device was never opened.
-        """
+        """As `Device.read`."""
         frame = None
         try:
             frame = self._stream.frames.take(timeout_s)
@@ -242,7 +195,7 @@ class LineDevice(ABC):
         return self._stream.frames.ended
 
     def events(self) -> Sequence[DeviceEvent]:
-        """Return what was told since the last call."""
+        """As `Device.events`."""
         found = self._stream.events()
         damaged = self._last.damaged if self._controller is None else self._damaged(self._controller)
         if damaged > self._damaged_told:
@@ -251,17 +204,11 @@ class LineDevice(ABC):
         return tuple(found)
 
     def counters(self) -> Counters:
-        """Return what was counted so far."""
+        """As `Device.counters`."""
         return self._last if self._controller is None else self._counted(self._controller)
 
     def stop(self) -> None:
-        """Output off, no more samples; those on their way can still be read.
-
-        Raises
-        ------
-        DeviceError
-            If the line is lost; the controller then goes to its safe state by itself.
-        """
+        """As `Device.stop`. Where the line is lost, the controller goes to its safe state by itself."""
         self._stream.ending = True
         try:
             self._ask("stop")
@@ -272,13 +219,7 @@ class LineDevice(ABC):
         self._stream.enter("idle", unless_fault=True)
 
     def clear(self) -> None:
-        """Leave the safe state after a fault whose cause is gone.
-
-        Raises
-        ------
-        DeviceError
-            If the cause is still there, there is no fault, or the line is lost.
-        """
+        """As `Device.clear`; refused where there is no fault, or its cause is still there."""
         self._ask("clear")
         self._stream.finish(self._ask("ask_status")["ticks"])
         self._stream.enter("idle")

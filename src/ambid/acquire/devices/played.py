@@ -115,17 +115,7 @@ class PlayedDevice(ABC):
                 self._open = False
 
     def self_test(self) -> SelfTest:
-        """Look at itself; idle only.
-
-        Returns
-        -------
-        SelfTest
-
-        Raises
-        ------
-        DeviceError
-            If it is not idle.
-        """
+        """As `Device.self_test`."""
         with self._lock:
             self._ready("self_test")
             if self._state != "idle":
@@ -133,17 +123,7 @@ class PlayedDevice(ABC):
             return self._tested()
 
     def start(self, mode: Mode) -> None:
-        """Begin.
-
-        Parameters
-        ----------
-        mode : {"sample", "drive", "levitate"}
-
-        Raises
-        ------
-        DeviceError
-            If it cannot do that, or not from this state.
-        """
+        """As `Device.start`."""
         with self._lock:
             self._ready("start")
             if mode not in _MODES:
@@ -160,18 +140,7 @@ class PlayedDevice(ABC):
             self._enter_state(_MODES[mode])
 
     def excite(self, program: Program | None) -> None:
-        """Play an excitation from the next tick on.
-
-        Parameters
-        ----------
-        program : Program or None
-            None ends it.
-
-        Raises
-        ------
-        DeviceError
-            If it cannot, or not from this state.
-        """
+        """As `Device.excite`."""
         with self._lock:
             self._ready("excite")
             if program is not None and self._state not in ("driving", "levitating"):
@@ -179,23 +148,7 @@ class PlayedDevice(ABC):
             self._play(program)
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Return the next block.
-
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for it, s.
-
-        Returns
-        -------
-        Frame or None
-            None if none came in time, or at the end.
-
-        Raises
-        ------
-        DeviceError
-            If it was never opened.
-        """
+        """As `Device.read`."""
         end = time.perf_counter() + timeout_s
         with self._lock:
             if not self._open and not self._queue:
@@ -221,19 +174,19 @@ class PlayedDevice(ABC):
             return not self._flowing and not self._queue
 
     def events(self) -> Sequence[DeviceEvent]:
-        """Return what was told since the last call."""
+        """As `Device.events`."""
         with self._lock:
             self._catch_up(partly=True)
             found, self._events = tuple(self._events), []
             return found
 
     def counters(self) -> Counters:
-        """Return what was counted so far."""
+        """As `Device.counters`."""
         with self._lock:
             return Counters(samples=self._samples, lost=self._lost, overruns=self._overruns)
 
     def stop(self) -> None:
-        """Output off, no more samples; those that are due can still be read."""
+        """As `Device.stop`; those that are due can still be read."""
         with self._lock:
             self._catch_up(partly=True)
             self._flowing = False
@@ -242,13 +195,7 @@ class PlayedDevice(ABC):
             self._lock.notify_all()
 
     def clear(self) -> None:
-        """Leave the safe state.
-
-        Raises
-        ------
-        DeviceError
-            If there is none.
-        """
+        """As `Device.clear`; refused where there is no fault."""
         with self._lock:
             self._ready("clear")
             if self._state != "fault":
