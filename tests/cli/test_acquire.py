@@ -306,7 +306,7 @@ def test_a_full_disk_is_told_at_once_and_ends_with_2(acquire, monkeypatch):
     assert "800 samples of 60000 wanted" in done.out
 
 
-@pytest.mark.parametrize(("what", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("what", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_keeps_what_came(acquire, monkeypatch, what, code):
     before = signal.getsignal(what)
     signalled(monkeypatch, 40, what)

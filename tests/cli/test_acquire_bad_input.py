@@ -13,7 +13,7 @@ from io import FileIO
 import pytest
 
 from ambid.cli import _Told
-from ambid.cli.interrupts import Stop
+from ambid.cli.interrupts import Stop, signals
 
 PROTOTYPE = files("ambid").joinpath("data", "prototype.toml").read_text(encoding="utf-8")
 SHORT = ("acquire", "--port", "simulated", "--rig", "p.toml", "-o", "a.h5", "--seconds", "0.05", "--settle", "0.05")
@@ -229,6 +229,28 @@ def test_a_program_that_is_no_emulated_bench_is_refused(ambid, folder, monkeypat
     monkeypatch.setenv("AMBID_FIRMWARE", str(folder / "p.toml"))
     refused(ambid(*SHORT, "--port", "emulated"), "emulated bench", "cannot be started" if says is None else "said")
     assert sorted(os.listdir(folder)) == ["bench.sh", "p.toml"]
+
+
+def test_a_firmware_of_another_machine_is_refused(ambid, folder, monkeypatch):
+    pytest.importorskip("serial")
+    program = folder / "bench.sh"
+    program.write_text("#!/bin/sh\n", encoding="utf-8")
+    program.chmod(0o755)
+    (folder / "host.elf").write_bytes(b"\x7fELF" + bytes(14) + b"\x3e\x00")
+    monkeypatch.setenv("AMBID_BENCH", str(program))
+    monkeypatch.setenv("AMBID_FIRMWARE", str(folder / "host.elf"))
+    refused(ambid(*SHORT, "--port", "emulated"), "host.elf is a program, but not of an AVR", "AMBID_FIRMWARE")
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals do not close here")
+def test_what_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals(Stop().take):
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_more_than_two_signals_tear_no_cleaning_off():

@@ -131,7 +131,7 @@ def command(
     except KeyboardInterrupt:
         typer.echo(f"ambid: interrupted{left(record, _changed(record) != before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
-    tell(done, wish, table=json != "-")
+    tell(done, wish, stop, table=json != "-")
     if track_end is not None:
         track_end()
     finish(done, wish, stop, strict=strict)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,13 +20,15 @@ if TYPE_CHECKING:
     from ambid.job.acquire import Acquired
 
 
-def tell(done: Acquired, wish: Wish, *, table: bool) -> None:
+def tell(done: Acquired, wish: Wish, stop: Stop, *, table: bool) -> None:
     """Say what was recorded; where standard output is of the track, only what is not good of it.
 
     Parameters
     ----------
     done : Acquired
     wish : Wish
+    stop : Stop
+        With the signal that ended it, if one did: a terminal that was closed takes nothing.
     table : bool
         Whether standard output is for it.
     """
@@ -33,7 +37,12 @@ def tell(done: Acquired, wish: Wish, *, table: bool) -> None:
     if table:
         from ambid.report.acquire_text import acquired_text
 
-        typer.echo(acquired_text(done, wish.record, paint=painter()))
+        try:
+            typer.echo(acquired_text(done, wish.record, paint=painter()))
+        except OSError:
+            if stop.number is None:
+                raise
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - nobody reads: it stays open to the end
     else:
         for line in done.quality.verdict:
             typer.echo(f"ambid: note: {line}", err=True)

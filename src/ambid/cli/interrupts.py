@@ -1,4 +1,4 @@
-"""Ctrl-C and the signal to terminate, for runs that end in an orderly way instead of being torn off."""
+"""Ctrl-C, the signal to terminate and that of a closed terminal: runs end in an orderly way, and are not torn off."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from types import FrameType
 
 @contextmanager
 def signals(take: Callable[[int], None]) -> Iterator[None]:
-    """Give Ctrl-C, and the signal to terminate, to a function; as before afterwards.
+    """Give Ctrl-C, the signal to terminate and that of a closed terminal to a function; as before afterwards.
+
+    What is ignored stays so: a program under ``nohup`` outlives its terminal.
 
     Parameters
     ----------
@@ -31,7 +33,10 @@ def signals(take: Callable[[int], None]) -> Iterator[None]:
         del frame
         take(number)
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    closed = getattr(signal, "SIGHUP", None)  # not every system has terminals that close
+    if closed is not None and signal.getsignal(closed) is not signal.SIG_IGN:
+        numbers.append(closed)
     before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield

@@ -109,9 +109,10 @@ def test_emulated_time_waits_for_its_reader():
         assert device.counters().lost == device.counters().overruns == 0
 
 
-def test_an_emulator_that_dies_is_a_lost_line():
+def test_an_emulator_that_dies_is_told_as_such():
     device = EmulatedDevice(PROTOTYPE)
-    with pytest.raises(DeviceError, match="was lost"), device:  # noqa: PT012 - what came before is read first
+    ended = r"the emulated bench ended by signal 9 \(SIGKILL\)"
+    with pytest.raises(DeviceError, match=ended), device:  # noqa: PT012 - what came before is read first
         device.start("levitate")
         assert device.read(60.0) is not None
         os.kill(device.emulator.pid, signal.SIGKILL)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from ambid.acquire.default_daq import with_default_daq
+from ambid.acquire.devices._folders import TemporaryFolder
 from ambid.acquire.devices.emulator import Emulator
 from ambid.acquire.devices.frames import ROOM
 from ambid.acquire.devices.line_device import LineDevice
 from ambid.acquire.devices.plant_file import write_plant_file
 from ambid.acquire.devices.played import Pace
-from ambid.acquire.link.port import Port, open_port
+from ambid.acquire.link.port import Port, PortEnded, open_port
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
@@ -22,13 +21,14 @@ from ambid.rig.rig import Rig
 _ANSWER_S = 2.0  # a busy machine may hold the emulator up
 _UNREAD_S = 0.25  # of the controller's time
 _LOOK_S = 0.001
+_GONE_S = 1.0  # between the end of a line and that of its program
 
 
-class _WaitingPort:
-    """A port from which nothing is taken while nobody wants it."""
+class _EmulatedPort:
+    """A port from which nothing is taken while nobody wants it, and that says how the bench behind it ended."""
 
-    def __init__(self, port: Port, paused: Callable[[], bool]) -> None:
-        self._port, self._paused = port, paused
+    def __init__(self, port: Port, emulator: Emulator, paused: Callable[[], bool]) -> None:
+        self._port, self._emulator, self._paused = port, emulator, paused
 
     @property
     def name(self) -> str:
@@ -38,10 +38,20 @@ class _WaitingPort:
         if self._paused():
             time.sleep(_LOOK_S)
             return b""
-        return self._port.read()
+        try:
+            return self._port.read()
+        except OSError as failure:
+            raise self._why(failure) from None
 
     def write(self, data: bytes) -> None:
-        self._port.write(data)
+        try:
+            self._port.write(data)
+        except OSError as failure:
+            raise self._why(failure) from None
+
+    def _why(self, failure: OSError) -> OSError:
+        how = self._emulator.ended(_GONE_S)
+        return failure if how is None else PortEnded(f"the emulated bench ended {how}. Start again")
 
     def close(self) -> None:
         self._port.close()
@@ -100,7 +110,7 @@ class EmulatedDevice(LineDevice):
         )
         self._bench, self._pace, self._seed, self._script = bench, pace, seed, script
         self._kept, self._trajectory = folder, trajectory
-        self._folder: Path | None = None
+        self._temporary: TemporaryFolder | None = None
         self._emulator: Emulator | None = None
 
     @property
@@ -109,21 +119,24 @@ class EmulatedDevice(LineDevice):
         return self._emulator
 
     def _open(self) -> Port:
-        self._folder = self._kept or Path(tempfile.mkdtemp(prefix="ambid-emulated-"))
-        self._folder.mkdir(parents=True, exist_ok=True)
-        plant = self._folder / "plant.txt"
+        folder = self._kept
+        if folder is None:
+            self._temporary = TemporaryFolder()
+            folder = self._temporary.path
+        folder.mkdir(parents=True, exist_ok=True)
+        plant = folder / "plant.txt"
         write_plant_file(plant, self._rig, bench=self._bench)
         self._emulator = Emulator(
             plant,
             script=self._script,
             pace=self._pace,
             seed=self._seed,
-            folder=self._folder,
+            folder=folder,
             trajectory=self._trajectory,
         )
         self._emulator.start()
         port = open_port(self._emulator.port, baud=self._baud, boot_s=0.0)
-        return port if self._real else _WaitingPort(port, self._paused)
+        return _EmulatedPort(port, self._emulator, self._paused)
 
     def _paused(self) -> bool:
         # Bytes that are not taken hold the emulator up. An answer that is waited for may stand behind them.
@@ -139,6 +152,6 @@ class EmulatedDevice(LineDevice):
         emulator, self._emulator = self._emulator, None
         if emulator is not None:
             emulator.close()
-        folder, self._folder = self._folder, None
-        if folder is not None and self._kept is None:
-            shutil.rmtree(folder, ignore_errors=True)
+        temporary, self._temporary = self._temporary, None
+        if temporary is not None:
+            temporary.remove()

@@ -13,12 +13,12 @@ import select
 import shutil
 import signal
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
+from ambid.acquire.devices._folders import TemporaryFolder
 from ambid.errors import DeviceError
 
 INSTALL = "apt-get install gcc-avr avr-libc libsimavr-dev"
@@ -26,6 +26,7 @@ INSTALL = "apt-get install gcc-avr avr-libc libsimavr-dev"
 
 _START_S = 60.0  # only ends a hang; a loaded machine may be slow
 _END_S = 10.0
+_AVR = b"\x53\x00"  # machine of an ELF file, little-endian
 
 
 def find_program() -> Path:
@@ -107,7 +108,8 @@ class Emulator:
     ) -> None:
         self._plant, self._firmware, self._program, self._script = Path(plant), firmware, program, script
         self._options = ["--pace", pace, "--lockstep", repr(float(lockstep_ms)), "--seed", str(seed)]
-        self._folder, self._own = folder, folder is None
+        self._folder = folder
+        self._temporary: TemporaryFolder | None = None
         self._trajectory = trajectory
         self._process: subprocess.Popen[bytes] | None = None
         self.port = ""
@@ -150,6 +152,7 @@ class Emulator:
         if self._process is not None:
             return
         program, firmware = self._program or find_program(), self._firmware or find_firmware()
+        _check_firmware(firmware)
         folder = self._place()
         folder.mkdir(parents=True, exist_ok=True)
         command = [str(program), "--firmware", str(firmware), "--plant", str(self._plant), "--log", str(self.log_path)]
@@ -187,9 +190,30 @@ class Emulator:
             _end(process)
             if process.stdout is not None:
                 process.stdout.close()
-        if self._own and not keep and self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            self._folder = None
+        if self._temporary is not None and not keep:
+            self._temporary.remove()
+            self._folder = self._temporary = None
+
+    def ended(self, timeout_s: float) -> str | None:
+        """Return how the process ended by itself.
+
+        Parameters
+        ----------
+        timeout_s : float
+            How long to wait for its end, s.
+
+        Returns
+        -------
+        str or None
+            Words; None where it still runs, or was never started.
+        """
+        if self._process is None:
+            return None
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+        return f"{_way(code)}: {said}" if (said := self.said()) else _way(code)
 
     def events(self, name: str | None = None) -> list[dict[str, Any]]:
         """Return what the log says so far.
@@ -223,7 +247,8 @@ class Emulator:
 
     def _place(self) -> Path:
         if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="ambid-emulated-"))
+            self._temporary = TemporaryFolder()
+            self._folder = self._temporary.path
         return self._folder
 
     def _said_path(self) -> Path:
@@ -252,7 +277,7 @@ class Emulator:
         if not text.endswith(b"\n"):
             code = _end(process)
             raise DeviceError(
-                f"emulated bench: it ended with {code} before its port was there: {self.said() or 'without a word'}."
+                f"emulated bench: it ended {_way(code)} before its port was there: {self.said() or 'without a word'}."
                 " Correct what it names"
             )
         try:
@@ -274,6 +299,30 @@ def _end(process: subprocess.Popen[bytes]) -> int:
             process.kill()
             process.wait()
     return process.returncode
+
+
+def _way(code: int) -> str:
+    """Say how a process ended."""
+    if code >= 0:
+        return f"with {code}"
+    try:
+        return f"by signal {-code} ({signal.Signals(-code).name})"
+    except ValueError:
+        return f"by signal {-code}"
+
+
+def _check_firmware(path: Path) -> None:
+    """Refuse a program of another machine, on which the emulator's library crashes; of other files it tells itself."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(20)
+    except OSError:
+        return
+    if head[:4] == b"\x7fELF" and (len(head) < 20 or head[18:20] != _AVR):
+        raise DeviceError(
+            f"emulated bench: firmware {path} is a program, but not of an AVR controller. Build the firmware with 'make"
+            " firmware', or correct AMBID_FIRMWARE"
+        )
 
 
 def _find(variable: str, name: str, target: str, sources: tuple[str, ...]) -> Path:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from ambid.acquire.link.listener import Hearing, Listener
-from ambid.acquire.link.port import Port
+from ambid.acquire.link.port import Port, PortEnded
 from ambid.acquire.link.refusals import refusal
 from ambid.acquire.protocol.codec import Message, message
 from ambid.acquire.protocol.framing import FrameCounters, encode
@@ -285,7 +285,10 @@ class Controller:
             if self._failure is not None or self._closing:
                 return
             self._failure = DeviceError(
-                f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port anew"
+                str(failure)
+                if isinstance(failure, PortEnded)
+                else f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port"
+                " anew"
             )
             self._news.notify_all()
         with self._due:

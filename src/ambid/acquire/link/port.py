@@ -22,6 +22,10 @@ _LARGEST = 65536  # bytes of one read
 _PSEUDO = ("/dev/pts/", "/dev/ttys0", "/dev/pty")  # terminals without a board behind them
 
 
+class PortEnded(OSError):
+    """What stood behind a port has ended, and no cable brings it back; its text says all."""
+
+
 class Port(Protocol):
     """A line of bytes in both directions. All methods but `read` and `write` may be called from any thread."""
 
