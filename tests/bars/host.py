@@ -147,7 +147,7 @@ class Host:
 
     def pump(self):
         """Take what has come, and give a sign of life where one is due."""
-        for payload in self.decoder.feed(self.port.read()):
+        for payload in self.decoder.feed(self._read()):
             if payload[0] == _SAMPLE:
                 self._keep(payload)
             else:
@@ -156,6 +156,14 @@ class Host:
         late = self.ping_by_clock and time.monotonic() - self.clock > PING_S
         if self.pings and (due or late):
             self.ping()
+
+    def _read(self):
+        try:
+            return self.port.read()
+        except OSError as lost:
+            process, last = self.bench._process, self.bench.events()[-3:]
+            code = process.wait(HANG_S) if process else None
+            raise AssertionError(f"the bench ended with {code}: {self.bench.said()!r}, {last}") from lost
 
     def _keep(self, payload):
         _, tick, state = _HEAD.unpack_from(payload)
