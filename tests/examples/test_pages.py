@@ -122,25 +122,47 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
     from ambid.cli.app import run_verb
 
     monkeypatch.chdir(tmp_path)
+    said: dict[str, str] = {}  # by command
     for piece in blocks(ROOT / "README.md", "sh"):
         for line in piece.splitlines():
             words = shlex.split(line, comments=True)
             if words[0] == "ambid":
                 assert run_verb(words[1:]) == 0, line
+                said[" ".join(words[1:3])] = capsys.readouterr().out
             elif words[0] == "sed":  # the one edit that the page makes to the rig file
                 old, new = re.fullmatch(r"s/(.*?)/(.*)/", words[2]).groups()
                 rig = Path(words[3])
                 rig.write_text(re.sub(old, new, rig.read_text(encoding="utf-8"), flags=re.MULTILINE), encoding="utf-8")
             else:
                 assert words[0] in (".", "cd"), f"unforeseen command: {line}"
-    printed = capsys.readouterr().out
-    assert re.search(r"^m    60 g .* fixed$", printed, re.MULTILINE)  # the edit took
-    assert "NOT SHOWN" not in printed
-    assert {"mine.json", "mine.png", "mine.html", "track.jsonl", "track.png"} <= {p.name for p in tmp_path.iterdir()}
-    rows = re.compile(r"^(m|k_x|k_i|R|L) +(-?[\d.]+) ± ([\d.]+) .* tracked$", re.MULTILINE)
-    shown = rows.findall((ROOT / "README.md").read_text(encoding="utf-8"))
-    found = {name: (float(value), float(sd)) for name, value, sd in rows.findall(printed)}
-    assert [name for name, _, _ in shown] == list(found) == ["m", "k_x", "k_i", "R", "L"]
-    for name, value, sd in shown:  # what the page shows of a track is what comes out
-        assert abs(float(value) - found[name][0]) < 0.5 * found[name][1], name
-        assert float(sd) == pytest.approx(found[name][1], rel=0.2), name
+    assert re.search(r"^m    60 g .* fixed$", said["identify mine.csv"], re.MULTILINE)  # the edit took
+    assert "NOT SHOWN" not in "".join(said.values())
+    left = {"mine.json", "mine.png", "mine.html", "track.jsonl", "track.png", "first", "run.h5"}
+    assert left <= {p.name for p in tmp_path.iterdir()}
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    tracked = re.compile(r"^(m|k_x|k_i|R|L) +(-?[\d.]+) ± ([\d.]+) (\S+) .* tracked$", re.MULTILINE)
+    same_values(tracked, page, said["track change.csv"])
+    commissioned = said["commission --port"]
+    same_values(COMMISSIONED, page, commissioned)
+    fenced = (ROOT / "docs" / "acquisition.md").read_text(encoding="utf-8").split("```")
+    page = next(piece for piece in fenced if piece.startswith("\n✓ 1/9 self-test"))
+    same_values(COMMISSIONED, page, commissioned)
+    assert without_numbers(page) <= without_numbers(commissioned)
+
+
+COMMISSIONED = re.compile(r"^  (m|k_x|k_i|R|L) = (-?[\d.]+) ± ([\d.]+) (\S+) \(95 %", re.MULTILINE)
+
+
+def same_values(rows: re.Pattern[str], page: str, printed: str) -> None:
+    """What the page shows is what comes out, but for the last digits."""
+    shown, found = rows.findall(page), rows.findall(printed)
+    assert [(name, unit) for name, _, _, unit in shown] == [(name, unit) for name, _, _, unit in found]
+    assert len(shown) == 5
+    for (name, value, sd, _), (_, now, sd_now, _) in zip(shown, found, strict=True):
+        assert abs(float(value) - float(now)) < 0.5 * float(sd_now), name
+        assert float(sd) == pytest.approx(float(sd_now), rel=0.2), name
+
+
+def without_numbers(text: str) -> set[str]:
+    """The lines of a text; a number of any size with its prefix is the same to it."""
+    return {re.sub(r"-?[\d.]+(e[+-]\d+)?( [num]?(?=[mAV]\b))?", "#", line.strip()) for line in text.strip().splitlines()}

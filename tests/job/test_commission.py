@@ -84,8 +84,9 @@ def test_what_it_says_has_digits_and_units_for_people(finished):
     _, done, _, _ = finished
     said = {s.name: s.findings for s in done.steps}
     assert said["self-test"][1] == "supply 5 V, position 921 and current 510.8 counts"
-    assert re.fullmatch(r"position at rest 1 mm, noise \d\.\d um rms", said["rest"][0])
-    assert re.fullmatch(r"current -?[\d.]+ [um]A, [\d.]+ mA rms", said["levitate"][1])
+    assert re.fullmatch(r"position at rest 1 mm, noise \d\.\d\d um rms", said["rest"][0])
+    assert re.fullmatch(r"current -?[\d.]+ [mu]A, \d+\.\d+ mA rms", said["levitate"][1])
+    assert re.fullmatch(r"voltage -?[\d.]+ [mu]?V, \d{3} mV rms", said["levitate"][2])
     m, k_x = said["identify"][:2]
     assert re.fullmatch(r"m = (299|30[01])\.\d ± \d\.\d g \(95 % interval ± [\d.]+ %\)", m)
     assert re.fullmatch(r"k_x = -6\.\d{3} ± 0\.0\d\d kN/m \(95 % interval ± [\d.]+ %\)", k_x)

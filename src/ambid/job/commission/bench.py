@@ -75,7 +75,7 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
         width = high - low
         if math.isfinite(width) and sd > _SD_AT_REST * width:
             reasons.append(
-                f"the {role} sensor's noise is {sized(sd, unit, 2)} rms with the output off, {100 * sd / width:.0f} %"
+                f"the {role} sensor's noise is {sized(sd, unit)} rms with the output off, {100 * sd / width:.0f} %"
                 " of the way between the trips: look at wiring, ground and the filter at the input"
             )
         if sd == 0.0:
@@ -86,7 +86,7 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
                 " the trips: correct the offset of channels.current, or see that the power stage does switch off"
             )
     findings = tuple(
-        f"{role} at rest {sized(mean, _UNITS[role])}, noise {sized(sd, _UNITS[role], 2)} rms"
+        f"{role} at rest {sized(mean, _UNITS[role])}, noise {sized(sd, _UNITS[role])} rms"
         for role, (mean, sd) in shown.items()
     )
     return Step(
@@ -137,7 +137,7 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
             " with; change bias, set point or supply"
         )
     findings = tuple(
-        f"{role} {sized(mean, _UNITS[role])}, {sized(sd, _UNITS[role], 2)} rms" for role, (mean, sd) in shown.items()
+        f"{role} {sized(mean, _UNITS[role])}, {sized(sd, _UNITS[role])} rms" for role, (mean, sd) in shown.items()
     )
     return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown))
 
