@@ -165,4 +165,6 @@ def same_values(rows: re.Pattern[str], page: str, printed: str) -> None:
 
 def without_numbers(text: str) -> set[str]:
     """The lines of a text; a number of any size with its prefix is the same to it."""
-    return {re.sub(r"-?[\d.]+(e[+-]\d+)?( [num]?(?=[mAV]\b))?", "#", line.strip()) for line in text.strip().splitlines()}
+    return {
+        re.sub(r"-?[\d.]+(e[+-]\d+)?( [num]?(?=[mAV]\b))?", "#", line.strip()) for line in text.strip().splitlines()
+    }
