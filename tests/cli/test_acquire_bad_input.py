@@ -12,6 +12,8 @@ from io import FileIO
 
 import pytest
 
+from ambid.acquire.causes import fault_words
+from ambid.acquire.device import DeviceEvent
 from ambid.cli import _Told
 from ambid.cli.interrupts import Stop, signals
 
@@ -97,6 +99,16 @@ def replayed(folder, change=None):
     text = "time [s],position [1],current [1],duty [1]\n" + "".join(rows if change is None else change(rows))
     (folder / "r.csv").write_text(text, encoding="utf-8")
     return ("acquire", "--port", "replay:r.csv", "--rig", "p.toml", "-o", "a.h5", "--seconds", "0.05")
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="file names are UTF-8 here")
+def test_file_names_of_other_bytes_are_read_and_written(ambid, folder):
+    words = replayed(folder)
+    odd = os.fsdecode(b"r\xff")
+    os.rename("r.csv", f"{odd}.csv")
+    done = ambid(*words, "--port", f"replay:{odd}.csv", "-o", f"{odd}.h5")
+    assert done.code == 0, done.err
+    assert os.path.exists(f"{odd}.h5")
 
 
 def test_a_record_in_other_units_than_the_rigs_is_not_replayed(ambid, folder):
@@ -229,6 +241,51 @@ def test_a_program_that_is_no_emulated_bench_is_refused(ambid, folder, monkeypat
     monkeypatch.setenv("AMBID_FIRMWARE", str(folder / "p.toml"))
     refused(ambid(*SHORT, "--port", "emulated"), "emulated bench", "cannot be started" if says is None else "said")
     assert sorted(os.listdir(folder)) == ["bench.sh", "p.toml"]
+
+
+@pytest.mark.parametrize(
+    ("sound", "changed", "parts"),
+    [
+        ("[-0.9e-3, 0.9e-3]", "[-1e-9, 1e-9]", ("rig p.toml", "has no two counts in it", "Widen daq.trip.position")),
+        ("lift_ms = 300", "lift_ms = 0", ("out_of_gap", "daq.lift_ms = 0 was over: raise it")),
+        ("rate_hz = 2000.0", "rate_hz = 2001.0", ("rig p.toml: daq.rate_hz is 2001 Hz",)),
+    ],
+)
+def test_entries_that_cannot_work_are_told_by_their_name(ambid, folder, sound, changed, parts):
+    assert sound in PROTOTYPE
+    (folder / "p.toml").write_text(PROTOTYPE.replace(sound, changed), encoding="utf-8")
+    refused(ambid(*SHORT), *parts)
+
+
+def test_a_fault_long_after_lift_off_is_not_put_down_to_it():
+    late = DeviceEvent(kind="fault", sample=2000, what="out_of_gap")
+    assert "gains of [loop], excite less" in fault_words(late, rate_hz=2000.0, lift_ms=300)
+    assert "gains of [loop], excite less" in fault_words(late)
+
+
+@pytest.mark.parametrize("volts", ["1e9", "1e-9"])
+def test_an_amplitude_is_told_in_few_digits(ambid, folder, volts):
+    done = ambid(*SHORT, "--seconds", "1", "--excitation", "prbs", "--amplitude", volts)
+    refused(done, "an excitation of", "room for 1 to 380")
+    assert "e+10 counts" in done.err or "e-08 counts" in done.err
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no /dev/null here")
+def test_only_what_may_go_to_standard_output_is_advised_to(ambid, folder):
+    refused(ambid(*SHORT, "-o", "/dev/null"), "is a device or a pipe; a file is wanted. Name one")
+
+
+def test_a_replay_of_nothing_is_refused(ambid, folder):
+    refused(ambid(*SHORT, "--port", "replay:"), "'replay:' names no record")
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [(("--seconds", "0.01"), "the record has 0.01 s"), (("--band", "900:2000"), "band 900 to 2000 Hz")],
+)
+def test_commission_refuses_lengths_and_bands_before_anything_moves(ambid, folder, words, part):
+    refused(ambid("commission", "--port", "simulated", "--rig", "p.toml", "-o", "f", *words), part)
+    assert os.listdir(folder) == ["p.toml"]
 
 
 def test_a_firmware_of_another_machine_is_refused(ambid, folder, monkeypatch):

@@ -1,12 +1,14 @@
 """``ambid recover``: what a recording that could not finish has left becomes a record, and what is missing is said."""
 
 import gzip
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Recorder, journal_path
+from ambid.acquire.recorder import Damage, Recorded, Recorder, Survey, journal_path
+from ambid.cli.recover import _lacks
 from ambid.record import read_record
 from tests.acquire.recorder.signals import ROWS, block, header, same_bits, values_at
 
@@ -232,3 +234,16 @@ def test_one_that_is_refused_does_not_keep_the_others_back(left, ambid):
     assert found.code == 2
     assert [line.split()[2] for line in found.err.splitlines()] == ["nor.journal", "none.journal"]
     assert len(values_of("run.h5")) == BLOCKS * ROWS
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (Damage(places=1), "bytes damaged in 1 place"),
+        (Damage(frames=1, places=1), "1 entry damaged, in 1 place"),
+        (Damage(blocks=2, frames=3, places=1), "2 blocks and 1 other entry damaged, in 1 place"),
+    ],
+)
+def test_only_what_is_damaged_is_counted(damage, words):
+    made = Recorded(path=Path("a.h5"), rate_hz=2000.0, survey=Survey(damage=damage))
+    assert _lacks(made) == f" with {words}"

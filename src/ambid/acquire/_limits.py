@@ -80,6 +80,11 @@ def trip_counts(rig: Rig, scale: Scale) -> tuple[int, int]:
         low, high = _one_sided(scale, wanted, low, high)
     elif low < 1 or high > ADC_TOP - 1:
         raise _beyond(rig, scale, wanted)
+    if low >= high and 0.0 <= ends[0] < ends[1] <= ADC_TOP:
+        raise RigError(
+            f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, has no two counts in it: one is"
+            f" {abs(scale.slope(float(ends.mean()))):.3g} by channels.{scale.role}. Widen daq.trip.{scale.role}"
+        )
     if low >= high or low > ADC_TOP or high < 0:
         raise _beyond(rig, scale, wanted)
     return low, high

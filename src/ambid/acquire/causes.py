@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -23,13 +24,19 @@ _REMEDY: Mapping[str, str] = MappingProxyType(
 """What to do about each cause of `messages.toml`."""
 
 
-def fault_words(fault: DeviceEvent) -> str:
+_AT_ONCE_MS = 10  # after the time to lift
+
+
+def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int = 0) -> str:
     """Write a fault for people: cause, what it means, where, and what to do.
 
     Parameters
     ----------
     fault : DeviceEvent
         Of kind ``fault``.
+    rate_hz, lift_ms : float, int
+        Samples in one second, and the time that the rotor is given to lift off, where the run began with sample 0:
+        what left the gap at the end of that time had not come into it.
 
     Returns
     -------
@@ -39,4 +46,8 @@ def fault_words(fault: DeviceEvent) -> str:
     about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
     at = "" if fault.sample is None else f" at sample {fault.sample}"
     meaning = "" if about is None else f", {about}"
-    return f"{fault.what}{meaning}{at}. {_REMEDY.get(fault.what, 'See to the cause')}"
+    remedy = _REMEDY.get(fault.what, "See to the cause")
+    lifted = (lift_ms + _AT_ONCE_MS) * rate_hz / 1e3  # a rate that is not known compares false
+    if fault.what == "out_of_gap" and fault.sample is not None and fault.sample <= lifted:
+        remedy = f"The rotor was not up when daq.lift_ms = {lift_ms} was over: raise it, or change the gains of [loop]"
+    return f"{fault.what}{meaning}{at}. {remedy}"

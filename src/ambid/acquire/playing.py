@@ -120,12 +120,13 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
         If the voltage has no calibration.
     """
     step = abs(scale_of(rig, "voltage").slope(duty_bias))
-    counts = round(program.amplitude / step)
+    exact = program.amplitude / step
+    counts = round(min(exact, 1e9))
     room = min(duty_bias - duty[0], duty[1] - duty_bias)
     if not 1 <= counts <= room:
         raise DeviceError(
-            f"{who(rig)}: an excitation of {program.amplitude:.4g} V is {counts} counts of pulse width; about rest at"
-            f" {duty_bias} counts there is room for 1 to {room}, {step:.3g} to {step * room:.4g} V. Give another"
+            f"{who(rig)}: an excitation of {program.amplitude:.4g} V is {exact:.3g} counts of pulse width; about rest"
+            f" at {duty_bias} counts there is room for 1 to {room}, {step:.3g} to {step * room:.4g} V. Give another"
         )
     return counts
 

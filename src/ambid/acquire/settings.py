@@ -16,7 +16,7 @@ from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ,
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
 from ambid.acquire.scales import scale_of, who
-from ambid.errors import RigError
+from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
 from ambid.rig.rig import Daq, Rig
@@ -145,7 +145,7 @@ def controller_settings(rig: Rig) -> ControllerSettings:
         0 if position is None else count_inside(rig, position, rest["position"], position_low, position_high, "trips")
     )
     settings = ControllerSettings(
-        period=period_of(daq.rate_hz),
+        period=_period(rig, daq),
         stream=stream_of(rig, daq),
         position_low=position_low,
         position_high=position_high,
@@ -217,6 +217,13 @@ def rest_of(rig: Rig) -> dict[str, float]:
         "current": current,
         "voltage": given.get("voltage", resistance * current),
     }
+
+
+def _period(rig: Rig, daq: Daq) -> int:
+    try:
+        return period_of(daq.rate_hz)
+    except DeviceError as failure:
+        raise DeviceError(f"{who(rig)}: {failure}") from None
 
 
 def _daq(rig: Rig) -> Daq:

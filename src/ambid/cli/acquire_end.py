@@ -73,8 +73,12 @@ def finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
     kept = f"{wish.record} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
     if done.run.fault is not None:
         from ambid.acquire.causes import fault_words
+        from ambid.rig.rig import Daq
 
-        raise AmbidError(f"{wish.port}: the controller went to its safe state: {fault_words(done.run.fault)}; {kept}")
+        rate_hz = done.info.rate_hz
+        daq = wish.rig.daq or Daq(rate_hz=rate_hz)
+        why = fault_words(done.run.fault, rate_hz=rate_hz, lift_ms=daq.lift_ms)
+        raise AmbidError(f"{wish.port}: the controller went to its safe state: {why}; {kept}")
     if done.not_stored:
         raise AmbidError(_not_stored(done, wish.record))
     if stop.number is not None:

@@ -9,6 +9,8 @@ from types import TracebackType
 
 from ambid.errors import AmbidError
 
+_STREAMED = ("--json",)  # options that take - for standard output
+
 
 class Outputs:
     """The files that a verb is going to write.
@@ -56,7 +58,8 @@ class Outputs:
     def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
         folder = (path.resolve() if path.is_symlink() else path).parent
         if path.exists() and not path.is_file() and not path.is_dir():
-            raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. Use - for standard output")
+            remedy = "Use - for standard output" if option in _STREAMED else "Name one"
+            raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. {remedy}")
         if path.is_dir():
             raise AmbidError(f"{option} {path} is a folder; a file is wanted. Name a file inside it")
         if suffixes and not path.name.lower().endswith(tuple(suffixes)):

@@ -99,9 +99,11 @@ def _lacks(made: Recorded) -> str:
     found, damage = made.survey, made.survey.damage
     parts = []
     if damage.frames or damage.places:
-        others = damage.frames - damage.blocks
-        also = f" and {_many(others, 'other entry', 'other entries')}" if others else ""
-        parts.append(f"{_many(damage.blocks, 'block')}{also} damaged, in {_many(max(damage.places, 1), 'place')}")
+        others, places = damage.frames - damage.blocks, _many(max(damage.places, 1), "place")
+        what = [_many(damage.blocks, "block")] if damage.blocks else []
+        if others:
+            what.append(_many(others, "other entry", "other entries") if what else _many(others, "entry", "entries"))
+        parts.append(f"{' and '.join(what)} damaged, in {places}" if what else f"bytes damaged in {places}")
     if found.gap_samples:
         parts.append(
             f"{_many(found.gap_samples, 'sample')} missing in {_many(found.gaps, 'place')} (read it with --gaps)"

@@ -71,7 +71,10 @@ def open_device(
     if port.startswith(REPLAY):
         from ambid.acquire.devices.replay import ReplayDevice
 
-        return ReplayDevice(port.removeprefix(REPLAY), rig, pace=pace)
+        name = port.removeprefix(REPLAY)
+        if not name.strip():
+            raise DeviceError(f"port {port!r} names no record. Give {REPLAY}FILE")
+        return ReplayDevice(name, rig, pace=pace)
     from ambid.acquire.devices.serial_device import SerialDevice
 
     return SerialDevice(port, rig)

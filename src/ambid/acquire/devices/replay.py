@@ -5,6 +5,7 @@ What was is over: it can be listened to (mode ``sample``), but neither driven, n
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NoReturn
 
@@ -64,7 +65,9 @@ class ReplayDevice(PlayedDevice):
         columns = tuple(
             Column(name=name, role=role, unit=record.channel(name).unit) for name, role in (roles | others).items()
         )
-        self._info = DeviceInfo(kind="replay", port=str(path), rate_hz=record.rate_hz, columns=columns)
+        # A name of other bytes than UTF-8 cannot be written into a record as it is.
+        port = os.fsencode(path).decode("utf-8", "replace")
+        self._info = DeviceInfo(kind="replay", port=port, rate_hz=record.rate_hz, columns=columns)
         self._row = self._base = 0
 
     @property
