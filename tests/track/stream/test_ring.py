@@ -1,5 +1,6 @@
 """The ring carries blocks between processes: whole, in order, without waiting, and leaves no segment behind."""
 
+import errno
 import json
 import os
 import signal
@@ -175,6 +176,19 @@ with BlockRing.attach(sys.argv[1]) as ring:
 def test_header_tells_what_flows():
     with ring(slots=5) as r, BlockRing.attach(r.name) as other:
         assert (other.rate_hz, other.channels, other.slots, other.block_samples) == (20e3, NAMES, 5, 100)
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="shared memory is no file here")
+def test_memory_without_room_is_refused_when_the_ring_is_made_and_leaves_nothing(monkeypatch):
+    def full(fd, offset, size):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = set(os.listdir("/dev/shm"))
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(EstimationError, match=r"No space left on device. Make room for it .on Linux in /dev/shm"):
+        ring()
+    mine = f"ambid-{os.getpid()}-"
+    assert not [name for name in set(os.listdir("/dev/shm")) - before if name.startswith(mine)]
 
 
 def test_something_else_is_not_attached_to():

@@ -9,21 +9,41 @@ import threading
 from collections.abc import Sized
 from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
 
 from ambid.errors import EstimationError
 
+_PLACE = Path("/dev/shm")  # where Linux has shared memory
 _ATTACHING = threading.Lock()
 
 
 def created(size: int) -> SharedMemory:
     """Make a segment of zeros with a name of its own; the resource tracker removes it should this process be killed."""
     name = f"ambid-{os.getpid()}-{secrets.token_hex(4)}"
+    segment = None
     try:
-        return SharedMemory(name=name, create=True, size=size)
+        segment = SharedMemory(name=name, create=True, size=size)
+        _reserve(segment)
     except OSError as failure:
+        if segment is not None:
+            removed(segment)
         raise EstimationError(
-            f"no shared memory of {size} bytes for a ring: {failure.strerror or failure}. Use fewer or shorter blocks"
+            f"no shared memory of {size} bytes for a ring: {failure.strerror or failure}. Make room for it (on Linux in"
+            f" {_PLACE}), or use fewer or shorter blocks"
         ) from None
+    return segment
+
+
+def _reserve(segment: SharedMemory) -> None:
+    """Take the memory now, where it is a file of its own: one without room would kill whoever writes to it later."""
+    path = _PLACE / segment.name
+    if not path.exists() or not hasattr(os, "posix_fallocate"):
+        return
+    fd = os.open(path, os.O_RDWR)
+    try:
+        os.posix_fallocate(fd, 0, segment.size)
+    finally:
+        os.close(fd)
 
 
 def attached(name: str) -> SharedMemory:
