@@ -8,7 +8,7 @@ covariance. Errors of all outputs are weighted by their covariance, found on the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any, Literal
 
@@ -23,13 +23,14 @@ from ambid.identify.networks.nn_train import State, added_gain, added_network, d
 from ambid.identify.networks.records import Scaled, scaled_records
 from ambid.identify.networks.search import Tick
 from ambid.identify.networks.settings import checked
-from ambid.identify.networks.start import Start, start_free, start_one_axis
+from ambid.identify.networks.start import SHORT, Start, start_free, start_one_axis
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 
 Array = NDArray[np.float64]
 
 _RANGES: Mapping[str, tuple[float, float]] = {
     "states": (1, 20),
+    "delay": (0, 1000),
     "neurons": (0, 40),
     "starts": (1, 20),
     "prior": (0.01, 1e6),
@@ -46,6 +47,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
 _DEFAULTS: Mapping[str, object] = {
     "form": "auto",
     "connections": "thesis",
+    "delay": 0,
     "neurons": 0,
     "residual": "anchored",
     "prior": 3.0,
@@ -56,6 +58,8 @@ _DEFAULTS: Mapping[str, object] = {
     "iterations": 50,
 }
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
+_LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
+_NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
 _LARGEST = 5  # states beyond the outputs that are tried
 
 
@@ -109,7 +113,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         If a setting is not known, records do not belong together, are too short, or a channel does not move.
     """
     s = {**_DEFAULTS, **checked("nn", settings, _RANGES, _CHOICES)}
-    data = scaled_records("nn", records, lag=40)
+    data = _late(scaled_records("nn", records, lag=40 + int(s["delay"])), int(s["delay"]))  # type: ignore[call-overload]
     work = Work()
     s["form"] = _form(str(s["form"]), records[0])
     try:
@@ -126,6 +130,13 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         used = {"states": 0, **s}
         return failed_fit("nn", records, used, seed, reason, work.timing_s)
     return finished(records, {**s, "states": work.state.layout.n}, data, work, seed=seed)
+
+
+def _late(data: Scaled, delay: int) -> Scaled:
+    """Put each output beside the input that acts at its time."""
+    if not delay:
+        return data
+    return replace(data, parts=tuple((y[delay:], u[:-delay]) for y, u in data.parts))
 
 
 def _form(asked: str, first: IOData) -> str:
@@ -148,17 +159,21 @@ def _first(s: Mapping[str, Any], data: Scaled, record: IOData, work: Work) -> st
     """Put a first network into `work`; return the reason where there is none."""
     began = perf_counter()
     found: Start | str
-    if s["form"] == "one-axis":
-        heads = tuple(_UNITS[record.units[x]] for x in record.outputs)
-        found = start_one_axis(data, record.dt, heads, s["connections"])
-    else:
-        found = start_free(data, record.dt, s.get("states") or data.y_level.size)
-    if isinstance(found, Start):
-        work.state = trained_start(found, data)
-        if work.state is None:
-            found = "no first network stays finite on these records: check the columns for their size and for jumps"
+    reason = ""
+    for past in (SHORT, *_LONG):
+        if s["form"] == "one-axis":
+            heads = tuple(_UNITS[record.units[x]] for x in record.outputs)
+            found = start_one_axis(data, record.dt, heads, s["connections"], past)
+        else:
+            found = start_free(data, record.dt, s.get("states") or data.y_level.size, past)
+        state = trained_start(found, data) if isinstance(found, Start) else None
+        if state is not None and (work.state is None or state.score < work.state.score):
+            work.state = state
+        if state is not None and state.without_gain().simulates(data):
+            break
+        reason = reason or (found if isinstance(found, str) else _NO_START)
     work.timing_s["start"] = perf_counter() - began
-    return found if isinstance(found, str) else ""
+    return "" if work.state is not None else reason
 
 
 def trained_start(start: Start, data: Scaled) -> State | None:
@@ -195,13 +210,11 @@ def _identify(s: dict[str, Any], data: Scaled, work: Work, seed: int, tick: Tick
     elif s["noise"] != "innovations":
         _take(work, trained(first.without_gain(), data, stage="simulation errors", **options), worse_ok=True)
     if s["neurons"]:
-        anchored = s["residual"] == "anchored"
+        anchored, base = s["residual"] == "anchored", work.state
         for k in range(int(s["starts"])):
             _take(
                 work,
-                added_network(
-                    work.state, data, int(s["neurons"]), float(s["prior"]), anchored, seed=[seed, k], **options
-                ),
+                added_network(base, data, int(s["neurons"]), float(s["prior"]), anchored, seed=[seed, k], **options),
             )
     _gain(s, data, work, first, options)
     work.timing_s["training"] = perf_counter() - began

@@ -47,7 +47,7 @@ def finished(
     assert work.state is not None
     problem = work.state.problem(data)
     state = work.state.moved(problem, work.state.vector)
-    model = None if state is None else _model(records, data, state)
+    model = None if state is None else _model(records, data, state, int(used["delay"]))
     if state is None or model is None:
         reason = "the network does not stay finite on the records that it was trained on: check the columns"
         return failed_fit("nn", records, used, seed, reason, work.timing_s)
@@ -79,7 +79,7 @@ def finished(
     )
 
 
-def _model(records: Sequence[IOData], data: Scaled, state: State) -> StateNetwork | None:
+def _model(records: Sequence[IOData], data: Scaled, state: State, delay: int) -> StateNetwork | None:
     """The model with the cloud of its own states in training; None where it leaves the finite numbers there."""
     nowhere = cloud_of(np.zeros((1, state.layout.n + state.layout.n_inputs)))
     model = StateNetwork(
@@ -90,6 +90,7 @@ def _model(records: Sequence[IOData], data: Scaled, state: State) -> StateNetwor
         y_level=data.y_level,
         y_scale=data.y_scale,
         cloud=nowhere,
+        delay=delay,
     )
     with np.errstate(over="ignore", invalid="ignore"):
         z = np.concatenate([model.regressors(x.u, x.y) for x in records])
@@ -98,6 +99,7 @@ def _model(records: Sequence[IOData], data: Scaled, state: State) -> StateNetwor
     return StateNetwork(
         **{k: getattr(model, k) for k in ("layout", "theta", "u_level", "u_scale", "y_level", "y_scale")},
         cloud=cloud_of(z),
+        delay=delay,
     )
 
 

@@ -84,6 +84,20 @@ class State:
         """Bayes' criterion."""
         return self.n_rows * self.score + self.layout.n_theta * float(np.log(self.n_rows))
 
+    def simulates(self, data: Scaled) -> bool:
+        """Say whether it runs freely with errors no larger than twice the outputs' deviations.
+
+        Parameters
+        ----------
+        data : Scaled
+
+        Returns
+        -------
+        bool
+        """
+        at = self.moved(self.problem(data), self.vector)
+        return at is not None and bool(np.all(np.diag(at.noise) < 4.0))
+
     def without_gain(self) -> State:
         """Return the same network without gain.
 

@@ -18,6 +18,8 @@ from ambid.identify.networks.records import Scaled
 
 Array = NDArray[np.float64]
 
+SHORT = 6  # samples of past: enough where the plant is stable and sampled well
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Start:
@@ -36,7 +38,7 @@ class Start:
     K: Array
 
 
-def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], connections: str) -> Start | str:
+def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], connections: str, past: int = SHORT) -> Start | str:
     """Return the start in the form ``one-axis``.
 
     Parameters
@@ -47,13 +49,15 @@ def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], connections:
     heads : tuple of int
         State (position, velocity, current) that each output is.
     connections : {"thesis", "damped", "all"}
+    past : int, optional
+        Samples that the first model looks back.
 
     Returns
     -------
     Start or str
         The reason where there is none.
     """
-    found = _subspace(data, 3)
+    found = _subspace(data, 3, past)
     if isinstance(found, str):
         return found
     A, B, C, K = found
@@ -90,7 +94,7 @@ def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], connections:
     return Start(layout=layout, theta=np.array([M[r, c] for r, c in layout.entries]), K=T @ K)
 
 
-def start_free(data: Scaled, dt: float, n: int) -> Start | str:
+def start_free(data: Scaled, dt: float, n: int, past: int = SHORT) -> Start | str:
     """Return the start in the form ``free``.
 
     Parameters
@@ -100,6 +104,8 @@ def start_free(data: Scaled, dt: float, n: int) -> Start | str:
         s.
     n : int
         States; at least one for each output.
+    past : int, optional
+        Samples that the first model looks back.
 
     Returns
     -------
@@ -114,7 +120,7 @@ def start_free(data: Scaled, dt: float, n: int) -> Start | str:
     p, m = data.y_level.size, data.u_level.size
     if n < p:
         raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
-    found = _subspace(data, n)
+    found = _subspace(data, n, past)
     if isinstance(found, str):
         return found
     A, B, C, K = found
@@ -147,13 +153,13 @@ def start_free(data: Scaled, dt: float, n: int) -> Start | str:
     return Start(layout=layout, theta=np.array([M[r, c] for r, c in layout.entries]), K=T_all @ K)
 
 
-def _subspace(data: Scaled, n: int) -> tuple[Array, Array, Array, Array] | str:
+def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Array] | str:
     """Predictor-based subspace model of the longest record, in scaled signals."""
     from ambid.identify.subspace import pbsid
 
     y, u = max(data.parts, key=lambda part: part[0].shape[0])
     names = tuple(f"u{k}" for k in range(u.shape[1])), tuple(f"y{k}" for k in range(y.shape[1]))
-    past = max(2 * -(-n // y.shape[1]), 6)
+    past = max(2 * -(-n // y.shape[1]), past)
     past = min(past, max(y.shape[0] // (3 * (y.shape[1] + u.shape[1])) - 2, 2))
     try:
         io = IOData(u=u, y=y, dt=1.0, inputs=names[0], outputs=names[1], units=dict.fromkeys(names[0] + names[1], "1"))

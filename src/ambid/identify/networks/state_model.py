@@ -34,6 +34,8 @@ class StateNetwork:
     y_level, y_scale : ndarray, shape (n_outputs,), SI
     cloud : Cloud
         Of states and inputs in training, scaled.
+    delay : int
+        Samples by which inputs act late.
     kind : str
         ``nn``.
     """
@@ -45,6 +47,7 @@ class StateNetwork:
     y_level: Array
     y_scale: Array
     cloud: Cloud
+    delay: int = 0
     kind: str = "nn"
 
     @property
@@ -65,6 +68,11 @@ class StateNetwork:
     @property
     def lag(self) -> int:
         """Samples from which the first state is found."""
+        return self.delay + self._head
+
+    @property
+    def _head(self) -> int:
+        """Samples that the first state is fitted to."""
         return max(3 * self.layout.n, 5)
 
     @property
@@ -141,7 +149,7 @@ class StateNetwork:
         Returns
         -------
         ndarray, shape (n_samples, n)
-            NaN from where the predictor diverges on.
+            The first `delay` rows are NaN, and all from where the predictor diverges on.
 
         Raises
         ------
@@ -150,7 +158,9 @@ class StateNetwork:
         """
         shot, m = self._shot(u, y), self._matrices
         x0, _ = self._first_state(shot, m, derive=False)
-        return run(self.layout, m, shot, x0)[0][:-1]
+        out = np.full((np.asarray(u).shape[0], self.layout.n), np.nan)
+        out[self.delay :] = run(self.layout, m, shot, x0)[0][:-1]
+        return out
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """Return the exact derivative of `predict` by `theta`, that of the first state included.
@@ -173,7 +183,8 @@ class StateNetwork:
         shot, m = self._shot(u, y), self._matrices
         x0, s = self._first_state(shot, m, derive=True)
         X, E = run(self.layout, m, shot, x0)
-        out = slopes(self.layout, m, shot, X, E, s) * (self.y_scale[:, None] / self.layout.unit)
+        out = np.zeros((np.asarray(u).shape[0], self.n_outputs, self.theta.size))
+        out[self.delay :] = slopes(self.layout, m, shot, X, E, s) * (self.y_scale[:, None] / self.layout.unit)
         out[: self.lag] = 0.0
         return out
 
@@ -200,9 +211,9 @@ class StateNetwork:
         whole, head = with_head(self, u, y)
         shot, m = self._shot(u, whole), self._matrices
         x0, _ = self._first_state(shot, m, derive=False)
-        begin = Shot(y=shot.y[:head], u=shot.u[:head], goes_on=False)
-        x = run(self.layout, m, begin, x0)[0][-1]
-        rest = Shot(y=shot.y[head:], u=shot.u[head:], goes_on=True)
+        k = min(self._head, shot.u.shape[0])
+        x = run(self.layout, m, Shot(y=shot.y[:k], u=shot.u[:k], goes_on=False), x0)[0][-1]
+        rest = Shot(y=shot.y[k:], u=shot.u[k:], goes_on=True)
         free = replace_gain(m)
         whole[head:] = self.y_level + self.y_scale * run(self.layout, free, rest, x)[0][:-1, self.layout.head_table]
         return whole
@@ -248,11 +259,15 @@ class StateNetwork:
         """
         X, k = self.states(u, y), self.lag
         us = (np.asarray(u, dtype=np.float64) - self.u_level) / self.u_scale
-        return np.hstack([X[k - 1 : -1], us[k - 1 : -1]])
+        return np.hstack([X[k - 1 : -1], us[k - 1 - self.delay : us.shape[0] - 1 - self.delay]])
 
     def _shot(self, u: Array, y: Array) -> Shot:
+        """Outputs from `delay` on, each with the input that acts at its time."""
         ys, us = scaled(self, u, y)
-        return Shot(y=ys, u=np.hstack([us, np.ones((us.shape[0], 1))]), goes_on=False)
+        us = us[: max(us.shape[0] - self.delay, 0)]
+        return Shot(
+            y=np.ascontiguousarray(ys[self.delay :]), u=np.hstack([us, np.ones((us.shape[0], 1))]), goes_on=False
+        )  # fmt: skip
 
     def _first_state(self, shot: Shot, m: Matrices, *, derive: bool) -> tuple[Array, Array]:
         """Least squares over the first `lag` samples, O x0 = y - (forced response); its slopes by the weights.
@@ -261,7 +276,7 @@ class StateNetwork:
         """
         layout, n, P = self.layout, self.layout.n, self.layout.n_theta
         linear = replace_gain(m, hidden=False)
-        head = Shot(y=shot.y[: self.lag], u=shot.u[: self.lag], goes_on=False)
+        head = Shot(y=shot.y[: self._head], u=shot.u[: self._head], goes_on=False)
         still = Shot(y=np.zeros_like(head.y), u=np.zeros_like(head.u), goes_on=False)
         heads = layout.head_table
         runs = [run(layout, linear, still, e) for e in np.eye(n)]
@@ -299,7 +314,7 @@ class StateNetwork:
             "neurons": x.neurons,
             "anchored": x.anchored,
         }
-        return {"dt_s": x.dt, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
+        return {"dt_s": x.dt, "delay": self.delay, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
 
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Self:
@@ -342,7 +357,8 @@ class StateNetwork:
                 k: finite(found[k], n, k)
                 for k, n in {"theta": layout.n_theta, "u_level": m, "u_scale": m, "y_level": p, "y_scale": p}.items()
             }
-            return cls(layout=layout, cloud=Cloud.from_json(found["cloud"], layout.n + m), **arrays)
+            cloud = Cloud.from_json(found["cloud"], layout.n + m)
+            return cls(layout=layout, cloud=cloud, delay=int(found["delay"]), **arrays)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise EstimationError(
                 f"no state network ({type(error).__name__}: {error}). Write the file again"

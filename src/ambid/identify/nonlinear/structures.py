@@ -80,6 +80,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
         settings={
             "form": "one-axis (entries of thesis eq. 4.8), free, auto (one-axis where units are V, m, A); auto",
             "states": "of the form free; chosen by Bayes' criterion. one-axis has 3",
+            "delay": "samples by which inputs act late; 0",
             "connections": "of one-axis: thesis (five), damped (a22 as well), all (second and third row); thesis",
             "neurons": "hidden units of G(x, u); 0",
             "residual": "anchored (no slope of G at the operating point) or orthogonal (to A and B on the data); anchored",
