@@ -83,7 +83,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
             "delay": "samples by which inputs act late; 0",
             "connections": "of one-axis: thesis (five), damped (a22 as well), all (second and third row); thesis",
             "neurons": "hidden units of G(x, u); 0",
-            "residual": "anchored (no slope of G at the operating point) or orthogonal (to A and B on the data); anchored",
+            "residual": "anchored (no slope of G at the operating point), orthogonal (to A, B on the data); anchored",
             "prior": "standard deviation of G's weights before the data, scaled; 3",
             "starts": "random starts of G; 3",
             "noise": "output, innovations (predictor gain), auto (gain where errors are not white); auto",
