@@ -19,6 +19,7 @@
 /* Addresses in data space. */
 enum { DDRB = 0x24, PORTB = 0x25, ADCSRA = 0x7a, ADMUX = 0x7c };
 enum { TCCR1A = 0x80, TCCR1B = 0x81, TCNT1L = 0x84, ICR1L = 0x86, OCR1AL = 0x88 };
+enum { ADEN = 1 << 7, ADSC = 1 << 6, ADATE = 1 << 5, ADIF = 1 << 4 };
 enum { ENABLE = 1 << 0, PULSE = 1 << 1, LAMP = 1 << 5 };
 
 double controller_seconds(const struct controller *c) { return (double)c->avr->cycle / CLOCK_HZ; }
@@ -79,11 +80,27 @@ static void see_port(struct controller *c)
                   enabled, pwm_width(&c->pwm), c->plant->x, c->plant->i);
 }
 
+/* Only in the modes that count up to it can ICR1 be written; elsewhere it keeps what it had. */
+static void see_top(struct controller *c, int mode)
+{
+    uint8_t *data = c->avr->data;
+    if (mode == 8 || mode == 10 || mode == 12 || mode == 14) {
+        c->top = (uint16_t)word_at(c->avr, ICR1L);
+        return;
+    }
+    if (word_at(c->avr, ICR1L) != c->top)
+        journal_write(controller_seconds(c), "ignored", "\"what\": \"ICR1 in mode %d of Timer1\"", mode);
+    data[ICR1L] = (uint8_t)c->top;
+    data[ICR1L + 1] = (uint8_t)(c->top >> 8);
+}
+
 static void see_timer(struct controller *c, int address)
 {
     const uint8_t *data = c->avr->data;
     const int clock = data[TCCR1B] & 7;
     const int mode = (data[TCCR1A] & 3) | (data[TCCR1B] >> 1 & 0xc);
+    if (address == ICR1L)
+        see_top(c, mode);
     const int running = clock == 1 && mode == 14;
     if (clock != 0 && mode == 14 && clock != 1 && !c->odd_mode)
         journal_write(controller_seconds(c), "unsupported", "\"what\": \"a prescaler of Timer1\"");
@@ -209,10 +226,20 @@ void controller_wire(struct controller *c)
 
 /* ---- running --------------------------------------------------------------------------------------------------- */
 
+static struct controller *asleep; /* the emulator hands its sleep no more than itself; there is one in a process */
+
+/* Called over and over while it sleeps, and never in real time. Once, at its beginning: a converter that is on, idle and
+ * without trigger of its own starts a conversion when the processor stops. */
 static void sleep_without_waiting(avr_t *avr, avr_cycle_count_t how_long)
 {
-    (void)avr;
+    const uint8_t control = avr->data[ADCSRA];
+    const avr_io_addr_t at = AVR_DATA_TO_IO(ADCSRA);
     (void)how_long;
+    if (!asleep->awake)
+        return;
+    asleep->awake = 0;
+    if ((control & (ADEN | ADSC | ADATE)) == ADEN && avr->io[at].w.c != NULL)
+        avr->io[at].w.c(avr, ADCSRA, (uint8_t)((control & ~ADIF) | ADSC), avr->io[at].w.param);
 }
 
 static void log_errors_only(avr_t *avr, const int level, const char *format, va_list values)
@@ -230,6 +257,7 @@ static void see_reset(struct controller *c)
     c->avr->run_cycle_limit = SLICE;
     c->feeding = 0;
     c->xoff = 0;
+    c->top = 0;
     controller_carry(c);
     see_timer(c, 0);
     see_port(c);
@@ -265,6 +293,7 @@ int controller_begin(struct controller *c, const char *firmware, struct plant *p
     c->avr->vcc = c->avr->avcc = c->avr->aref = SUPPLY_MV;
     c->avr->log = LOG_ERROR;
     c->avr->sleep = sleep_without_waiting;
+    asleep = c;
     c->avr->run_cycle_limit = SLICE;
     for (size_t k = 0; k < sizeof watched / sizeof watched[0]; k++)
         avr_irq_register_notify(avr_iomem_getirq(c->avr, (avr_io_addr_t)watched[k], NULL, AVR_IOMEM_IRQ_ALL), written, c);
@@ -276,6 +305,7 @@ int controller_begin(struct controller *c, const char *firmware, struct plant *p
 
 int controller_run(struct controller *c)
 {
+    c->awake = c->avr->state != cpu_Sleeping;
     const int state = avr_run(c->avr);
     see_reset(c);
     return state;

@@ -27,6 +27,8 @@ struct controller {
     double override[PLANT_SENSORS];   /* V at the pin, NaN: none */
     uint64_t first_enable;            /* tick, UINT64_MAX: not yet */
     uint64_t conversions, resets, late; /* late: received bytes that a real receiver would have lost */
+    int awake;                 /* until now: the processor has not gone to sleep */
+    uint16_t top;              /* ICR1 as far as it could be written */
     unsigned converted;        /* input of the conversion under way */
     uint64_t current_held[2]; /* ticks at which A1 was held: the last but one time, and the last */
 };

@@ -206,3 +206,17 @@ def test_a_touch_of_the_stops_is_told_once(probe):
     line.enable(1)
     line.wait_ticks(180)
     assert [e["side"] for e in bench.events("stop")] == ["high", "low"]
+
+
+@pytest.mark.parametrize(("on", "conversions"), [(1, 1), (0, 0)])
+def test_falling_asleep_starts_a_conversion_where_the_converter_is_on(probe, on, conversions):
+    _, line = probe({})
+    assert line.ask(bytes([ord("z"), on]), 1)[0] == conversions
+
+
+@pytest.mark.parametrize("mode", range(16))
+def test_the_top_is_taken_only_in_a_mode_that_has_it(probe, mode):
+    bench, line = probe({})
+    taken = mode in (8, 10, 12, 14)
+    assert int.from_bytes(line.ask(bytes([ord("i"), mode, 77]), 2), "little") == (77 if taken else 799)
+    assert len(bench.events("ignored")) == (not taken)

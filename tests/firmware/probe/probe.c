@@ -9,9 +9,11 @@
  *   f        frames without stop bit so far
  *   g N      answers with N bytes 0, 1, 2, ...
  *   h        hangs, until the watchdog resets; the next boot says 'w', any other boot says 'B'
+ *   i M LO   ICR1 = LO written in mode M of Timer1 (0 to 15), which stands still meanwhile; answers with ICR1, low byte first
  *   l        bits of port D that were high at every tick since the last 'l'
  *   s V      stream: V = 1 sends tick (16 bits) and two conversions at every tick, V = 0 ends it; answers nothing
  *   t        ticks so far, 32 bits
+ *   z V      sleeps once, with the converter on (V = 1) or off and nothing asked of it; answers whether it converted
  *   x V      answers with V
  * Anything else is answered with '?'. */
 #include <avr/interrupt.h>
@@ -19,8 +21,10 @@
 #include <avr/sleep.h>
 #include <avr/wdt.h>
 
+#define CONVERT (_BV(ADEN) | _BV(ADSC) | _BV(ADIE) | _BV(ADPS2) | _BV(ADPS0)) /* 500 kHz */
+
 static volatile uint16_t result[3];
-static volatile uint8_t channel, wrong_frames, streaming, always_high = 0xff;
+static volatile uint8_t channel, wrong_frames, streaming, quiet, always_high = 0xff;
 static volatile uint32_t ticks;
 
 static volatile uint8_t in[64], in_last, out[256], out_last;
@@ -67,9 +71,11 @@ ISR(TIMER2_COMPA_vect)
 {
     ticks++;
     always_high &= PIND;
+    if (quiet)
+        return;
     channel = 0;
     ADMUX = _BV(REFS0);
-    ADCSRA |= _BV(ADSC);
+    ADCSRA = CONVERT;
 }
 
 ISR(ADC_vect)
@@ -77,8 +83,11 @@ ISR(ADC_vect)
     result[channel] = ADC;
     if (++channel < 3) {
         ADMUX = _BV(REFS0) | channel;
-        ADCSRA |= _BV(ADSC);
-    } else if (streaming && (uint8_t)(out_first - out_last - 1) >= 8) {
+        ADCSRA = CONVERT;
+        return;
+    }
+    ADCSRA = 0; /* or falling asleep would start one more */
+    if (streaming && (uint8_t)(out_first - out_last - 1) >= 8) {
         say((uint8_t)ticks);
         say((uint8_t)(ticks >> 8));
         say((uint8_t)result[0]);
@@ -140,6 +149,15 @@ static void answer(uint8_t letter)
         wdt_enable(WDTO_15MS);
         for (;;)
             ;
+    case 'i':
+        v = next();
+        TCCR1B = 0;
+        TCCR1A = v & 3;
+        TCCR1B = (uint8_t)((v & 0xc) << 1);
+        ICR1 = next();
+        say(ICR1L);
+        say(ICR1H);
+        return;
     case 'l':
         say(always_high);
         always_high = 0xff;
@@ -150,6 +168,18 @@ static void answer(uint8_t letter)
     case 't':
         for (v = 0; v < 32; v += 8)
             say((uint8_t)(ticks >> v));
+        return;
+    case 'z':
+        v = next();
+        quiet = 1;
+        while (ADCSRA & _BV(ADSC))
+            ;
+        ADCSRA = _BV(ADEN) | _BV(ADIF);
+        ADCSRA = (uint8_t)(v ? _BV(ADEN) | _BV(ADPS2) | _BV(ADPS0) : 0);
+        sleep_mode();
+        __builtin_avr_delay_cycles(1000);
+        say((ADCSRA & _BV(ADIF)) != 0);
+        quiet = 0;
         return;
     case 'x':
         say(next());
@@ -164,15 +194,15 @@ int main(void)
 {
     PORTD = _BV(PD7);
     DDRB = _BV(PB0) | _BV(PB1) | _BV(PB5);
+    TCCR1A = _BV(COM1A1) | _BV(WGM11);
+    TCCR1B = _BV(WGM13) | _BV(WGM12);
     ICR1 = 799;
     OCR1A = 399;
-    TCCR1A = _BV(COM1A1) | _BV(WGM11);
     TCCR1B = _BV(WGM13) | _BV(WGM12) | _BV(CS10);
     OCR2A = 249;
     TCCR2A = _BV(WGM21);
     TCCR2B = _BV(CS21) | _BV(CS20); /* 32 */
     TIMSK2 = _BV(OCIE2A);
-    ADCSRA = _BV(ADEN) | _BV(ADIE) | _BV(ADPS2) | _BV(ADPS0); /* 32: 500 kHz */
     UCSR0A = _BV(U2X0);
     UBRR0 = 1;
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
