@@ -10,6 +10,8 @@
 #include "frame.h"
 #include "report.h"
 
+#define BYTES_A_PASS 8 /* some 0.2 ms with ticks and bytes coming: samples go first, and the watchdog is fed */
+
 static struct decoder decoder;
 
 void amb_setup(void)
@@ -20,13 +22,14 @@ void amb_setup(void)
     daq_begin(by_watchdog);
 }
 
-/* Takes bytes until one command is done; its answer takes the command's place. While an answer finds no room, bytes wait. */
+/* Takes bytes until one command is done, or so many of whatever else comes; the answer takes the command's place. While an
+ * answer finds no room, bytes wait. */
 static void listen(void)
 {
-    uint8_t n = 0;
+    uint8_t n = 0, most = BYTES_A_PASS;
     if (tx_free(&board_tx) < FRAME_BYTES(ANSWER_LARGEST))
         return;
-    while (n == 0 && rx_waiting(&board_rx)) {
+    while (n == 0 && most-- && rx_waiting(&board_rx)) {
         n = decoder_feed(&decoder, rx_take(&board_rx));
         if (n == FRAME_DAMAGED) {
             daq_count(&daq.rx_errors);
@@ -36,6 +39,8 @@ static void listen(void)
     if (n == 0)
         return;
     n = commands_handle(decoder.body, n, decoder.body);
+    if (n == 0)
+        return;
     frame_put(&board_tx, decoder.body, n, 0);
     board_send();
 }

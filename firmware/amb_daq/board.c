@@ -93,12 +93,12 @@ uint8_t board_begin(void)
     cli();
     begin_pins();
     begin_timers();
-    board_begin_line();
     ADMUX = _BV(REFS0);
     ADCSRA = ADC_RUN;
     board_measure(0); /* the first one takes longer */
     set_sleep_mode(SLEEP_MODE_IDLE);
     wdt_enable(WDTO_15MS);
+    board_begin_line(); /* last: what comes before interrupts do would be lost unseen */
     sei();
     return by_watchdog;
 }
@@ -107,10 +107,12 @@ uint8_t board_begin(void)
 
 void board_output(uint8_t on)
 {
-    if (on)
-        PORTB |= _BV(PORTB0);
-    else
+    if (on) {
+        BOARD_FLAGS |= RISING;
+    } else {
+        BOARD_FLAGS &= (uint8_t)~RISING;
         PORTB &= (uint8_t)~_BV(PORTB0);
+    }
 }
 
 void board_duty(uint16_t duty)
@@ -145,32 +147,51 @@ static uint8_t largest_base(uint16_t period)
     return n;
 }
 
-static void begin_base(uint8_t periods)
+/* Timer 2 from 0 to `top` at the phase of timer 1; 0: that was over. Interrupts are off. */
+static uint8_t begin_base(uint8_t top)
 {
-    uint16_t now;
-    base = periods;
-    readings = (uint8_t)(LONGEST_BASE / periods + 1);
-    open_readings = low_readings = 0;
-    do
-        now = TCNT1;
-    while (now < PHASE || now > PHASE + 16);
+    if (TCNT1 >= PHASE)
+        return 0;
+    while (TCNT1 < PHASE)
+        ;
     GTCCR = _BV(PSRASY);
-    OCR2A = (uint8_t)(periods * COUNTS_PER_PERIOD - 1);
+    OCR2A = top;
     TCNT2 = 0;
     TIFR2 = _BV(OCF2A);
+    return 1;
+}
+
+/* Waits, with interrupts, until the phase of timer 1 is less than 6 us ahead. */
+static void await_phase(void)
+{
+    uint16_t now;
+    do {
+        ATOMICALLY { now = TCNT1; }
+    } while (now < PHASE - 90 || now > PHASE - 40);
 }
 
 void board_ticks_start(uint16_t period, uint8_t inputs)
 {
-    uint8_t periods = largest_base(period);
-    ATOMICALLY
-    {
-        share = share_left = period / periods;
-        steps_wanted = (uint8_t)(inputs + 1); /* the current twice */
-        working = awaited = 0;
-        ADCSRA = ADC_RUN | _BV(ADIF);
-        begin_base(periods);
-        sampling = 1;
+    uint8_t periods = largest_base(period), begun = 0, lines = (uint8_t)(LONGEST_BASE / periods + 1);
+    uint8_t top = (uint8_t)(periods * COUNTS_PER_PERIOD - 1);
+    uint16_t each = period / periods;
+    board_measure(0); /* the first one after sleep takes longer */
+    steps_wanted = (uint8_t)(inputs + 1); /* the current twice */
+    while (!begun) {
+        await_phase();
+        ATOMICALLY
+        {
+            begun = begin_base(top);
+            if (begun) {
+                base = periods;
+                readings = lines;
+                open_readings = low_readings = 0;
+                share = share_left = each;
+                working = awaited = 0;
+                ADCSRA = ADC_RUN | _BV(ADIF);
+                sampling = 1;
+            }
+        }
     }
 }
 
@@ -202,7 +223,8 @@ static inline void watch_lines(void)
 #endif
 }
 
-/* Starts the conversion of a step, at its count of timer 1 unless that is over. */
+/* Starts the conversion of a step, at its count of timer 1 unless that is over: up to 24 us late it waits for nothing, and
+ * nothing keeps an interrupt waiting for so long. In time it waits 12 us at most. */
 static inline void start_conversion(uint8_t next)
 {
     uint16_t at = flash_u16(&start_at[next]), now;
@@ -240,6 +262,8 @@ ISR(TIMER2_COMPA_vect)
     if (sampling && --share_left == 0) {
         share_left = share;
         if (tick_begin(working)) {
+            if (BOARD_FLAGS & RISING)
+                PORTB |= _BV(PORTB0);
             working = 1;
             step = FIRST_CURRENT;
             start_conversion(FIRST_CURRENT);
@@ -358,17 +382,17 @@ void board_feed(void)
 
 uint16_t board_alive(void)
 {
-    static uint16_t before;
+    static uint8_t before;
     uint16_t now;
     ATOMICALLY { now = beats; }
-    if (now != before)
+    if ((uint8_t)now != before)
         board_feed();
-    before = now;
+    before = (uint8_t)now;
     return now;
 }
 
-/* Falling asleep starts a conversion by itself while the converter is on: there is no sleep while ticks want theirs at
- * fixed times. Interrupts wait from the question until the processor sleeps: none that gives work can slip in between. */
+/* Falling asleep starts a conversion by itself while the converter is on: so it is off then, and there is no sleep while
+ * ticks want their conversions at fixed times. Interrupts wait from the question until the processor sleeps: none that gives work can slip in between. */
 void board_sleep(uint8_t (*pending)(void))
 {
     uint8_t now = (uint8_t)beats;
@@ -377,6 +401,7 @@ void board_sleep(uint8_t (*pending)(void))
             ;
         return;
     }
+    ADCSRA = 0;
     cli();
     if (!pending()) {
         sleep_enable();
@@ -385,6 +410,7 @@ void board_sleep(uint8_t (*pending)(void))
         sleep_disable();
     }
     sei();
+    ADCSRA = ADC_RUN;
 }
 #else
 typedef int board_is_not_this_one; /* a C file must not be empty */

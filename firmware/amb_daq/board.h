@@ -33,7 +33,8 @@
 #define BOARD_INTERLOCK 1
 #endif
 
-/* What happens inside runs without interruption; it must take less than 10 us, or bytes from the line are lost. */
+/* What happens inside runs without interruption. It takes less than 10 us: the hardware holds two bytes of 10 us, and the
+ * longest interrupt (12 us, where it waits for the time of a conversion) may come right behind. */
 #ifdef __AVR__
 #include <util/atomic.h>
 #define ATOMICALLY ATOMIC_BLOCK(ATOMIC_RESTORESTATE)
@@ -47,6 +48,7 @@ extern struct rx_ring board_rx;
 /* Pins, timers, converter, line, watchdog; output off, pulse width 0. Returns 1 if the program hung before. */
 uint8_t board_begin(void);
 
+/* ENABLE: off at once; on at the begin of the next tick, when the pulse width that was ordered before acts. */
 void board_output(uint8_t on);
 void board_duty(uint16_t duty);
 

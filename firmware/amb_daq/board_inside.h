@@ -14,6 +14,7 @@
 /* Bits in a register that one instruction sets and clears. */
 #define BOARD_FLAGS GPIOR0
 #define SOUND_BYTE _BV(0) /* since the last one without stop bit */
+#define RISING _BV(2)    /* ENABLE goes on at the next tick */
 #define BYTE_CAME _BV(1)  /* a sound one, since the timer's last interrupt */
 
 extern volatile uint8_t board_bad_bytes; /* without stop bit, one after the other, before a SOUND_BYTE */

@@ -49,6 +49,7 @@ ISR(USART_RX_vect)
 ISR(USART_UDRE_vect)
 {
     uint8_t tail = board_tx.tail;
+    RING_ORDER();
     UDR0 = board_tx.data[tail++];
     board_tx.tail = tail;
     if (tail == board_tx.head)

@@ -16,6 +16,7 @@
 
 #define IN(state) (uint8_t)(1 << (state))
 #define ANY 0xff
+#define OLD 200       /* commands after which one that comes again is a new one; the host repeats within 60 */
 #define TABLE_MOST 48 /* elements in one command */
 
 #if LENGTH_STATUS > ANSWER_LARGEST || LENGTH_IDENTITY > ANSWER_LARGEST || LENGTH_SELF_TEST_RESULT > ANSWER_LARGEST
@@ -38,7 +39,7 @@ struct rule {
 };
 
 static struct {
-    uint8_t id, code, n;
+    uint8_t id, code, age; /* age: commands since */
     uint8_t answer[LENGTH_SELF_TEST_RESULT]; /* the longest that is kept: those of identify and ask_status are not */
 } last;
 
@@ -107,16 +108,26 @@ static uint8_t interval_refuses(uint16_t low, uint16_t high, uint16_t least, uin
     return high > most || high <= low ? 2 : 0;
 }
 
+/* The whole range of the converter: there is no position, as where only a coil is driven. */
+static uint8_t position_unused(const struct msg_limits *l)
+{
+    return l->position_low == 0 && l->position_high == BOARD_ADC_TOP;
+}
+
+/* An input never leaves an interval that ends where the converter does. Only a current sensor that shows one sign has one
+ * such end, and needs the other. */
 static uint8_t limits_refuse(const struct msg_limits *l)
 {
     uint8_t end;
-    if ((end = interval_refuses(l->position_low, l->position_high, 0, BOARD_ADC_TOP)) != 0)
+    if (!position_unused(l) && (end = interval_refuses(l->position_low, l->position_high, 1, BOARD_ADC_TOP - 1)) != 0)
         return (uint8_t)(1 + end);
     if ((end = interval_refuses(l->current_low, l->current_high, CAP_CURRENT_LOW, CAP_CURRENT_HIGH)) != 0)
         return (uint8_t)(3 + end);
+    if (l->current_low == 0 && l->current_high == BOARD_ADC_TOP)
+        return 5;
     if ((end = interval_refuses(l->duty_low, l->duty_high, CAP_DUTY_LOW, CAP_DUTY_HIGH)) != 0)
         return (uint8_t)(5 + end);
-    if (l->duty_off > BOARD_PWM_TOP)
+    if (l->duty_off > CAP_DUTY_HIGH)
         return 8;
     if (l->host_ms < HOST_MS_LEAST || l->host_ms > HOST_MS_MOST)
         return 9;
@@ -245,6 +256,8 @@ static uint8_t on_start(struct request *r)
             return out_of_range(r, 2);
         if (mode == MODE_LEVITATE && (position_outside(daq.control.gains.setpoint) || duty_outside(daq.control.gains.duty_bias)))
             return out_of_range(r, 2); /* limits that came after the gains leave these out */
+        if (mode == MODE_LEVITATE && position_unused(&daq.limits))
+            return out_of_range(r, 2);
         if (board_interlock_open())
             return CODE_INTERLOCK;
     }
@@ -304,7 +317,7 @@ static uint8_t on_self_test(struct request *r)
 static const struct rule rules[] FLASH = {
     {MSG_IDENTIFY, LENGTH_IDENTIFY, ANY, on_identify},
     {MSG_CONFIGURE, LENGTH_CONFIGURE, IN(STATE_IDLE), on_configure},
-    {MSG_LIMITS, LENGTH_LIMITS, IN(STATE_IDLE) | IN(STATE_SAMPLING), on_limits},
+    {MSG_LIMITS, LENGTH_LIMITS, IN(STATE_IDLE) | IN(STATE_SAMPLING) | IN(STATE_FAULT), on_limits},
     {MSG_GAINS, LENGTH_GAINS, IN(STATE_IDLE) | IN(STATE_SAMPLING) | IN(STATE_LEVITATING), on_gains},
     {MSG_SETPOINT, LENGTH_SETPOINT, IN(STATE_IDLE) | IN(STATE_SAMPLING) | IN(STATE_LEVITATING), on_setpoint},
     {MSG_EXCITATION, LENGTH_EXCITATION, ANY, on_excitation},
@@ -335,9 +348,12 @@ static uint8_t fits(const struct rule *rule, uint8_t n)
     return rule->code == MSG_TABLE ? n >= rule->length : n == rule->length;
 }
 
+/* A message to the host is no command, but an echo on the line: an answer to it would come back too. */
 static uint8_t malformed(const uint8_t *body, uint8_t n, uint8_t *answer, uint8_t code)
 {
     daq_count(&daq.rx_errors);
+    if (body[0] < MSG_IDENTIFY)
+        return 0;
     return write_ack(answer, n < 2 ? 0 : body[1], code, 0);
 }
 
@@ -346,17 +362,20 @@ uint8_t commands_handle(const uint8_t *body, uint8_t n, uint8_t *answer)
     struct rule rule;
     struct request r = {body, n, 0, answer, 0};
     uint8_t code = body[0], id = body[1], done; /* body is gone once there is an answer */
-    ATOMICALLY { daq.silent_ticks = 0; }
     if (!rule_of(code, &rule))
         return malformed(body, n, answer, CODE_UNKNOWN);
     if (!fits(&rule, n))
         return malformed(body, n, answer, CODE_LENGTH);
+    ATOMICALLY { daq.silent_ticks = 0; } /* this is the host, and not noise or an echo */
     if (id == 0)
         return write_ack(answer, 0, CODE_RANGE, 1);
     if (id == last.id && code == last.code) {
-        memcpy(answer, last.answer, last.n);
-        return last.n;
+        uint8_t length = last.answer[0] == MSG_ACK ? LENGTH_ACK : LENGTH_SELF_TEST_RESULT;
+        memcpy(answer, last.answer, length);
+        return length;
     }
+    if (++last.age == OLD)
+        last.id = 0; /* before numbers come round to it */
     done = (rule.states & IN(daq.state)) ? rule.handle(&r) : not_now(&r);
     if (!r.answered)
         r.answered = write_ack(answer, id, done, r.detail);
@@ -365,7 +384,7 @@ uint8_t commands_handle(const uint8_t *body, uint8_t n, uint8_t *answer)
     } else if (code != MSG_PING && code != MSG_ASK_STATUS) {
         last.id = id;
         last.code = code;
-        last.n = r.answered;
+        last.age = 0;
         memcpy(last.answer, answer, r.answered);
     }
     return r.answered;

@@ -42,6 +42,7 @@ void daq_output(uint8_t state)
         tick_prepare();
         daq.host_ticks = host;
         daq.lift_ticks = lift;
+        daq.inside = 0;
         daq.silent_ticks = 0;
         daq.state = state;
     }

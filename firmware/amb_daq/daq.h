@@ -35,6 +35,7 @@
 #define HOST_MS_LEAST 20
 #define HOST_MS_MOST 2000
 #define LIFT_MS_MOST 2000
+#define LIFTED_MS 20 /* inside its limits for so long: the rotor is lifted, the position counts from now on */
 
 struct daq {
     volatile uint8_t state, cause;
@@ -49,6 +50,7 @@ struct daq {
     volatile uint32_t ticks; /* since start; the tick being worked on is the one before */
     volatile uint16_t silent_ticks, host_ticks;
     volatile uint16_t lift_ticks; /* left in which out_of_gap does not count */
+    uint16_t inside; /* periods of the pulse width for which the position was inside its limits during the lift */
     uint16_t inputs[BOARD_ANALOG];
 
     uint32_t fault_tick;

@@ -43,6 +43,7 @@ uint8_t frame_put(struct tx_ring *ring, const uint8_t *body, uint8_t n, uint8_t 
     put(&w, (uint8_t)(crc >> 8));
     put(&w, 0); /* closes the last block; the place it takes for a next one is the frame's end */
     w.data[w.mark] = 0;
+    RING_ORDER();
     ring->head = w.at;
     return 1;
 }

@@ -25,13 +25,13 @@
 #define MSG_FAULT 0x06 /* to the host: sent once, at once, when the safe state is entered */
 #define MSG_IDENTIFY 0x10 /* to the controller: who are you; any state; the number of the last command is forgotten */
 #define MSG_CONFIGURE 0x11 /* to the controller: sampling; idle only; refused where a sample would not fit into the period at 11 us a byte; a new period makes gains invalid */
-#define MSG_LIMITS 0x12 /* to the controller: what the controller holds to, whatever else it is told; idle or sampling */
-#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. See firmware/amb_daq/control.h */
+#define MSG_LIMITS 0x12 /* to the controller: what the controller holds to, whatever else it is told; idle, sampling or fault. An end of a trip at an end of the converter would never trip: refused, but for one end of the current (a sensor of one sign), and for 0 to 1023 of the position, which says that there is none (no levitation then) */
+#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
 #define MSG_SETPOINT 0x14 /* to the controller: set point of the position; idle, sampling or levitating; within limits */
 #define MSG_EXCITATION 0x15 /* to the controller: what is added to the pulse width once excite says so; not while it plays */
 #define MSG_TABLE 0x16 /* to the controller: elements of the excitation table; not while it plays */
 #define MSG_EXCITE 0x17 /* to the controller: begin (1) at the next tick, from its first element also while it plays, or end (0) the excitation; driving or levitating */
-#define MSG_START 0x18 /* to the controller: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the first tick whose checks are passed */
+#define MSG_START 0x18 /* to the controller: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the tick after the first one whose checks are passed, when the pulse width that this one ordered acts */
 #define MSG_STOP 0x19 /* to the controller: output off and idle; any state but fault, from which only samples stop */
 #define MSG_CLEAR 0x1a /* to the controller: leave the safe state to idle; fault only, and only if its cause is gone; out_of_gap, host_silent and overrun always are */
 #define MSG_PING 0x1b /* to the controller: the host is there; any state */
@@ -67,7 +67,7 @@
 
 #define CAUSE_NONE 0 /* no fault since the last clear */
 #define CAUSE_OVERRUN 1 /* a tick came before the work of the last one was done */
-#define CAUSE_HOST_SILENT 2 /* no sound frame from the host for longer than limits.host_ms */
+#define CAUSE_HOST_SILENT 2 /* no sound command from the host for longer than limits.host_ms */
 #define CAUSE_OVER_CURRENT 3 /* current outside limits */
 #define CAUSE_OUT_OF_GAP 4 /* position outside limits */
 #define CAUSE_INTERLOCK 5 /* the interlock loop is open: cable pulled or emergency stop */
@@ -375,7 +375,7 @@ static inline uint8_t write_configure(uint8_t *p, uint8_t id, uint16_t period, u
     return LENGTH_CONFIGURE;
 }
 
-/* limits: what the controller holds to, whatever else it is told; idle or sampling */
+/* limits: what the controller holds to, whatever else it is told; idle, sampling or fault. An end of a trip at an end of the converter would never trip: refused, but for one end of the current (a sensor of one sign), and for 0 to 1023 of the position, which says that there is none (no levitation then) */
 struct msg_limits {
     uint8_t id; /* number of the command */
     uint16_t position_low; /* counts; below: out_of_gap */
@@ -384,9 +384,9 @@ struct msg_limits {
     uint16_t current_high; /* counts; above: over_current */
     uint16_t duty_low; /* least pulse width, counts */
     uint16_t duty_high; /* largest pulse width, counts */
-    uint16_t duty_off; /* pulse width of no voltage, counts: with the output off, and about which drive works without gains */
+    uint16_t duty_off; /* pulse width of no voltage, counts: with the output off, and about which drive works without gains; not above the cap of duty_high that was compiled in */
     uint16_t host_ms; /* longest silence of the host while the output is on, 20 to 2000 ms */
-    uint16_t lift_ms; /* time after start of drive or levitation in which out_of_gap does not count, 0 to 2000 ms */
+    uint16_t lift_ms; /* time after start of drive or levitation in which out_of_gap does not count, 0 to 2000 ms; it ends early once the position was inside for 20 ms */
 };
 static inline struct msg_limits read_limits(const uint8_t *p)
 {
@@ -419,7 +419,7 @@ static inline uint8_t write_limits(uint8_t *p, uint8_t id, uint16_t position_low
     return LENGTH_LIMITS;
 }
 
-/* gains: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. See firmware/amb_daq/control.h */
+/* gains: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
 struct msg_gains {
     uint8_t id; /* number of the command */
     int32_t kp; /* 2^-12 counts of pulse width per count of position */
@@ -564,7 +564,7 @@ static inline uint8_t write_excite(uint8_t *p, uint8_t id, uint8_t on)
     return LENGTH_EXCITE;
 }
 
-/* start: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the first tick whose checks are passed */
+/* start: begin: ticks count from 0; from idle, or from sampling to drive or levitate (ticks count on); the output goes on with the tick after the first one whose checks are passed, when the pulse width that this one ordered acts */
 struct msg_start {
     uint8_t id; /* number of the command */
     uint8_t mode; /* mode */

@@ -9,23 +9,24 @@
 #include "frame.h"
 #include "tick.h"
 
-static uint16_t status_told; /* ticks / 256 at the last unasked status */
+static uint8_t status_told; /* ticks / 256 at the last unasked status, modulo 256 */
 
 uint8_t report_status(uint8_t *body, uint8_t id)
 {
-    uint32_t ticks;
+    uint32_t ticks, fault_tick;
     uint16_t overruns, dropped, busy_us;
     uint8_t state, cause;
     ATOMICALLY
     {
         ticks = daq.ticks;
+        fault_tick = daq.fault_tick;
         overruns = daq.overruns;
         dropped = daq.dropped;
         busy_us = daq.busy_us;
         state = daq.state;
         cause = daq.cause;
     }
-    return write_status(body, id, state, cause, ticks, daq.fault_tick, overruns, dropped, daq.rx_errors,
+    return write_status(body, id, state, cause, ticks, fault_tick, overruns, dropped, daq.rx_errors,
                         board_rx_lost(), busy_us, daq.supply_mv);
 }
 
@@ -38,8 +39,9 @@ static uint16_t ticks_256(void)
 
 static void tell_fault(void)
 {
-    uint8_t body[LENGTH_FAULT + 2];
-    uint8_t n = write_fault(body, daq.cause, daq.fault_tick, daq.fault_position, daq.fault_current);
+    uint8_t body[LENGTH_FAULT + 2], n;
+    RING_ORDER(); /* what a fault leaves stands until it is cleared; it was complete before it was to be told */
+    n = write_fault(body, daq.cause, daq.fault_tick, daq.fault_position, daq.fault_current);
     if (frame_put(&board_tx, body, n, 0))
         daq.fault_untold = 0;
 }
@@ -69,8 +71,8 @@ void report_pending(void)
     while ((sample = tick_sample()) != NULL)
         tell_sample(sample);
     now = ticks_256();
-    if (now != status_told) {
-        status_told = now;
+    if ((uint8_t)now != status_told) {
+        status_told = (uint8_t)now;
         if (daq.sampling && now)
             tell_status();
     }

@@ -9,6 +9,9 @@
 
 #include <stdint.h>
 
+/* What was read or written before it is, before what comes after it: the compiler may move plain data across an index. */
+#define RING_ORDER() __asm__ volatile("" ::: "memory")
+
 #define TX_RING 256 /* as large as its index: it wraps by itself */
 #define RX_RING 128
 
@@ -34,6 +37,7 @@ static inline uint8_t rx_put(struct rx_ring *ring, uint8_t byte)
     if (next == ring->tail)
         return 0;
     ring->data[head] = byte;
+    RING_ORDER();
     ring->head = next;
     return 1;
 }
@@ -46,7 +50,10 @@ static inline uint8_t rx_waiting(const struct rx_ring *ring)
 /* Takes the oldest byte; only while rx_waiting. */
 static inline uint8_t rx_take(struct rx_ring *ring)
 {
-    uint8_t tail = ring->tail, byte = ring->data[tail];
+    uint8_t tail = ring->tail, byte;
+    RING_ORDER(); /* rx_waiting has seen the head that was moved behind this byte */
+    byte = ring->data[tail];
+    RING_ORDER();
     ring->tail = (uint8_t)((tail + 1) & (RX_RING - 1));
     return byte;
 }

@@ -30,14 +30,28 @@ static uint8_t current_outside(uint16_t current)
     return current < daq.limits.current_low || current > daq.limits.current_high;
 }
 
+static inline uint8_t position_outside(uint16_t position)
+{
+    return position < daq.limits.position_low || position > daq.limits.position_high;
+}
+
+/* A tick in which the position does not count yet. */
+static inline void lift(uint8_t outside)
+{
+    daq.lift_ticks--;
+    daq.inside = outside ? 0 : (uint16_t)(daq.inside + daq.period);
+    if (daq.inside >= LIFTED_MS * BOARD_PERIODS_PER_MS)
+        daq.lift_ticks = 0;
+}
+
 uint8_t safety_check(void)
 {
     uint16_t position = daq.inputs[0];
     if (current_outside(daq.inputs[1]))
         return CAUSE_OVER_CURRENT;
     if (daq.lift_ticks)
-        daq.lift_ticks--;
-    else if (position < daq.limits.position_low || position > daq.limits.position_high)
+        lift(position_outside(position));
+    else if (position_outside(position))
         return CAUSE_OUT_OF_GAP;
     if (daq.silent_ticks >= daq.host_ticks)
         return CAUSE_HOST_SILENT;

@@ -83,6 +83,7 @@ static void keep(uint16_t tick, uint16_t duty, int16_t excitation)
     if (stream & STREAM_SETPOINT)
         *value++ = daq.control.gains.setpoint;
     sample->n = (uint8_t)(value - sample->values);
+    RING_ORDER();
     queue_head = next;
 }
 
@@ -129,10 +130,13 @@ void tick_work(void)
 
 const struct sample *tick_sample(void)
 {
-    return queue_tail == queue_head ? NULL : &queue[queue_tail];
+    uint8_t tail = queue_tail, waits = tail != queue_head;
+    RING_ORDER();
+    return waits ? &queue[tail] : NULL;
 }
 
 void tick_sent(void)
 {
+    RING_ORDER();
     queue_tail = (uint8_t)((queue_tail + 1) & (SAMPLE_QUEUE - 1));
 }

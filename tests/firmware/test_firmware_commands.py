@@ -37,7 +37,7 @@ FIELDS = {
 TAKEN = {
     "identify": {s: s for s in STATES},
     "configure": {IDLE: IDLE},
-    "limits": {IDLE: IDLE, SAMPLING: SAMPLING},
+    "limits": {s: s for s in (IDLE, SAMPLING, FAULT)},
     "gains": {s: s for s in (IDLE, SAMPLING, LEVITATING)},
     "setpoint": {s: s for s in (IDLE, SAMPLING, LEVITATING)},
     "excitation": {s: s for s in STATES},
@@ -110,6 +110,10 @@ def test_another_period_wants_new_gains(console):
         ("configure", {"stream": 0x40}, 3),
         ("limits", {"position_low": 912}, 3),
         ("limits", {"position_high": 1024}, 3),
+        # What the converter cannot leave never trips.
+        ("limits", {"position_low": 0}, 2),
+        ("limits", {"position_high": 1023}, 3),
+        ("limits", {"current_low": 0, "current_high": 1023}, 5),
         ("limits", {"current_high": 1024}, 5),
         ("limits", {"current_low": 900}, 5),
         ("limits", {"duty_high": 801}, 7),
@@ -197,6 +201,46 @@ def test_a_repeated_command_is_answered_and_not_carried_out(console):
     assert code(lines[9]) == (DONE, 0)
 
 
+@pytest.mark.parametrize(("between", "carried_out"), [(199, False), (200, True), (254, True)])
+def test_the_last_command_is_forgotten_before_numbers_come_round(console, between, carried_out):
+    """Pings number on from it, and the next command of the same kind has its number once more."""
+    pings = [command("ping", (6 + k) % 255 + 1) for k in range(between)]
+    off = command("excite", 6, on=0)
+    lines = console([*way_to(LEVITATING), command("excite", 6, on=1), *pings, off])
+    assert code(lines[-1]) == (DONE, 0)
+    assert stand(lines[-1]).playing == (not carried_out)
+
+
+def test_limits_that_leave_out_the_current_at_rest_are_put_right_in_the_fault(console):
+    wrong = [*ready(limits={"current_low": 600}), command("start", 5, mode=2), "tick 512 512 0 0"]
+    right = [command("clear", 6), command("limits", 7, **LIMITS), command("clear", 8), command("start", 9, mode=2)]
+    lines = console([*wrong, *right])
+    assert [stand(line).state for line in lines[5:]] == [FAULT, FAULT, FAULT, IDLE, DRIVING]
+    assert [code(line) for line in lines[6:]] == [(STATE, FAULT), (DONE, 0), (DONE, 0), (DONE, 0)]
+    assert {stand(line).output for line in lines} == {0}
+
+
+def test_the_safe_pulse_width_keeps_to_what_is_compiled_in(native_cc, tmp_path):
+    capped = Console(build(native_cc, tmp_path, "-DCAP_DUTY_HIGH=600"))
+    wanted = [(600, 601), (600, 600), (601, 400)]
+    lines = capped([command("limits", 1 + k, **(LIMITS | {"duty_high": high, "duty_off": off}))
+                    for k, (high, off) in enumerate(wanted)])  # fmt: skip
+    assert [code(line) for line in lines] == [(RANGE, 8), (DONE, 0), (RANGE, 7)]
+    assert [stand(line).duty for line in lines] == [0, 600, 600]
+
+
+def test_a_current_of_one_sign_trips_on_the_other_side_only(console):
+    for k, ends in enumerate([{"current_low": 0}, {"current_high": 1023}]):
+        assert code(console([command("limits", 1 + k, **(LIMITS | ends))])[0]) == (DONE, 0)
+
+
+def test_a_coil_without_position_is_driven_and_not_levitated(console):
+    none = ready(limits={"position_low": 0, "position_high": 1023})
+    lines = console([*none, command("start", 5, mode=3), command("start", 6, mode=2), "tick 1023 512 0 0"])
+    assert [code(lines[4]), code(lines[5])] == [(RANGE, 2), (DONE, 0)]
+    assert stand(lines[-1]).state == DRIVING
+
+
 def test_identify_forgets_the_last_number(console):
     stop = command("stop", 6)
     lines = console([stop, *ready(), command("start", 6, mode=1), command("identify", 6), command("start", 6, mode=1)])
@@ -204,10 +248,17 @@ def test_identify_forgets_the_last_number(console):
 
 
 def test_malformed_commands_are_answered_and_counted(console):
-    requests = ["command 20ff", "command 01050000", "command 1b", "command 1b0500", "command 1805", "command 1b00"]
+    requests = ["command 20ff", "command 7f050000", "command 1b", "command 1b0500", "command 1805", "command 1b00"]
     lines = console(requests)
     assert [code(line) for line in lines] == [(UNKNOWN, 0)] * 2 + [(LENGTH, 0)] * 3 + [(RANGE, 1)]
     assert stand(lines[-1]).rx_errors == 5
+
+
+@pytest.mark.parametrize("first", range(16))
+def test_a_message_to_the_host_is_counted_and_gets_no_answer(console, first):
+    line = console([f"command {first:02x}050000"])[0]
+    assert line.startswith(" ")
+    assert stand(line).rx_errors == 1
 
 
 def test_identity_and_status(console):

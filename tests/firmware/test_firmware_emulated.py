@@ -85,7 +85,7 @@ def test_identity_and_self_test(bench, firmware_elf, tmp_path):
 
 @pytest.mark.parametrize(("period", "stream"), [(10, 0x0F), (5, 0x0F), (5, 0x3F)])
 def test_samples_flow_without_loss(bench, period, stream):
-    _, host = bench()
+    emulator, host = bench()
     host.make_ready(period=period, stream=stream)
     host.done("start", mode=1)
     host.flow(5000)
@@ -96,6 +96,13 @@ def test_samples_flow_without_loss(bench, period, stream):
     counters = host.decoder.counters
     assert counters.discarded_bytes == 0
     assert all(len(s.values) == bin(stream).count("1") for s in host.samples)
+    _all_was_heard_in_time(emulator)
+
+
+def _all_was_heard_in_time(emulator):
+    """No byte found the receiver with two unread ones: on hardware it would have been lost."""
+    emulator.close(keep=True)
+    assert emulator.events("end")[0]["late"] == 0
 
 
 def test_the_unstable_rotor_is_held(bench):
@@ -117,6 +124,21 @@ def test_the_unstable_rotor_is_held(bench):
     assert status["busy_us"] < 400
     host.done("stop")
     assert [e["level"] for e in emulator.events("enable")] == [1, 0]
+    _all_was_heard_in_time(emulator)
+
+
+@pytest.mark.parametrize("off", [0, 800])
+def test_the_safe_pulse_width_never_drives(bench, off):
+    """It may lie outside what the output may have: ENABLE rises once another one acts, and falls before it does."""
+    emulator, host = bench()
+    host.make_ready(period=10, limits={"position_low": 60, "duty_low": 300, "duty_high": 600, "duty_off": off})
+    for mode in (2, 3, 2):
+        host.done("start", mode=mode)
+        host.flow(30)
+        host.done("stop")
+    edges = emulator.events("enable")
+    assert [e["level"] for e in edges] == [1, 0] * 3
+    assert all(300 <= e["duty"] <= 600 for e in edges)
 
 
 @pytest.mark.parametrize("period", [20, 11, 10, 8])

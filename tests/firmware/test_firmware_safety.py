@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from ambid.acquire.board import LIFTED_MS
+from ambid.acquire.devices import _kernels as k_
 from ambid.acquire.protocol.codec import unpack
 from tests.firmware.native.console import (
     DRIVING,
@@ -61,6 +63,46 @@ def test_out_of_gap_counts_after_the_lift(console, position):
     lines = console([*ready(), command("start", 5, mode=3), *[f"tick {position} 512 0 0"] * (ticks + 1)])
     assert all(stand(line).output == 1 for line in lines[5:-1])
     _is_safe(lines[-1], OUT_OF_GAP)
+
+
+@pytest.mark.parametrize("ticks", [39, 40])
+def test_the_lift_ends_once_the_position_was_inside_for_20_ms(console, ticks):
+    """A rotor that lies inside from the start is watched from then on, not only after lift_ms."""
+    inside, out = "tick 512 512 0 0", "tick 1000 512 0 0"
+    begun = [*ready(limits={"lift_ms": 2000}), command("start", 5, mode=3)]
+    lines = console([*begun, *[inside] * 39, out, *[inside] * ticks, out])
+    assert [stand(line).state for line in lines[5:-1]] == [LEVITATING] * (40 + ticks)
+    assert stand(lines[-1]).state == (LEVITATING if ticks == 39 else FAULT)
+
+
+@pytest.mark.parametrize("period", [8, 10, 11, 20])
+def test_the_simulated_device_ends_the_lift_at_the_same_tick(console, period):
+    rng = np.random.default_rng(period)
+    inside = np.repeat(rng.random(60) < 0.8, rng.integers(1, 60, 60))
+    positions = np.where(inside, 500, 1000)
+    limits = LIMITS | {"lift_ms": 300, "host_ms": 2000}
+    begun = [*ready(period=period, limits=limits), command("start", 5, mode=3)]
+    lines = console([*begun, *[f"tick {x} 512 0 0" for x in positions]])
+    tripped = next(k for k, line in enumerate(lines[5:]) if stand(line).state == FAULT)
+    settings, memory = np.zeros(k_.N_SETTINGS, dtype=np.int64), np.zeros(k_.N_MEMORY, dtype=np.int64)
+    places = (k_.POSITION_LOW, k_.POSITION_HIGH, k_.CURRENT_LOW, k_.CURRENT_HIGH)
+    settings[list(places)] = [limits[n] for n in ("position_low", "position_high", "current_low", "current_high")]
+    settings[k_.LIFT] = -(-300 * 20 // period)
+    settings[k_.SETTLED] = -(-LIFTED_MS * 20 // period)
+    memory[k_.STATE] = k_.LEVITATING
+    causes = []
+    for tick, x in enumerate(positions):
+        memory[k_.TICK] = tick
+        causes.append(k_.tripped(x, 512, settings, memory))
+    assert 0 < tripped == causes.index(OUT_OF_GAP)
+
+
+@pytest.mark.parametrize("noise", ["20ff", "01050000", "1b", "1b0500", "0309", "00"])
+def test_only_a_command_is_a_sign_of_the_host(console, noise):
+    ticks = LIMITS["host_ms"] * 2
+    lines = console([*way_to(LEVITATING), *[REST] * 300, f"command {noise}", *[REST] * (ticks - 300)])
+    assert stand(lines[-2]).output == 1
+    _is_safe(lines[-1], SILENT)
 
 
 def test_a_silent_host(console):

@@ -43,6 +43,7 @@ def test_the_host_knows_the_board(defined):
     assert defined["CONTROL_LARGEST"] == board.LARGEST_GAIN
     assert defined["CAP_OUTPUT_PERIOD"] == board.SLOWEST_OUTPUT
     assert defined["CAP_OUTPUT_FASTEST"] == board.FASTEST_OUTPUT
+    assert defined["LIFTED_MS"] == board.LIFTED_MS
     assert defined["BOARD_BYTE_US"] == board.BYTE_BITS  # at 1 Mbaud a bit takes 1 us
 
 

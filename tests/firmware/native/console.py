@@ -54,16 +54,16 @@ class Stand:
 _BUILT = {}
 
 
-def build(compiler, folder):
-    """Build the console, once for all tests of a process; returns its path."""
-    if compiler in _BUILT:
-        return _BUILT[compiler]
+def build(compiler, folder, *flags):
+    """Build the console, once for all tests of a process and for each choice of flags; returns its path."""
+    if (compiler, *flags) in _BUILT:
+        return _BUILT[compiler, *flags]
     program = folder / "console"
     sources = [str(p) for p in sorted(FIRMWARE.glob("*.c")) if p.name != "main.c"]
     sources += [str(p) for p in sorted(HERE.glob("*.c"))]
     paths = [f"-I{FIRMWARE}", f"-I{HERE}"]
-    subprocess.run([compiler, *FLAGS, *SANITIZERS, *paths, "-o", str(program), *sources], check=True)
-    _BUILT[compiler] = program
+    subprocess.run([compiler, *FLAGS, *SANITIZERS, *flags, *paths, "-o", str(program), *sources], check=True)
+    _BUILT[compiler, *flags] = program
     return program
 
 

@@ -34,12 +34,13 @@ POSITION_LOW, POSITION_HIGH, CURRENT_LOW, CURRENT_HIGH, DUTY_LOW, DUTY_HIGH, DUT
     15,
 )
 KIND, AMPLITUDE, HOLD, LENGTH, CYCLES, TOP, TOP_DUTY = 16, 17, 18, 19, 20, 21, 22
-N_SETTINGS = 23
+SETTLED = 23  # ticks inside its limits after which the position counts
+N_SETTINGS = 24
 
 # Places in `memory`.
 STATE, CAUSE, INTEGRAL, DERIVATIVE, LAST, FRESH, TICK, FAULT_TICK, LIFTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY = 9, 10, 11, 12, 13, 14
-N_MEMORY = 15
+PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY, INSIDE = 9, 10, 11, 12, 13, 14, 15
+N_MEMORY = 16
 
 _ONE = 1 << 12  # a count in the law's fixed point
 _TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
@@ -135,10 +136,13 @@ def tripped(position: int, current: int, settings: Integers, memory: Integers) -
         return 0
     if not settings[CURRENT_LOW] <= current <= settings[CURRENT_HIGH]:
         return OVER_CURRENT
-    lifting = memory[TICK] - memory[LIFTED] < settings[LIFT]
-    if not lifting and not settings[POSITION_LOW] <= position <= settings[POSITION_HIGH]:
-        return OUT_OF_GAP
-    return 0
+    outside = not settings[POSITION_LOW] <= position <= settings[POSITION_HIGH]
+    if memory[TICK] - memory[LIFTED] < settings[LIFT]:
+        memory[INSIDE] = 0 if outside else memory[INSIDE] + 1
+        if memory[INSIDE] >= settings[SETTLED]:
+            memory[LIFTED] = memory[TICK] - settings[LIFT]
+        return 0
+    return OUT_OF_GAP if outside else 0
 
 
 @njit(cache=True, nogil=True)

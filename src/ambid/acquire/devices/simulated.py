@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquire.board import ADC_TOP, LAG_S, PWM_TOP, TABLE_LENGTH, output_rates
+from ambid.acquire.board import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, output_rates
 from ambid.acquire.default_daq import with_default_daq
 from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.benches import Bench, bench_of
@@ -140,7 +140,7 @@ class SimulatedDevice(PlayedDevice):
             memory[k.TICK] = 0
         memory[k.STATE] = table().value("state", {"sample": "sampling", "drive": "driving"}.get(mode, "levitating"))
         memory[k.CAUSE] = memory[k.INTEGRAL] = memory[k.DERIVATIVE] = memory[k.PLAYING] = 0
-        memory[k.FRESH], memory[k.LIFTED] = 1, memory[k.TICK]
+        memory[k.FRESH], memory[k.LIFTED], memory[k.INSIDE] = 1, memory[k.TICK], 0
 
     def _rest(self) -> None:
         """Let time pass with the output off, unseen."""
@@ -282,6 +282,7 @@ def _numbers_of(settings: ControllerSettings) -> Integers:
     numbers = np.zeros(k.N_SETTINGS, dtype=np.int64)
     numbers[: len(_PLACES)] = [getattr(settings, name) for name in _PLACES]
     numbers[k.LIFT] = math.ceil(settings.lift_ms * 1e-3 * settings.rate_hz)
+    numbers[k.SETTLED] = math.ceil(LIFTED_MS * 1e-3 * settings.rate_hz)
     numbers[k.HOLD], numbers[k.TOP], numbers[k.TOP_DUTY] = 1, ADC_TOP, PWM_TOP
     return numbers
 

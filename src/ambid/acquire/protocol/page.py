@@ -117,7 +117,9 @@ _COMMANDS = """\
 Every command begins with `id`, its number from 1 to 255, which the answer repeats.
 A command that comes again with number and code of the last one is answered again and not carried out: its answer was
 lost.
-`ping` and `ask_status` do not count as the last one, and `identify` makes the controller forget it.
+`ping` and `ask_status` do not count as the last one; 200 further commands (pings too) and `identify` make the
+controller forget it. A sound frame of a code below 0x10, which is an echo, is counted and gets no answer; neither it
+nor another frame that is no command by code and length is a sign of life.
 """
 
 _STREAM = """\
