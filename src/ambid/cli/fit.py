@@ -1,4 +1,4 @@
-"""``ambid fit``: a black-box model from one record."""
+"""``ambid fit``: a black-box model from one record, or a nonlinear one from several."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, SecondRecord, fixed_of, orders_of
-from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.fit_nonlinear import fit_records, one_record, only_one, refuse_linear_only
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
@@ -24,7 +25,14 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
 
 def command(
-    record: RecordFile,
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORD...",
+            help="Record: .csv, .csv.gz, .h5 or .mat; nonlinear structures take several of one bench.",
+            show_default=False,
+        ),
+    ],
     structure: Annotated[
         str,
         typer.Option("--structure", metavar="NAME", help="Structure; 'ambid models' lists them.", show_default=False),
@@ -39,6 +47,19 @@ def command(
             help="Orders; nb=2/3 for two inputs that differ, nk=auto to find a delay, auto to choose all.",
         ),
     ] = "auto",
+    settings: Annotated[
+        str | None,
+        typer.Option(
+            "--settings",
+            metavar="ny=2,nu=2,degree=3",
+            help="Settings of a nonlinear structure (--orders does the same); 'ambid models' lists them.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", metavar="N", help="Of all that is random in a nonlinear structure.", show_default="0"),
+    ] = None,
     criterion: Annotated[
         str, typer.Option("--criterion", help="What chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")
     ] = "bic",
@@ -91,11 +112,44 @@ def command(
     ] = False,
     strict: Strict = False,
 ) -> None:
-    """Fit a black-box model to a record: polynomial, subspace or continuous-time structures.
+    """Fit a black-box model to a record: polynomial, subspace, continuous-time or nonlinear structures.
 
     The plant is taken to be under feedback unless --open-loop says otherwise: structures that feedback disturbs warn.
-    With --rig, inputs and outputs are the rig's, and the fit is carried on to its physical parameters.
+    With --rig, inputs and outputs are the rig's, and a linear fit is carried on to its physical parameters.
+    Ctrl-C during a nonlinear fit keeps the best model so far (exit code 130).
     """
+    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+
+    if structure in NONLINEAR_STRUCTURES:
+        linear_only = {
+            "--criterion": criterion != "bic",
+            "--fix": bool(fix),
+            "--reference": bool(reference),
+            "--at-rest": at_rest,
+            "--stabilisation": stabilisation is not None,
+            "--sensitivity": sensitivity,
+        }
+        refuse_linear_only(linear_only, structure)
+        fit_records(
+            records,
+            structure,
+            orders if settings is None else only_one(orders, settings),
+            inputs=inputs or (),
+            outputs=output or (),
+            open_loop=open_loop,
+            part=(from_s, to_s),
+            rate=rate,
+            gaps=gaps,
+            second=second,
+            second_part=(validate_from, validate_to),
+            rig=rig,
+            seed=seed or 0,
+            json=json,
+            plot=plot,
+            strict=strict,
+        )
+        return
+    record = one_record(records, structure, settings, seed)
     from ambid.job import fit, physics, read_data
     from ambid.report.fit_text import fit_text, physics_text
     from ambid.rig import load_rig

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import typer
+
+if TYPE_CHECKING:
+    from ambid.identify.nonlinear.structures import NonlinearStructure
 
 
 def command() -> None:
     """List models with their parameters and units, black-box structures, excitations, scenarios and preset benches."""
     from ambid.cli.terminal import painter
     from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
+    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
@@ -36,6 +41,9 @@ def command() -> None:
     wide = max(map(len, left)) + 2
     for start, x in zip(left, STRUCTURES.values(), strict=True):
         typer.echo(textwrap.fill(x.summary, 80, initial_indent=start.ljust(wide), subsequent_indent=" " * wide))
+    typer.echo(f"\n{paint('nonlinear structures', 'strong')}  for 'ambid fit', with settings (what they are; default)")
+    for n in NONLINEAR_STRUCTURES.values():
+        _nonlinear(n)
     typer.echo(f"\n{paint('structures from a frequency response', 'strong')}  for 'ambid frf'")
     for x in RESPONSE_STRUCTURES.values():
         start = f"  {x.name.ljust(14)}{' '.join(x.orders)}  "
@@ -46,6 +54,15 @@ def command() -> None:
              {name: scenario(name).summary for name in scenario_names()})  # fmt: skip
     typer.echo()
     _listing("presets", "benches for 'ambid simulate'", {name: preset(name).summary for name in preset_names()})
+
+
+def _nonlinear(of: NonlinearStructure) -> None:
+    """A structure, then its settings, one below the other."""
+    start = f"  {of.name}{'*' * (of.feedback == 'biased')}  "
+    typer.echo(textwrap.fill(of.summary, 80, initial_indent=start, subsequent_indent=" " * len(start)))
+    wide = max(map(len, of.settings), default=0) + 6
+    for name, meaning in of.settings.items():
+        typer.echo(textwrap.fill(meaning, 80, initial_indent=f"    {name}".ljust(wide), subsequent_indent=" " * wide))
 
 
 def _listing(title: str, use: str, summaries: Mapping[str, str]) -> None:

@@ -16,6 +16,7 @@ from ambid.errors import AmbidError, EstimationError
 if TYPE_CHECKING:
     from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.estimate import Estimate
+    from ambid.identify.nonlinear.fit import NonlinearFit
     from ambid.rig import Rig
 
 
@@ -42,13 +43,14 @@ def command(
     Without --rig: the record is read as the one that the estimate came from.
     """
     from ambid.identify.blackbox.fit import BlackBoxFit
+    from ambid.identify.nonlinear.fit import NonlinearFit
     from ambid.job.estimates import read_estimate
 
     with Outputs(estimate, record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
         known = read_estimate(estimate)
         with progress("validate"):
-            if isinstance(known, BlackBoxFit):
+            if isinstance(known, BlackBoxFit | NonlinearFit):
                 if rig is not None:
                     raise EstimationError(f"{estimate.name} is a black-box fit, which knows no rig. Leave --rig out")
                 found, lines = _judged_fit(known, record, (from_s, to_s), rate, gaps)
@@ -89,8 +91,9 @@ def _judged_estimate(
 
 
 def _judged_fit(
-    known: BlackBoxFit, record: Path, part: Part, rate: float | None, gaps: str | None
+    known: BlackBoxFit | NonlinearFit, record: Path, part: Part, rate: float | None, gaps: str | None
 ) -> tuple[dict[str, Any], list[str]]:
+    from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.json_values import plain_json
     from ambid.job import read_data
     from ambid.job.blackbox import same_bench
@@ -99,6 +102,12 @@ def _judged_fit(
 
     data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)
     same_bench(known.units, known.dt, data)
+    if not isinstance(known, BlackBoxFit):
+        from ambid.report.nonlinear_text import second_record_lines
+        from ambid.validate.nonlinear import validation as nonlinear_validation
+
+        judged = nonlinear_validation(known, data)
+        return {"samples": data.n_samples, "fit": plain_json(judged)}, second_record_lines(judged)
     found = validation(known, data)
     return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
 

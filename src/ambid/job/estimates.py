@@ -11,10 +11,11 @@ from ambid.identify.estimate import Estimate
 
 if TYPE_CHECKING:
     from ambid.identify.blackbox.fit import BlackBoxFit
+    from ambid.identify.nonlinear.fit import NonlinearFit
 
 
-def read_estimate(path: str | Path) -> Estimate | BlackBoxFit:
-    """Read an estimate or a black-box fit from its file.
+def read_estimate(path: str | Path) -> Estimate | BlackBoxFit | NonlinearFit:
+    """Read an estimate, a black-box fit or a nonlinear fit from its file.
 
     Parameters
     ----------
@@ -23,7 +24,7 @@ def read_estimate(path: str | Path) -> Estimate | BlackBoxFit:
 
     Returns
     -------
-    Estimate or BlackBoxFit
+    Estimate, BlackBoxFit or NonlinearFit
 
     Raises
     ------
@@ -48,5 +49,11 @@ def read_estimate(path: str | Path) -> Estimate | BlackBoxFit:
             "Give what 'ambid identify --json' wrote"
         ) from None
     if isinstance(document, dict) and document.get("schema") == SCHEMA:
+        from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+
+        if str(document.get("structure")) in NONLINEAR_STRUCTURES:
+            from ambid.identify.nonlinear.fit_file import nonlinear_fit_from_json
+
+            return nonlinear_fit_from_json(document, f"fit {path}")
         return fit_from_json(document, f"fit {path}")
     return estimate_from_json(document, f"estimate {path}")

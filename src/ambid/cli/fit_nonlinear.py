@@ -1,0 +1,273 @@
+"""``ambid fit`` for nonlinear structures: settings, seed, several records, and Ctrl-C that keeps the best so far."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from ambid.cli.interrupts import Stop, signals
+from ambid.cli.options import FAILED_CHECK, json_path
+from ambid.cli.output import Outputs
+from ambid.cli.terminal import painter, progress
+from ambid.errors import EstimationError, nearest
+
+if TYPE_CHECKING:
+    from ambid.identify.nonlinear.fit import NonlinearFit, Settings
+
+Part = tuple[float | None, float | None]
+
+
+def fit_records(
+    records: Sequence[Path],
+    structure: str,
+    settings: str,
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    open_loop: bool,
+    part: Part,
+    rate: float | None,
+    gaps: str | None,
+    second: Path | None,
+    second_part: Part,
+    rig: Path | None,
+    seed: int,
+    json: str | None,
+    plot: Path | None,
+    strict: bool,
+) -> None:
+    """Fit a nonlinear model to records, write and show it.
+
+    Parameters
+    ----------
+    records : sequence of Path
+    structure, settings : str
+        As the command line has them.
+    inputs, outputs : sequence of str
+        Columns.
+    open_loop : bool
+    part : (float or None, float or None), s
+        Of every record.
+    rate : float or None, Hz
+    gaps : str or None
+    second : Path or None
+        To judge on.
+    second_part : (float or None, float or None), s
+        Of it.
+    rig : Path or None
+    seed : int
+    json : str or None
+    plot : Path or None
+    strict : bool
+
+    Raises
+    ------
+    AmbidError
+        If something that is given breaks a rule.
+    typer.Exit
+        130 (143 for the signal to terminate) after an interruption, with everything written; 3 for a failed fit, and
+        under `strict` for a failed check.
+    """
+    from ambid.identify.nonlinear.fit_file import nonlinear_fit_text
+    from ambid.job import fit_nonlinear
+    from ambid.report.nonlinear_text import nonlinear_text
+
+    stop = Stop()
+    with Outputs(*records, second, rig) as files:
+        files.claim(json_path(json), "--json")
+        files.claim(plot, "--plot", (".png", ".svg", ".pdf"))
+        wanted = settings_of(settings)
+        with signals(stop.take), progress("fit") as show:
+            found = fit_nonlinear(
+                records,
+                inputs=inputs,
+                outputs=outputs,
+                structure_name=structure,
+                settings=wanted,
+                open_loop=open_loop,
+                from_s=part[0],
+                to_s=part[1],
+                rate_hz=rate,
+                gaps=gaps,
+                validate=second,
+                validate_from_s=second_part[0],
+                validate_to_s=second_part[1],
+                rig=rig,
+                seed=seed,
+                tick=_interruptible(show, stop),
+            )
+            if plot is not None and found.model is not None:
+                show("draw")
+                _draw(found, records[0], files, plot, inputs, outputs, part, rate, gaps, rig)
+        written = nonlinear_fit_text(found)
+        if (path := json_path(json)) is not None:
+            files.stage_text(path, written)
+    if json == "-":
+        typer.echo(written, nl=False)
+    else:
+        typer.echo(nonlinear_text(found, paint=painter()))
+    if stop.wished():
+        raise typer.Exit(stop.code)
+    if found.status == "failed" or (strict and not found.passed):
+        raise typer.Exit(FAILED_CHECK)
+
+
+def _interruptible(show: Callable[[str], None], stop: Stop) -> Callable[[str], None]:
+    """Interrupt the search once where that is wished; what judges its result afterwards goes on."""
+    told = False
+
+    def tick(stage: str) -> None:
+        nonlocal told
+        show(stage)
+        if stop.wished() and not told and stage != "check":
+            told = True
+            raise KeyboardInterrupt
+
+    return tick
+
+
+def settings_of(text: str) -> Settings:
+    """Read settings as they are written on the command line.
+
+    Parameters
+    ----------
+    text : str
+        ``"ny=2,nu=2/3,degree=3,criterion=bic"``: numbers, words, or several numbers with a slash between; ``auto``, for
+        one or instead of all, leaves the choice to the method.
+
+    Returns
+    -------
+    dict of str to int, float, str or tuple of int
+
+    Raises
+    ------
+    EstimationError
+        If a part is not NAME=VALUE, or a name stands twice.
+    """
+    found: dict[str, int | float | str | tuple[int, ...]] = {}
+    if text.strip() in ("auto", ""):
+        return found
+    named = set[str]()
+    for part in text.split(","):
+        name, sign, value = (x.strip() for x in part.partition("="))
+        if not (name and sign and value):
+            raise EstimationError(f"--settings {text!r}: {part.strip()!r} is not NAME=VALUE. Write ny=2,nu=2,degree=3")
+        if name in named:
+            raise EstimationError(f"--settings {text!r}: {name} stands twice. Leave one out")
+        named.add(name)
+        if value != "auto":
+            found[name] = _value(value)
+    return found
+
+
+def _value(text: str) -> int | float | str | tuple[int, ...]:
+    parts = text.split("/")
+    if len(parts) > 1 and all(x.strip().isdecimal() for x in parts):
+        return tuple(int(x) for x in parts)
+    for read in (int, float):
+        try:
+            return read(text)
+        except ValueError:
+            continue
+    return text
+
+
+def refuse_linear_only(given: Mapping[str, bool], structure: str) -> None:
+    """Refuse options that only the linear structures have.
+
+    Parameters
+    ----------
+    given : Mapping[str, bool]
+        By option: whether it was given.
+    structure : str
+
+    Raises
+    ------
+    EstimationError
+        Naming the first one.
+    """
+    for option, was in given.items():
+        if was:
+            raise EstimationError(f"{option} is for linear structures; {structure} has no use for it. Leave it out")
+
+
+def only_one(orders: str, settings: str) -> str:
+    """Return the settings where ``--orders``, which is another name for them, is not given too.
+
+    Parameters
+    ----------
+    orders, settings : str
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    EstimationError
+        If both are given.
+    """
+    if orders != "auto":
+        raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
+    return settings
+
+
+def one_record(records: Sequence[Path], structure: str, settings: str | None, seed: int | None) -> Path:
+    """Return the one record that a linear structure is fitted to.
+
+    Parameters
+    ----------
+    records : sequence of Path
+    structure : str
+    settings : str or None
+    seed : int or None
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    EstimationError
+        If there are several, or an option that only nonlinear structures have.
+    """
+    from ambid.identify.blackbox.structures import STRUCTURES
+    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+
+    if structure not in STRUCTURES:
+        every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
+        raise EstimationError(
+            f"structure {structure!r} is not known; known: {', '.join(every)}.{nearest(structure, every)}"
+        )
+    if len(records) > 1:
+        several = ", ".join(NONLINEAR_STRUCTURES)
+        raise EstimationError(f"structure {structure} takes one record; {several} take several. Leave {records[1]} out")
+    for option, value in (("--settings", settings), ("--seed", seed)):
+        if value is not None:
+            raise EstimationError(f"{option} is for nonlinear structures; {structure} has --orders. Leave it out")
+    return records[0]
+
+
+def _draw(
+    found: NonlinearFit,
+    record: Path,
+    files: Outputs,
+    plot: Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    part: Part,
+    rate: float | None,
+    gaps: str | None,
+    rig: Path | None,
+) -> None:
+    from ambid.job import read_data
+    from ambid.report.figures import save
+    from ambid.report.nonlinear_figure import nonlinear_overview
+    from ambid.rig import load_rig
+
+    bench = None if rig is None else load_rig(rig)
+    page = nonlinear_overview(found, read_data(record, inputs, outputs, part=part, rate_hz=rate, gaps=gaps, rig=bench))
+    files.stage(plot, lambda path: save(page, path))
