@@ -160,6 +160,25 @@ def test_units_decide_on_the_form_and_a_wrong_one_is_refused() -> None:
         nn([replace(record, y=np.hstack([record.y, record.y**2]), outputs=("y", "z"))], {"states": 1})
 
 
+def test_an_interrupted_search_gives_its_best_network() -> None:
+    record, _, _ = sampled(600, 7, noise=0.02)
+    whole = nn([record], {"states": 2, "neurons": 4, "starts": 1})
+    calls = 0
+
+    def tick(stage: str) -> None:
+        nonlocal calls
+        calls += stage == "hidden layer"
+        if calls == 4:
+            raise KeyboardInterrupt
+
+    part = nn([record], {"states": 2, "neurons": 4, "starts": 1}, tick=tick)
+    assert part.status == "stalled"
+    assert part.settings == whole.settings
+    assert part.model is not None
+    assert "x1: unit 4" in part.model.names  # three iterations of the hidden layer are kept
+    assert part.noise_covariance[0, 0] < 1.1 * whole.noise_covariance[0, 0]
+
+
 # --- the nonlinear bearing: unstable, under feedback ---------------------------------------------------------------
 
 

@@ -51,8 +51,8 @@ def bootstrapped(problem: NarxProblem, theta: Array, seed: int, tick: Tick | Non
     """Return the covariance of weights after a Gauss-Newton step on blocks of time drawn with replacement.
 
     Blocks keep the correlation of the errors (Kuensch 1989), which Laplace's approximation takes as white. One step
-    from the optimum stays where the network is linear in its weights: whole trainings end in weights that differ while the
-    function does not, and their covariance says nothing of the function.
+    from the optimum stays where the network is linear in its weights: whole trainings end in weights that differ while
+    the function does not, and their covariance says nothing of the function.
 
     Parameters
     ----------

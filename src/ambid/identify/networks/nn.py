@@ -19,10 +19,19 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.nn_result import finished
-from ambid.identify.networks.nn_train import State, added_gain, added_network, descended, shooting, trained, white
+from ambid.identify.networks.nn_train import (
+    Interrupted,
+    State,
+    added_gain,
+    added_network,
+    descended,
+    trained,
+    white,
+)
 from ambid.identify.networks.records import Scaled, scaled_records
 from ambid.identify.networks.search import Tick
 from ambid.identify.networks.settings import checked
+from ambid.identify.networks.shooting import shooting
 from ambid.identify.networks.start import SHORT, Start, start_free, start_one_axis
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 
@@ -120,7 +129,9 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         reason = _first(s, data, records[0], work)
         if not reason:
             _identify(s, data, work, seed, tick)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if isinstance(stop, Interrupted):
+            work.state = stop.state
         work.status = "stalled"
         work.warnings.insert(0, "interrupted: the best model so far")
     except np.linalg.LinAlgError as error:
@@ -206,8 +217,8 @@ def _identify(s: dict[str, Any], data: Scaled, work: Work, seed: int, tick: Tick
         began = perf_counter()
     options: dict[str, Any] = {"iterations": int(s["iterations"]), "tick": tick}
     if s["shooting"]:
-        _take(work, shooting(first, data, int(s["shooting"]), **options))
-    elif s["noise"] != "innovations":
+        _take(work, shooting(first, data, int(s["shooting"]), **options), worse_ok=True)
+    elif s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
         _take(work, trained(first.without_gain(), data, stage="simulation errors", **options), worse_ok=True)
     if s["neurons"]:
         anchored, base = s["residual"] == "anchored", work.state

@@ -98,6 +98,11 @@ class State:
         at = self.moved(self.problem(data), self.vector)
         return at is not None and bool(np.all(np.diag(at.noise) < 4.0))
 
+    @property
+    def stable(self) -> bool:
+        """Whether no pole lies outside the unit circle, integrators allowed."""
+        return bool(np.max(np.abs(np.linalg.eigvals(self.layout.matrices(self.theta).A))) < 1.0 + 1e-4)
+
     def without_gain(self) -> State:
         """Return the same network without gain.
 
@@ -157,6 +162,24 @@ class State:
         return np.concatenate([self.theta, self.x0.ravel()])
 
 
+class Interrupted(KeyboardInterrupt):
+    """An interruption in the middle of a search.
+
+    Parameters
+    ----------
+    state : State
+        The best network of that search.
+
+    Attributes
+    ----------
+    state : State
+    """
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        self.state = state
+
+
 def added_gain(state: State, data: Scaled, K: Array) -> State | None:
     """Return the network with a predictor gain; None if it diverges on the data with every try.
 
@@ -201,6 +224,11 @@ def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Ti
     Returns
     -------
     (State, LearningCurve, converged) or None
+
+    Raises
+    ------
+    Interrupted
+        With the best network so far, if `tick` raises KeyboardInterrupt.
     """
     at = state.moved(state.problem(data), state.vector)
     if at is None:
@@ -208,13 +236,16 @@ def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Ti
     seconds, errors, offset, converged = [], [], 0.0, False
     damping = 1e-3 if state.layout.neurons else 1e-9  # physics alone begins near: Gauss-Newton at once
     for k in range(_ROUNDS):
-        before, problem = at.score, at.problem(data)
-        found = search(
-            problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
-            damping=damping, tick=tick,
-        )  # fmt: skip
+        before, problem, best = at.score, at.problem(data), [at.vector]
+        try:
+            found = search(
+                problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
+                damping=damping, tick=tick, keep=best.append,
+            )  # fmt: skip
+        except KeyboardInterrupt as stop:
+            raise Interrupted(at.moved(problem, best[-1]) or at) from stop
         seconds += [offset + t for t in found.seconds]
-        errors += [_relative(c, at) for c in found.costs]
+        errors += [relative_error(c, at) for c in found.costs]
         offset = seconds[-1]
         after = at.moved(problem, found.theta)
         converged = found.converged
@@ -230,8 +261,20 @@ def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Ti
     return at, curve, converged
 
 
-def _relative(cost: float, at: State) -> float:
-    """Root mean square error in deviations of the outputs, from a weighted sum of squares."""
+def relative_error(cost: float, at: State) -> float:
+    """Return the root mean square error in deviations of the outputs.
+
+    Parameters
+    ----------
+    cost : float
+        Sum of squares of errors of unit variance.
+    at : State
+        Whose errors' covariance they were weighted by.
+
+    Returns
+    -------
+    float
+    """
     size = np.exp(at.score / at.layout.p / 2)
     return float(np.sqrt(cost / (at.n_rows * at.layout.p)) * size)
 
@@ -267,59 +310,6 @@ def descended(state: State, data: Scaled, iterations: int) -> tuple[tuple[Learni
             both = A * size[:n, None] / size[:n], B * size[:n, None] / size[n:]
         found[name] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
     return curves, found
-
-
-def shooting(state: State, data: Scaled, length: int, *, iterations: int, tick: Tick | None) -> Trained:
-    """Search over shots with continuity penalties, whose weights are found on the way (multiple shooting).
-
-    Parameters
-    ----------
-    state : State
-    data : Scaled
-    length : int
-        Samples of a shot.
-    iterations : int
-    tick : callable or None
-
-    Returns
-    -------
-    (State, LearningCurve, converged) or None
-        A network with gain again: without one, the predictor of an unstable plant does not stay.
-    """
-    problem = state.problem(data)
-    X = np.concatenate([x[:-1] for x in problem.errors(state.vector)[0]])
-    plain = state.without_gain()
-    short = plain.problem(data, length)
-    at = np.cumsum([0, *(s.y.shape[0] for s in short.shots)])[:-1]
-    v = np.concatenate([plain.theta, X[at].ravel()])
-    seconds, errors, offset, jump, converged = [], [], 0.0, np.full(plain.layout.n, 10.0), False
-    for _ in range(_ROUNDS + 1):
-        short = plain.problem(data, length, jump)
-        found = search(short, v, stage="multiple shooting", most=iterations, tolerance=1e-6, tick=tick)
-        v, converged = found.theta, found.converged
-        seconds += [offset + t for t in found.seconds]
-        errors += [_relative(c, plain) for c in found.costs]
-        offset = seconds[-1]
-        jump, plain = _reweighted(plain, short, v)
-    theta, x0 = short.split(v)
-    first = x0[[k for k, s in enumerate(short.shots) if not s.goes_on]]
-    again = added_gain(replace(plain, theta=theta, x0=first), data, state.K)
-    if again is None:
-        return None
-    curve = LearningCurve(
-        method="Levenberg-Marquardt, multiple shooting", seconds=np.array(seconds), training=np.array(errors)
-    )
-    return again, curve, converged
-
-
-def _reweighted(state: State, problem: StateProblem, v: Array) -> tuple[Array, State]:
-    """Weights of jumps, and the errors' covariance, as they come out."""
-    X, E = problem.errors(v)
-    _, x0 = problem.split(v)
-    gaps = [x0[k] - X[k - 1][-1] for k in range(1, len(X)) if problem.shots[k].goes_on]
-    e = np.concatenate(E)
-    size = np.sqrt(np.mean(np.square(gaps), axis=0)) if gaps else np.ones(state.layout.n)
-    return 1.0 / np.maximum(size, 1e-6), replace(state, noise=e.T @ e / e.shape[0])
 
 
 def added_network(
