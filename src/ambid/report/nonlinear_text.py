@@ -45,7 +45,7 @@ def nonlinear_text(fit: NonlinearFit, *, width: int = WIDTH, paint: Paint = plai
         [x for c in fit.curves for x in textwrap.wrap(curve_line(c), width, subsequent_indent="  ")],
         check_lines(fit.checks, width=width, paint=paint),
         warning_lines(fit.warnings, width=width, paint=paint),
-        [paint(timing_line(fit.timing_s), "dim")] if fit.timing_s else [],
+        [paint(x, "dim") for x in textwrap.wrap(timing_line(fit.timing_s), width)] if fit.timing_s else [],
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 

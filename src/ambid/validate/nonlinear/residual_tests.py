@@ -19,8 +19,8 @@ from ambid.identify.blackbox.data import IOData
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.residual_tests import WHITE_LAGS, input_lags
-from ambid.validate.blackbox.score import Score, autoregression, score
-from ambid.validate.nonlinear.runs import Run, model_of
+from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
+from ambid.validate.nonlinear.runs import Run, looks_back, model_of
 from ambid.validate.residuals import ResidualTest
 
 Array = NDArray[np.float64]
@@ -46,12 +46,16 @@ class Material:
         Derivatives of the predictions.
     colours : tuple of ndarray, shape (n + 1,) each, or None
         Autoregression of each output's error, where the model leaves the colour of the noise open.
+    instrumental : bool
+        Whether `J` holds noise that such errors depend on: for a model that was fitted to its free run, but predicts
+        from measured outputs. Then inputs serve as instruments.
     """
 
     e: list[Array]
     u: list[Array]
     J: list[Array]
     colours: tuple[Array, ...] | None
+    instrumental: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,7 +67,8 @@ class NonlinearTests:
     white : ResidualTest
         e against past e.
     uncorrelated, squares, variance : ResidualTest or None
-        e against past u, e against past u^2, e^2 against past u^2; None without inputs.
+        e against past u, e against past u^2, e^2 against past u^2; None without inputs, and where the model has more
+        parameters than a test has instruments.
     products : ResidualTest or None
         e against past e u; None without inputs, and where the model leaves the colour of the noise open.
     feedback : ResidualTest or None
@@ -136,7 +141,8 @@ def material(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run], 
     u = [(x - level) / np.where(size > 0, size, 1.0) for x in u]
     longest = max(e, key=len)
     colours = tuple(autoregression(column) for column in longest.T) if coloured else None
-    return Material(e=e, u=u, J=J, colours=colours)
+    instrumental = coloured and any(looks_back(x, r) for x, r in used)
+    return Material(e=e, u=u, J=J, colours=colours, instrumental=instrumental)
 
 
 def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
@@ -158,10 +164,12 @@ def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
     inputs = bool(of.u[0].shape[1])
     lags = input_lags(shortest, with_now=with_now)
     squares = _squares(of)
+    # As instruments, squares alone are too few for most models.
+    instruments = [np.hstack([a, b]) for a, b in zip(of.u, squares, strict=True)] if of.instrumental else squares
     return NonlinearTests(
         white=_worst([_tested(of, o, of.e, white) for o in _outputs(of)], white, of.e[0].shape[1]),
-        uncorrelated=_against(of, of.u, lags, coloured=True) if inputs else None,
-        squares=_against(of, squares, products, coloured=True) if inputs else None,
+        uncorrelated=_against(of, of.u, lags) if inputs else None,
+        squares=_against(of, instruments, products) if inputs else None,
         products=_products(of, products) if inputs and of.colours is None else None,
         variance=_worst([_variance(of, o, squares, products) for o in _outputs(of)], products, squares[0].shape[1])
         if inputs
@@ -221,6 +229,8 @@ def _tested(of: Material, o: int, signals: list[Array], lags: tuple[int, ...], *
     e = np.concatenate([x[longest:, o] for x in of.e])
     J = np.concatenate([x[longest:, o] for x in of.J])
     colour = of.colours[o] if coloured and of.colours is not None else None
+    if of.instrumental and colour is not None:
+        return instrumental_score(e, J, _lagged(signals, lags), colour=colour)
     return score(e, J, _lagged(signals, lags), colour=colour)
 
 
@@ -238,9 +248,11 @@ def _lagged(signals: list[Array], lags: tuple[int, ...]) -> Array:
     return np.concatenate([np.hstack([s[longest - k : s.shape[0] - k] for k in lags]) for s in signals])
 
 
-def _against(of: Material, signals: list[Array], lags: tuple[int, ...], *, coloured: bool) -> ResidualTest:
-    found = [_tested(of, o, signals, lags, coloured=coloured) for o in _outputs(of)]
-    return _worst(found, lags, signals[0].shape[1])
+def _against(of: Material, signals: list[Array], lags: tuple[int, ...]) -> ResidualTest | None:
+    """Test errors against inputs; None where no instrument is left over."""
+    found = [_tested(of, o, signals, lags, coloured=True) for o in _outputs(of)]
+    worst = _worst(found, lags, signals[0].shape[1])
+    return None if of.instrumental and not worst.degrees else worst
 
 
 def _products(of: Material, lags: tuple[int, ...]) -> ResidualTest:

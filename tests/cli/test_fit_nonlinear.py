@@ -1,0 +1,158 @@
+"""``ambid fit`` with nonlinear structures: from words to file, table and exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from ambid.cli import fit_nonlinear
+from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+
+WORDS = ("--input", "u", "--output", "y", "--open-loop")
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory):
+    at = tmp_path_factory.mktemp("records")
+    for k in range(3):
+        rng = np.random.default_rng(20 + k)
+        u, y = rng.uniform(-1, 1, 500), np.zeros(500)
+        for t in range(2, 500):
+            y[t] = 0.6 * y[t - 1] + 0.9 * u[t - 2] + 0.3 * u[t - 1] ** 2 + 0.02 * rng.standard_normal()
+        table = np.column_stack([np.arange(500) / 100, u, y])
+        np.savetxt(at / f"r{k}.csv", table, delimiter=",", header="time [s],u [V],y [m]", comments="")
+    return at
+
+
+@pytest.fixture
+def at(records, monkeypatch, tmp_path):
+    """The folder with the records; what is written goes elsewhere."""
+    monkeypatch.chdir(records)
+    return tmp_path
+
+
+def test_several_records_to_file_figure_and_table(at, ambid) -> None:
+    out, figure = at / "fit.json", at / "fit.png"
+    found = ambid(
+        "fit", "r0.csv", "r1.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0,degree=2", "--validate",
+        "r2.csv", "--json", out, "--plot", figure, "--strict",
+    )  # fmt: skip
+    assert found.code == 0, found.out
+    assert max(map(len, found.out.splitlines())) <= 80
+    lines = found.out.splitlines()
+    assert lines[0].startswith("2 records: narmax, 1000 samples")
+    assert any(x.startswith("u(t-1)^2 ") and x.endswith("%") and "±" in x for x in lines)
+    assert "on the second record" in found.out
+    document = json.loads(out.read_text())
+    assert document["schema"] == "ambid.fit/1"
+    assert document["orders"]["degree"] == 2
+    assert len(document["records"]) == 2
+    assert document["fit"]["y"]["simulation"] > 0.9
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    again = ambid("validate", out, "r2.csv", "--json", "-")
+    assert json.loads(again.out)["fit"]["y"] == document["validation"]["y"]
+    shown = ambid("validate", out, "r2.csv")
+    assert shown.code == 0
+    assert "outside the training data" in shown.out
+
+
+def test_orders_are_another_name_for_settings(at, ambid) -> None:
+    by = [
+        json.loads(ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, name, "ne=0,ny=1", "--json", "-").out)
+        for name in ("--orders", "--settings")
+    ]
+    assert by[0]["model"] == by[1]["model"]
+    both = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--orders", "ny=1", "--settings", "ny=1")
+    assert both.code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--structure", "narmax", "--at-rest"), "--at-rest is for linear structures"),
+        (("--structure", "narmax", "--criterion", "aic"), "--criterion is for linear"),
+        (("--structure", "narmax", "--settings", "degree"), "not NAME=VALUE"),
+        (("--structure", "narmax", "--settings", "ny=1,ny=2"), "ny stands twice"),
+        (("--structure", "narmax", "--settings", "degree=high"), "degree"),
+        (("--structure", "narmax", "--settings", "dgree=2"), "Did you mean 'degree'"),
+        (("--structure", "arx", "--seed", "1"), "--seed is for nonlinear structures"),
+        (("--structure", "arx", "--settings", "na=1"), "--settings is for nonlinear structures"),
+        (("--structure", "narmaxx"), "Did you mean 'narmax'"),
+        (("r1.csv", "--structure", "arx"), "takes one record"),
+        (("--structure", "narmax", "--plot", "fit.txt"), "has to end in"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(at, ambid, words, said) -> None:
+    refused = ambid("fit", "r0.csv", *words, *WORDS)
+    assert refused.code == 2
+    assert said in refused.err
+    assert len(refused.err.splitlines()) == 1
+
+
+def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
+    ticks = []
+
+    @contextmanager
+    def pressed(title):
+        def tick(stage):
+            ticks.append(stage)
+            if len(ticks) == 5:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        yield tick
+
+    monkeypatch.setattr(fit_nonlinear, "progress", pressed)
+    out = at / "fit.json"
+    found = ambid("fit", "r0.csv", "--structure", "narx", *WORDS, "--json", out)
+    assert found.code == 130
+    document = json.loads(out.read_text())
+    assert document["status"] == "stalled"
+    assert document["model"] is not None
+    assert "interrupted" in found.out
+    assert ticks[-1] == "check"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_failed_fit_says_why_and_ends_with_three(at, ambid, monkeypatch) -> None:
+    from dataclasses import replace
+
+    from ambid import job
+
+    real = job.fit_nonlinear
+
+    def failing(*args, **options):
+        fit = real(*args, **options)
+        return replace(fit, model=None, covariance=None, status="failed", reason="it broke", checks={}, fit={})
+
+    monkeypatch.setattr(job, "fit_nonlinear", failing)
+    out = at / "fit.json"
+    found = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--json", out, "--plot", at / "none.png")
+    assert found.code == 3
+    assert "no model: it broke" in found.out
+    assert json.loads(out.read_text())["status"] == "failed"
+    assert not (at / "none.png").exists()
+    assert ambid("validate", out, "r0.csv").code == 2
+
+
+def test_models_list_every_structure_with_its_settings(ambid) -> None:
+    found = ambid("models")
+    assert found.code == 0
+    part = found.out[found.out.index("nonlinear structures") :]
+    for s in NONLINEAR_STRUCTURES.values():
+        assert f"\n  {s.name}" in part
+        for name in s.settings:
+            assert f"\n    {name} " in part
+    assert max(map(len, part.splitlines())) <= 80
+
+
+def test_settings_as_they_are_written() -> None:
+    read = fit_nonlinear.settings_of
+    assert read("auto") == {}
+    assert read("ny=2, nu=2/3,prior=0.5,criterion=bic,neurons=auto,x=1e-3") == {
+        "ny": 2, "nu": (2, 3), "prior": 0.5, "criterion": "bic", "x": 1e-3,
+    }  # fmt: skip

@@ -1,0 +1,110 @@
+"""The nonlinear job: several records, settings, seed, interruption."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambid.errors import AmbidError, EstimationError
+from ambid.identify.nonlinear.fit_file import nonlinear_fit_text
+from ambid.job import fit_nonlinear
+from ambid.job.estimates import read_estimate
+from ambid.record import read_record
+
+CHANNELS = {"inputs": ("u",), "outputs": ("y",)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three records of y(t) = 0.6 y(t-1) + 0.9 u(t-2) + 0.3 u(t-1)^2 + e(t), the last at half the rate."""
+    at = tmp_path_factory.mktemp("records")
+    for k, rate in enumerate((100, 100, 100, 50)):
+        rng = np.random.default_rng(k)
+        u, y = rng.uniform(-1, 1, 500), np.zeros(500)
+        for t in range(2, 500):
+            y[t] = 0.6 * y[t - 1] + 0.9 * u[t - 2] + 0.3 * u[t - 1] ** 2 + 0.02 * rng.standard_normal()
+        table = np.column_stack([np.arange(500) / rate, u, y])
+        np.savetxt(at / f"r{k}.csv", table, delimiter=",", header="time [s],u [V],y [m]", comments="")
+    return at
+
+
+def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
+    stages: list[str] = []
+    fit = fit_nonlinear(
+        [folder / "r0.csv", read_record(folder / "r1.csv")],
+        **CHANNELS,
+        structure_name="narmax",
+        settings={"ne": 0},
+        open_loop=True,
+        from_s=0.5,
+        validate=folder / "r2.csv",
+        validate_to_s=3.0,
+        tick=stages.append,
+    )
+    assert fit.passed
+    assert [x["samples"] for x in fit.records] == [450, 450]
+    assert fit.model is not None
+    found = dict(zip(fit.model.names, fit.model.theta, strict=True))
+    assert found == pytest.approx({"y(t-1)": 0.6, "u(t-2)": 0.9, "u(t-1)^2": 0.3}, abs=0.02)
+    assert fit.validation is not None
+    assert set(fit.validation["y"]) == {"one_step", "simulation", "extrapolated"}  # type: ignore[call-overload]
+    assert set(fit.timing_s) == {"read", "fit", "checks"}
+    assert (stages[0], stages[-1]) == ("read", "check")
+
+
+def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> None:
+    calls = []
+
+    def tick(stage: str) -> None:
+        calls.append(stage)
+        if stage not in ("read", "check") and "stopped" not in calls and len(calls) > 4:
+            calls.append("stopped")
+            raise KeyboardInterrupt
+
+    fit = fit_nonlinear([folder / "r0.csv"], **CHANNELS, structure_name="narx", open_loop=True, tick=tick)
+    assert fit.status == "stalled"
+    assert any("interrupted" in x for x in fit.warnings)
+    assert fit.fit["y"].one_step > 0.1
+    assert "residuals_white" in fit.checks
+
+
+def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -> None:
+    settings = {"ny": 1, "nu": 2, "neurons": 3, "starts": 2, "iterations": 8}
+    fits = [
+        fit_nonlinear(
+            [folder / "r0.csv"], **CHANNELS, structure_name="narx", settings=settings, open_loop=True, seed=seed
+        )
+        for seed in (4, 4, 5)
+    ]
+    thetas = [f.model.theta for f in fits if f.model is not None]
+    np.testing.assert_array_equal(thetas[0], thetas[1])
+    assert not np.array_equal(thetas[0], thetas[2])
+    path = tmp_path / "fit.json"
+    path.write_text(nonlinear_fit_text(fits[0]), encoding="utf-8")
+    again = read_estimate(path)
+    assert nonlinear_fit_text(again) == path.read_text(encoding="utf-8")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"structure_name": "narmx"}, "Did you mean 'narmax'"),
+        ({"settings": {"degre": 2}}, "Did you mean 'degree'"),
+        ({"seed": -1}, "seed"),
+        ({"validate_from_s": 1.0}, "--validate"),
+        ({"outputs": ("z",)}, "z"),
+        ({"from_s": 100.0}, "100"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(folder, changes, said) -> None:
+    with pytest.raises(AmbidError, match=said):
+        fit_nonlinear([folder / "r0.csv"], **{**CHANNELS, "structure_name": "narmax", **changes})
+
+
+def test_records_of_another_rate_are_refused(folder) -> None:
+    for words in ({"records": [folder / "r0.csv", folder / "r3.csv"]},
+                  {"records": [folder / "r0.csv"], "validate": folder / "r3.csv"}):  # fmt: skip
+        with pytest.raises(EstimationError, match="50 Hz"):
+            fit_nonlinear(**words, **CHANNELS, structure_name="narmax")
+    with pytest.raises(EstimationError, match="no record"):
+        fit_nonlinear([], **CHANNELS, structure_name="narmax")
