@@ -162,7 +162,7 @@ def inputs(ax: Axes) -> None:
     contact(ax, 77, 45, "90 °C\nin the coil")
     wire(ax, (84, 45), (84, 44))
     ground(ax, 84, 44)
-    rows = ((33, "A1", "1.5 kΩ", "current\namplifier\n20 V/V"), (23, "A0", "1.0 kΩ", "position\nsensor\n2 V/mm"))
+    rows = ((33, "A1", "1.0 kΩ", "current\namplifier\n20 V/V"), (23, "A0", "1.0 kΩ", "position\nsensor\n2 V/mm"))
     for y, pin, ohms, part in rows:
         wire(ax, (45, y), (88, y))
         words(ax, 44.4, y, pin, at="right")
@@ -248,15 +248,15 @@ def sensors() -> plt.Figure:
     steps.annotate("blind at\nthe peak", (2.6, 150), (5.0, 60), arrowprops={"arrowstyle": "->", "color": SOFT})
 
     f = np.geomspace(10.0, 40e3, 400)
-    for ohms, color, name in ((1.0e3, POWER, "A0: 1.0 kΩ, 47 nF"), (1.5e3, INK, "A1: 1.5 kΩ, 47 nF")):
-        filters.semilogx(f, -10 * np.log10(1 + (2 * np.pi * f * ohms * 47e-9) ** 2), color=color, label=name)
+    gain = -10 * np.log10(1 + (2 * np.pi * f * 1.0e3 * 47e-9) ** 2)
+    filters.semilogx(f, gain, color=POWER, label="A0 and A1: 1.0 kΩ, 47 nF")
     marks = ((55.0, "loop\n55 Hz"), (1000.0, "half the\nrate"), (20e3, "PWM"))
     for at, name in marks:
         filters.axvline(at, color=SOFT, lw=0.8, ls=":")
         filters.text(at * 0.93, -21.5, name, fontsize=8, ha="right", va="bottom", color=SOFT)
     filters.set(xlabel="frequency (Hz)", ylabel="dB", xlim=(10, 40e3), ylim=(-22, 6))
     filters.set_title("filters at the inputs")
-    filters.legend(loc="upper right", frameon=False)
+    filters.legend(loc="upper right", framealpha=1.0, edgecolor="white")
     for ax in (curve, steps, filters):
         ax.grid(alpha=0.25)
     figure.tight_layout()
