@@ -1,7 +1,7 @@
 """Measure ambid beside straightforward SciPy and beside peers: ``make bench``, or ``make bench BENCH="speed records"``.
 
-Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about three
-quarters of an hour, the physical one three minutes.
+Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about fifty
+minutes, the physical one three minutes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition")
+PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection")
 
 
 def main(wanted: list[str]) -> None:
@@ -82,6 +82,10 @@ def _measured(part: str) -> Iterator[Any]:
         from acquisition import acquisition_tables
 
         return acquisition_tables()
+    if part == "selection":
+        from selection import selection_tables
+
+        return selection_tables()
     from records import record_tables
 
     return record_tables()
