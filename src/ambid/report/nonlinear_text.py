@@ -146,7 +146,10 @@ def term_lines(fit: NonlinearFit) -> list[str]:
 
 
 def _percent(err: object) -> str:
-    return f"{100 * err:.4f} %" if isinstance(err, (int, float)) else ""
+    """In percent; small ratios, which fast sampling makes of all but the last output, in a power of ten."""
+    if not isinstance(err, (int, float)):
+        return ""
+    return f"{100 * err:.3f} %" if err >= 1e-4 or err == 0 else f"{100 * err:.1e} %"
 
 
 def _coefficient(value: float, sd: float | None) -> str:

@@ -75,6 +75,17 @@ def test_an_unstable_plant_in_a_loop_is_not_blamed_for_its_free_run() -> None:
     assert any("said to be open loop" in x for x in said.warnings)
 
 
+def test_what_a_model_misses_is_not_called_feedback() -> None:
+    rng = np.random.default_rng(2)
+    u = np.convolve(rng.standard_normal(1540), np.ones(40) / 6, "valid")[:1500]  # slow: it goes on as it did
+    y = np.zeros(1500)
+    for t in range(1, 1500):
+        y[t] = 0.6 * y[t - 1] + u[t - 1] + u[t - 1] ** 2 + 0.05 * rng.standard_normal()
+    found = judged(narmax([io(u, y)], {"degree": 1}), [io(u, y)])
+    assert not found.checks["residuals_nonlinear"].passed
+    assert not any("said to be open loop" in x for x in found.warnings)
+
+
 def test_extrapolation_is_the_share_outside_the_training_data_and_is_warned_of() -> None:
     data = static_record(1000, 7)
     inside = judged(static_fit(Static(edge=10.0), data), [data], second=static_record(500, 8))

@@ -108,10 +108,9 @@ def _feedback(fit: NonlinearFit, tests: NonlinearTests, *, coloured: bool) -> Ch
     test, biased = tests.feedback, feedback_biases(fit, coloured=coloured)
     assert test is not None
     seen = test.p < P_LEAST
-    left = [x for x in (tests.uncorrelated, tests.squares) if x is not None and x.p < P_LEAST]
     if not seen:
         detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
-    elif left:
+    elif explained_by_inputs(tests):
         detail = "inputs depend on past residuals, which hold what inputs explain: feedback, or what the model misses"
     elif biased:
         detail = f"inputs depend on past residuals: there is feedback, and this {fit.structure} is biased by it"
@@ -123,6 +122,20 @@ def _feedback(fit: NonlinearFit, tests: NonlinearTests, *, coloured: bool) -> Ch
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
         detail=f"{detail} (p = {test.p:.2g})",
     )
+
+
+def explained_by_inputs(tests: NonlinearTests) -> bool:
+    """Return whether residuals hold a function of past inputs: then inputs depend on them without any feedback.
+
+    Parameters
+    ----------
+    tests : NonlinearTests
+
+    Returns
+    -------
+    bool
+    """
+    return any(x is not None and x.p < P_LEAST for x in (tests.uncorrelated, tests.squares))
 
 
 def feedback_warnings(
@@ -146,11 +159,9 @@ def feedback_warnings(
     if not fit.inputs:
         return []
     told_open = all(x.open_loop for x in records)
-    if tests is not None and tests.feedback is not None and tests.feedback.p < P_LEAST and told_open:
-        return [
-            f"the records are said to be open loop, but inputs depend on past residuals (p = {tests.feedback.p:.2g}): "
-            "leave --open-loop out, unless what the model misses explains it"
-        ]
+    seen = tests is not None and tests.feedback is not None and tests.feedback.p < P_LEAST
+    if seen and told_open and tests is not None and not explained_by_inputs(tests):
+        return ["the records are said to be open loop, but inputs depend on past residuals: leave --open-loop out"]
     said = any("biased" in x and "open loop" in x for x in fit.warnings)
     if told_open or said or not feedback_biases(fit, coloured=coloured):
         return []

@@ -152,7 +152,7 @@ def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
     ----------
     of : Material
     with_now : bool
-        Whether to test the present input too; under feedback it may depend on the present error.
+        Whether to test the present input too, unless feedback is seen: then it may depend on the present error.
 
     Returns
     -------
@@ -162,7 +162,8 @@ def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
     white = tuple(k for k in WHITE_LAGS if k < shortest // 10) or (1,)
     products = tuple(k for k in _PRODUCT_LAGS if k < shortest // 10) or (1,)
     inputs = bool(of.u[0].shape[1])
-    lags = input_lags(shortest, with_now=with_now)
+    loop = _feedback(of) if inputs else None
+    lags = input_lags(shortest, with_now=with_now and (loop is None or loop.passed))
     squares = _squares(of)
     # As instruments, squares alone are too few for most models.
     instruments = [np.hstack([a, b]) for a, b in zip(of.u, squares, strict=True)] if of.instrumental else squares
@@ -174,7 +175,7 @@ def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
         variance=_worst([_variance(of, o, squares, products) for o in _outputs(of)], products, squares[0].shape[1])
         if inputs
         else None,
-        feedback=_feedback(of) if inputs else None,
+        feedback=loop,
     )
 
 
