@@ -160,9 +160,19 @@ def _played(wish: Wish, device: Device, amplitude_v: float, seconds: float) -> P
     from ambid.acquire.program import program
 
     return program(
-        str(wish.name), amplitude_v=amplitude_v, band=wish.band, rate_hz=device.info.rate_hz, seconds=seconds,
-        seed=wish.seed,
+        str(wish.name), amplitude_v=amplitude_v, band=_band(wish, device), rate_hz=device.info.rate_hz,
+        seconds=seconds, seed=wish.seed,
     )  # fmt: skip
+
+
+def _band(wish: Wish, device: Device) -> tuple[float, float] | None:
+    """Return the band as wished; without one, a multisine that a levitated rotor follows."""
+    from ambid.job.amplitude import moving_band
+
+    if wish.band is not None or wish.mode != "levitate" or wish.name not in ("multisine", "schroeder"):
+        return wish.band
+    low, high = moving_band(device.info.rate_hz, wish.seconds)
+    return (low, high) if 3.0 * low < high else None  # a short record has no room for slow lines
 
 
 def _found_amplitude(wish: Wish, device: Device, stop: Stop, watch: Watch) -> float:
@@ -171,8 +181,8 @@ def _found_amplitude(wish: Wish, device: Device, stop: Stop, watch: Watch) -> fl
 
     watch.show("amplitude", 0.0, "trials, small first")
     trial = Trial(
-        name=str(wish.name), band=wish.band, mode=wish.mode, settle_s=wish.settle_s, seconds=_trial_s(wish, device),
-        seed=wish.seed,
+        name=str(wish.name), band=_band(wish, device), mode=wish.mode, settle_s=wish.settle_s,
+        seconds=_trial_s(wish, device), seed=wish.seed,
     )  # fmt: skip
     try:
         found = fitting_amplitude(device, wish.rig, trial, stopped=stop.wished)

@@ -32,7 +32,10 @@ RigOfDevice = Annotated[
 BandHz = Annotated[
     str | None,
     typer.Option(
-        "--band", metavar="LO:HI", help="Band of the excitation in Hz.", show_default="what the controller can play"
+        "--band",
+        metavar="LO:HI",
+        help="Band of the excitation in Hz.",
+        show_default="of a multisine to levitate, where the rotor moves; else what the controller can play",
     ),
 ]
 BenchName = Annotated[

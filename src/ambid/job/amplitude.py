@@ -17,6 +17,7 @@ from ambid.errors import DeviceError
 from ambid.job.look import Array, Look, Room, ended, looking
 from ambid.rig import Rig
 
+_FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
 _TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
 _ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
 _AIM = 0.9  # of that part
@@ -68,6 +69,24 @@ class Size:
     used: float
     findings: tuple[str, ...]
     reasons: tuple[str, ...] = ()
+
+
+def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
+    """Return the band in which a levitated rotor moves: an excitation above it tells of the coil alone.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Of the device, Hz.
+    seconds : float
+        Length of the record, s: the lowest line has at least four periods in it.
+
+    Returns
+    -------
+    (float, float)
+        From a thousandth of the rate to a thirtieth, Hz.
+    """
+    return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
 
 
 def find_amplitude(

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
+from ambid.job.amplitude import moving_band
+
 StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"]
 
 STEPS: tuple[StepName, ...] = (
@@ -127,7 +129,7 @@ class Wishes:
         (float, float)
             As wished, or from the rate.
         """
-        return self.band_hz or (rate_hz / 1000.0, rate_hz / 30.0)
+        return self.band_hz or moving_band(rate_hz)
 
     def longest_trial_s(self, rate_hz: float) -> float:
         """Return the length of a trial in s: as wished, or longer where the band is slow.
