@@ -35,7 +35,7 @@
 #define HOST_MS_LEAST 20
 #define HOST_MS_MOST 2000
 #define LIFT_MS_MOST 2000
-#define LIFTED_MS 20 /* inside its limits for so long: the rotor is lifted, the position counts from now on */
+#define LIFTED_MS 100 /* inside its limits for so long: the rotor is lifted, the position counts from now on */
 
 struct daq {
     volatile uint8_t state, cause;

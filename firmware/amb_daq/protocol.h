@@ -386,7 +386,7 @@ struct msg_limits {
     uint16_t duty_high; /* largest pulse width, counts */
     uint16_t duty_off; /* pulse width of no voltage, counts: with the output off, and about which drive works without gains; not above the cap of duty_high that was compiled in */
     uint16_t host_ms; /* longest silence of the host while the output is on, 20 to 2000 ms */
-    uint16_t lift_ms; /* time after start of drive or levitation in which out_of_gap does not count, 0 to 2000 ms; it ends early once the position was inside for 20 ms */
+    uint16_t lift_ms; /* time after start of drive or levitation in which out_of_gap does not count, 0 to 2000 ms; it ends early once the position was inside for 100 ms */
 };
 static inline struct msg_limits read_limits(const uint8_t *p)
 {

@@ -28,7 +28,7 @@ LARGEST_GAIN = 2**19
 """Largest step number of a gain: no product can then overflow the controller's arithmetic."""
 SHORTEST_PERIOD, LONGEST_PERIOD = 5, 20_000
 """Of a tick, in periods of the pulse width modulation."""
-LIFTED_MS = 20
+LIFTED_MS = 100
 """Inside its limits for so long after a start, the position counts from then on, ms."""
 LAG_S = 175e-6
 """From the moment that a sample stands for to that from which its pulse width acts, at every rate, s."""
