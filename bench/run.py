@@ -43,13 +43,20 @@ def main(wanted: list[str]) -> None:
         results[part] = {"machine": machine, "items": found}
         print(f"{quantity(machine['took_s'], 's')} for {part}", flush=True)
         RESULTS.parent.mkdir(exist_ok=True)
-        RESULTS.write_text(json.dumps({"schema": "ambid.bench/2", "parts": results}, indent=1) + "\n", encoding="utf-8")
+        RESULTS.write_text(
+            json.dumps({"schema": "ambid.bench/2", "parts": results}, indent=1, default=_plain) + "\n", encoding="utf-8"
+        )
     missing = [part for part in PARTS if part not in results]
     if missing:
         print(f"docs/{PAGE.name} not written: not measured yet: {' '.join(missing)}")
         return
     PAGE.write_text(page([results[part] for part in PARTS]), encoding="utf-8")
     print(f"{RESULTS.relative_to(HERE.parent)} and docs/{PAGE.name} written")
+
+
+def _plain(value: Any) -> Any:
+    """Take a number of NumPy for what it is: measurements of many minutes were lost for one."""
+    return value.item()
 
 
 def _earlier() -> dict[str, Any]:
