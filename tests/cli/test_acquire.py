@@ -227,7 +227,7 @@ def test_a_record_that_exists_is_kept_unless_forced(acquire, place, monkeypatch)
     assert "--force" in done.err
     assert (place / "o.h5").read_text() == "precious"
     monkeypatch.undo()
-    os.chdir(place)
+    monkeypatch.chdir(place)
     assert acquire("--seconds", "1", "--force").code == 0
     assert samples() == 2000
 

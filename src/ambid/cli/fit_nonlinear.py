@@ -234,9 +234,12 @@ def one_record(records: Sequence[Path], structure: str, settings: str | None, se
     EstimationError
         If there are several, or an option that only nonlinear structures have.
     """
-    from ambid.identify.blackbox.structures import STRUCTURES
+    from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
+    from ambid.identify.blackbox.structures import structure as linear
     from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
 
+    if structure in RESPONSE_STRUCTURES:
+        linear(structure)  # says where those are fitted
     if structure not in STRUCTURES:
         every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
         raise EstimationError(

@@ -5,6 +5,7 @@ import os
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ from tests.acquire.recorder.signals import (
 BLOCKS = 4
 SMALL = JournalHeader(columns=header(1).columns, rate_hz=1000.0)
 HEADER_END = PREAMBLE_SIZE + OVERHEAD + len(json_bytes(SMALL.as_json()))
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def small(number):
@@ -131,7 +134,7 @@ print(recorder.acknowledged, recorder.blocks, *told, sep="\\n")
 def test_a_limit_of_the_system_on_the_size_of_files(tmp_path):
     path, limit = tmp_path / "run.h5", 9000
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(path), str(limit)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", LIMITED, str(path), str(limit)], capture_output=True, text=True, timeout=120, cwd=ROOT
     )
     assert done.returncode == 0, done.stderr
     acknowledged, blocks, *told = done.stdout.splitlines()

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from ambid.errors import DeviceError
 from ambid.record import read_record
 from ambid.track.stream.block import Block
 from tests.acquire.recorder.signals import COLUMNS, RATE, ROWS, block, contents, header, same_bits, values_at
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def recorded(path, numbers=range(10), **more):
@@ -145,7 +148,7 @@ def test_the_lock_holds_against_another_process(tmp_path):
     code = f"from ambid.acquire.recorder import JournalReader\nJournalReader.open({str(tmp_path / 'run.h5.journal')!r})"
     with Recorder(tmp_path / "run.h5", header()) as recorder:
         recorder.append(block(0))
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert "is being written" in done.stderr
 
 
@@ -165,7 +168,9 @@ os._exit(0)
 
 def test_a_process_that_was_forked_off_does_not_hold_the_journal_of_a_dead_recorder(tmp_path):
     code = [sys.executable, "-c", FORKED, str(tmp_path / "run.h5")]
-    with subprocess.Popen(code, stdin=subprocess.PIPE) as parent:  # on leaving, the child's input is closed: it ends
+    with subprocess.Popen(
+        code, stdin=subprocess.PIPE, cwd=ROOT
+    ) as parent:  # on leaving, the child's input is closed: it ends
         assert parent.wait(60) == 0
         assert len(contents(tmp_path / "run.h5.journal")[0]) == 1
 
