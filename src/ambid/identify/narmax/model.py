@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.narmax.recursion import Tables, predicted, sensitivities, tables
 from ambid.identify.narmax.terms import Term, term_from_json, term_name, term_to_json
+from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
 
@@ -146,7 +147,7 @@ class PolynomialNarmax:
         EstimationError
             If the signals are not of the model's shape.
         """
-        ys, us = self._scaled(u, y)
+        ys, us = scaled(self, u, y)
         found, _ = predicted(self.tables, self.theta / self.unit, ys, us)
         return self.y_level + self.y_scale * found
 
@@ -168,7 +169,7 @@ class PolynomialNarmax:
         EstimationError
             If the signals are not of the model's shape.
         """
-        ys, us = self._scaled(u, y)
+        ys, us = scaled(self, u, y)
         theta = self.theta / self.unit
         _, z = predicted(self.tables, theta, ys, us)
         return sensitivities(self.tables, theta, z) * (self.y_scale[:, None] / self.unit)
@@ -193,16 +194,11 @@ class PolynomialNarmax:
         EstimationError
             If the signals are not of the model's shape.
         """
-        u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        head = min(self.lag, u.shape[0])
-        if y.shape[0] < head:
-            raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
-        whole = np.zeros((u.shape[0], self.n_outputs))
-        whole[:head] = y[:head]
-        ys, us = self._scaled(u, whole)
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
         found, _ = predicted(self.tables, self.theta / self.unit, ys, us, free=True)
         out: Array = self.y_level + self.y_scale * found
-        out[:head] = y[:head]
+        out[:head] = whole[:head]
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
@@ -223,7 +219,7 @@ class PolynomialNarmax:
         EstimationError
             If the signals are not of the model's shape.
         """
-        ys, us = self._scaled(u, y)
+        ys, us = scaled(self, u, y)
         _, z = predicted(self.tables, self.theta / self.unit, ys, us)
         x = lagged_signals(self.tables, z)
         out = np.full(ys.shape[0], np.nan)
@@ -272,16 +268,6 @@ class PolynomialNarmax:
             return cls(**_read(found))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise EstimationError(f"no NARMAX model ({type(error).__name__}: {error}). Write the file again") from error
-
-    def _scaled(self, u: Array, y: Array) -> tuple[Array, Array]:
-        u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        want = ((y.shape[0] if y.ndim else 0, self.n_inputs), (y.shape[0] if y.ndim else 0, self.n_outputs))
-        if (u.shape, y.shape) != want:
-            raise EstimationError(
-                f"inputs of shape {u.shape} and outputs of shape {y.shape} for a model of {self.n_inputs} and "
-                f"{self.n_outputs} channels; time is axis 0. Pass (n_samples, n_channels)"
-            )
-        return (y - self.y_level) / self.y_scale, (u - self.u_level) / self.u_scale
 
 
 def _read(found: dict[str, Any]) -> dict[str, Any]:

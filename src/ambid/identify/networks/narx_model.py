@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
 
@@ -240,60 +241,3 @@ def finite(value: Any, n: int, what: str) -> Array:
     if not np.all(np.isfinite(out)):
         raise ValueError(f"{what} is not finite")
     return out
-
-
-def scaled(model: Any, u: Array, y: Array) -> tuple[Array, Array]:
-    """Return outputs and inputs in a model's scaled units.
-
-    Parameters
-    ----------
-    model : NeuralNarx or StateNetwork
-    u : ndarray, shape (n_samples, n_inputs), SI
-    y : ndarray, shape (n_samples, n_outputs), SI
-
-    Returns
-    -------
-    y, u : ndarray, shapes (n_samples, n_outputs) and (n_samples, n_inputs)
-
-    Raises
-    ------
-    EstimationError
-        If they are not of the model's shape.
-    """
-    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    n = y.shape[0] if y.ndim else 0
-    if (u.shape, y.shape) != ((n, model.n_inputs), (n, model.n_outputs)):
-        raise EstimationError(
-            f"inputs of shape {u.shape} and outputs of shape {y.shape} for a model of {model.n_inputs} and "
-            f"{model.n_outputs} channels; time is axis 0. Pass (n_samples, n_channels)"
-        )
-    return (y - model.y_level) / model.y_scale, (u - model.u_level) / model.u_scale
-
-
-def with_head(model: Any, u: Array, y: Array) -> tuple[Array, int]:
-    """Return outputs as long as the inputs, of which only the first `lag` rows are taken over.
-
-    Parameters
-    ----------
-    model : NeuralNarx or StateNetwork
-    u : ndarray, shape (n_samples, n_inputs)
-    y : ndarray, shape (at least lag, n_outputs)
-
-    Returns
-    -------
-    y : ndarray, shape (n_samples, n_outputs)
-    head : int
-        Rows taken over.
-
-    Raises
-    ------
-    EstimationError
-        If there are fewer than `lag` rows.
-    """
-    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    head = min(model.lag, u.shape[0])
-    if y.ndim != 2 or y.shape[0] < head:
-        raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
-    whole = np.zeros((u.shape[0], y.shape[1]))
-    whole[:head] = y[:head]
-    return whole, head

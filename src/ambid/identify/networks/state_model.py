@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.layout import Layout, Matrices
-from ambid.identify.networks.narx_model import finite, scaled, with_head
+from ambid.identify.networks.narx_model import finite
 from ambid.identify.networks.segments import Shot, run, slopes
+from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
 
