@@ -106,8 +106,8 @@ def test_a_pulse_width_acts_a_fixed_time_after_its_tick(run, mode, period, strea
     lags = done.lags_us()
     # At 2.5 kHz the last sample is still on the line: its bytes may keep the hold waiting for a microsecond or two.
     assert np.median(lags) == pytest.approx(175.0, abs=2.0)
-    # A command's bytes may come just when an order is due: at most one order a command, 1 tick in 20, could act a period
-    # later; how many do depends on when the host sends. A hold that was late itself moves the tick by some us.
+    # A command's bytes may come just when an order is due: at most one order a command, 1 tick in 20, could act a
+    # period later; how many do depends on when the host sends. A hold that was late itself moves the tick by some us.
     late = int(np.count_nonzero(lags > 175.0 + 0.5e6 / PWM_HZ))
     assert late <= done.status["overruns"] <= 0.01 * len(done.samples)  # what acts late is counted
     assert np.mean(np.abs(lags - 175.0) < 10.0) >= 0.99
