@@ -99,7 +99,7 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
 
     @contextmanager
     def pressed(title):
-        def tick(stage):
+        def tick(stage, done=None):
             ticks.append(stage)
             if len(ticks) == 5:
                 os.kill(os.getpid(), signal.SIGINT)

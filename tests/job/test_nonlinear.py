@@ -39,7 +39,7 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
         from_s=0.5,
         validate=folder / "r2.csv",
         validate_to_s=3.0,
-        tick=stages.append,
+        tick=lambda stage, done=None: stages.append(stage),
     )
     assert fit.passed
     assert [x["samples"] for x in fit.records] == [450, 450]
@@ -55,7 +55,7 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
 def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> None:
     calls = []
 
-    def tick(stage: str) -> None:
+    def tick(stage: str, done: float | None = None) -> None:
         calls.append(stage)
         if stage not in ("read", "check") and "stopped" not in calls and len(calls) > 4:
             calls.append("stopped")

@@ -99,7 +99,8 @@ def command(
             watch.clear()
             return _agreed(name, device, yes=yes)
 
-        def alive(stage: str) -> None:
+        def alive(stage: str, done: float | None = None, /) -> None:
+            del done
             watch.show("identify", STEPS.index("identify") / len(STEPS), stage)
 
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from ambid.cli.options import FAILED_CHECK, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 from ambid.errors import EstimationError, nearest
+from ambid.identify.nonlinear.progress import Tick
 
 if TYPE_CHECKING:
     from ambid.identify.nonlinear.fit import NonlinearFit, Settings
@@ -115,13 +116,13 @@ def fit_records(
         raise typer.Exit(FAILED_CHECK)
 
 
-def _interruptible(show: Callable[[str], None], stop: Stop) -> Callable[[str], None]:
+def _interruptible(show: Tick, stop: Stop) -> Tick:
     """Interrupt the search once where that is wished; what judges its result afterwards goes on."""
     told = False
 
-    def tick(stage: str) -> None:
+    def tick(stage: str, done: float | None = None, /) -> None:
         nonlocal told
-        show(stage)
+        show(stage, done)
         if stop.wished() and not told and stage != "check":
             told = True
             raise KeyboardInterrupt

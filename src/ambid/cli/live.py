@@ -166,18 +166,21 @@ class Follower:
         else:
             self._latest[event.kind] = event
 
-    def tick(self, stage: str) -> None:
+    def tick(self, stage: str, done: float | None = None) -> None:
         """Take a sign of life from the job.
 
         Parameters
         ----------
         stage : str
+        done : float or None, optional
+            Not shown.
 
         Raises
         ------
         Stopped
             If the run is to end.
         """
+        del done
         if self._stop is not None:
             raise Stopped(self._stop)
         if self.header is None:

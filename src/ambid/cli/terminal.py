@@ -6,17 +6,17 @@ import codecs
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING, TextIO
 
 import typer
 
+from ambid.identify.nonlinear.progress import Tick, silent
+
 if TYPE_CHECKING:
     from ambid.report.text import Paint, Style
-
-Tick = Callable[[str], None]
 
 _PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
 _COLOURS = {"good": {"fg": "green"}, "bad": {"fg": "red", "bold": True}, "dim": {"dim": True}, "strong": {"bold": True}}
@@ -79,7 +79,7 @@ def progress(title: str) -> Iterator[Tick]:
         To be called with the name of the stage at each evaluation.
     """
     if not sys.stderr.isatty():
-        yield _silent
+        yield silent
         return
     display = _Display(title)
     try:
@@ -88,21 +88,19 @@ def progress(title: str) -> Iterator[Tick]:
         display.stop()
 
 
-def _silent(stage: str) -> None:
-    del stage
-
-
 class _Display:
     """A line of progress, drawn by a thread of its own so that it also lives while loops are compiled."""
 
     def __init__(self, title: str) -> None:
         self._begin = self._stage_begin = time.monotonic()
         self._stage, self._count, self._fit_s = title, 0, 0.0
+        self._share: float | None = None
         self._done = Event()
         self._thread = Thread(target=self._show, daemon=True)
         self._thread.start()
 
-    def tick(self, stage: str) -> None:
+    def tick(self, stage: str, done: float | None = None, /) -> None:
+        self._share = done
         if stage != self._stage or self._count == 0:
             now = time.monotonic()
             self._fit_s = now - self._stage_begin if self._count else 0.0

@@ -1,12 +1,7 @@
-"""Progress of a job: the name of its present stage, for whoever wants to know."""
+"""Progress of a job: the same calls as those of a search, defined there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from ambid.identify.nonlinear.progress import Tick, silent
 
-Tick = Callable[[str], None]
-
-
-def silent(stage: str) -> None:
-    """Report no progress."""
-    del stage
+__all__ = ["Tick", "silent"]

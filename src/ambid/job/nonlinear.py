@@ -71,7 +71,8 @@ def fit_nonlinear(
     seed : int, optional
         Of everything random, 0 or more: equal seeds give equal results.
     tick : callable, optional
-        Called with the name of the present stage. A KeyboardInterrupt that it raises during the search ends that with
+        Called with the name of the present stage and, where it is known, the share of the search that is over, 0 to 1
+        (else None): ``tick(stage, done)``. A KeyboardInterrupt that it raises during the search ends that with
         the best model so far, status ``stalled``.
 
     Returns

@@ -165,7 +165,7 @@ def test_an_interrupted_search_gives_its_best_network() -> None:
     whole = nn([record], {"states": 2, "neurons": 4, "starts": 1})
     calls = 0
 
-    def tick(stage: str) -> None:
+    def tick(stage: str, done: float | None = None) -> None:
         nonlocal calls
         calls += stage == "hidden layer"
         if calls == 4:

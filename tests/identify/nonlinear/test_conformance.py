@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -288,13 +289,23 @@ def test_numbers_that_run_away_end_in_failed_or_in_a_finite_model(s: NonlinearSt
 @every
 def test_interruption_gives_the_best_so_far(s: NonlinearStructure) -> None:
     stages: list[str] = []
-    fitted(s, smooth(), tick=stages.append)
+    shares: list[float] = []
+
+    def listen(stage: str, done: float | None = None) -> None:
+        stages.append(stage)
+        if done is not None:
+            shares.append(done)
+
+    fitted(s, smooth(), tick=listen)
     assert stages
     assert all(isinstance(x, str) and x for x in stages)
+    assert all(0.0 <= x <= 1.0 for x in shares)
+    assert all(b >= a for a, b in pairwise(shares))  # what is over stays so
     for stop in sorted({0, len(stages) // 2}):
         calls = 0
 
-        def tick(_: str, stop: int = stop) -> None:
+        def tick(_: str, done: float | None = None, /, stop: int = stop) -> None:
+            del done
             nonlocal calls
             calls += 1
             if calls > stop:

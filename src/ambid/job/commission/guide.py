@@ -241,11 +241,11 @@ class _Guide:
         assert self.estimate is not None
         return result.validation(self.estimate)
 
-    def _tick(self, stage: str) -> None:
+    def _tick(self, stage: str, done: float | None = None, /) -> None:
         """Take a sign of life from what is worked out, and end it if that is wished."""
         if self._stopped():
             raise _Interrupted(f"interrupted while working it out ({stage})")
-        self._told(stage)
+        self._told(stage, done)
 
     def _identify(self) -> Step:
         self.estimate = identify(
