@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 
@@ -35,3 +36,49 @@ def silent(stage: str, done: float | None = None, /) -> None:
         Not used.
     """
     del stage, done
+
+
+def part_of(tick: Tick | None, begin: float, end: float) -> Tick | None:
+    """Return a tick for a part of a search, which counts its own share from 0 to 1.
+
+    Parameters
+    ----------
+    tick : Tick or None
+        Of the whole.
+    begin, end : float
+        Shares of the whole that are over where the part begins and ends.
+
+    Returns
+    -------
+    Tick or None
+        None where there is none for the whole.
+    """
+    if tick is None:
+        return None
+
+    def of_part(stage: str, done: float | None = None, /) -> None:
+        tick(stage, None if done is None else begin + (end - begin) * min(max(done, 0.0), 1.0))
+
+    return of_part
+
+
+def portions(tick: Tick | None, costs: Sequence[float]) -> list[Tick | None]:
+    """Return a tick for each of several parts of a search that come one after the other.
+
+    Parameters
+    ----------
+    tick : Tick or None
+        Of the whole.
+    costs : sequence of float
+        What the parts are expected to take, in any unit; 0 for one that is left out.
+
+    Returns
+    -------
+    list of Tick or None
+        As `part_of` makes them.
+    """
+    whole, before, out = sum(costs) or 1.0, 0.0, list[Tick | None]()
+    for cost in costs:
+        out.append(part_of(tick, before / whole, (before + cost) / whole))
+        before += cost
+    return out
