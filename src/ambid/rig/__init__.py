@@ -3,7 +3,7 @@
 from ambid.rig.bench import bench_record, mat_variables, read_bench
 from ambid.rig.draft import draft_rig
 from ambid.rig.load import default_rig, load_rig, rig_from_text
-from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel
+from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet
 from ambid.rig.write import rig_text, write_rig
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "RecordSettings",
     "Rig",
     "RigChannel",
+    "RigMagnet",
     "bench_record",
     "default_rig",
     "draft_rig",

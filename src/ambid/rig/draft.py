@@ -60,6 +60,7 @@ def draft_rig(record: Record) -> str:
         "[parameters]",
     ]
     lines += _parameter_lines(plant)
+    lines += _magnet_lines() if plant.name == "one-axis" else []
     lines += [
         "",
         "# [operating_point]   # default: the means of the record",
@@ -150,3 +151,13 @@ def _parameter_lines(plant: LinearModel) -> list[str]:
         default = "" if spec.default is None else f'value = {spec.default!r}, role = "fixed", '
         lines.append(f'{spec.name:3} = {{ {default}unit = "{spec.unit}" }}   # {spec.meaning}')
     return lines
+
+
+def _magnet_lines() -> list[str]:
+    return [
+        "",
+        "# [magnet]            # for ambid identify --nonlinear, which takes several records",
+        '# kind = "single"     # or "pair"; default: a pair where the current changes its sign',
+        "# [magnet.parameters] # 'ambid models' lists them",
+        '# g = { value = 9.81, unit = "m/s^2", role = "fixed" }',
+    ]

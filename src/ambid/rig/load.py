@@ -8,15 +8,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.errors import AmbidError, ModelError, RigError, UnitError, nearest
+from ambid.errors import AmbidError, ModelError, RigError, nearest
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter, ParameterSpec
 from ambid.record.calibration import Calibration, read_calibration_table
 from ambid.rig._daq import daq_of
+from ambid.rig._known import magnet_of, parameter_of, unit_of
 from ambid.rig.rig import RecordSettings, Rig, RigChannel
-from ambid.units import Unit, parse_unit
 
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
@@ -134,6 +134,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         model=file.model,
         channels=channels,
         parameters=_parameters(file.parameters, plant, where),
+        magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop) if file.loop else None,
         limits=limits,
@@ -196,7 +197,7 @@ def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path
     return RigChannel(
         role=role,
         column=entry.column or role,
-        unit=_unit(entry.unit, f"{place}.unit").symbol if entry.unit else None,
+        unit=unit_of(entry.unit, f"{place}.unit").symbol if entry.unit else None,
         calibration=_calibration(entry, unit, place, path.parent),
         delay=delay if role in plant.inputs else 0,
         variable=entry.variable,
@@ -239,7 +240,7 @@ def _parameters(entries: Mapping[str, ParameterEntry], plant: LinearModel, where
                 f"{nearest(name, names)}"
             )
     return tuple(
-        _parameter(spec, entries[spec.name], f"{where}: parameters.{spec.name}")
+        parameter_of(spec, entries[spec.name], f"{where}: parameters.{spec.name}")
         if spec.name in entries
         else _unnamed(spec)
         for spec in plant.parameters
@@ -250,31 +251,6 @@ def _unnamed(spec: ParameterSpec) -> Parameter:
     if spec.default is None:
         return Parameter(name=spec.name, unit=spec.unit)
     return Parameter(name=spec.name, unit=spec.unit, role="fixed", value=spec.default)
-
-
-def _parameter(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
-    """Convert one parameter to SI and check it against what it is."""
-    unit = None
-    if entry.unit is not None:
-        unit = _unit(entry.unit, f"{place}.unit")
-        if unit.si != parse_unit(spec.unit).si:
-            raise RigError(
-                f"{place} ({spec.meaning}) is in [{entry.unit}]; it is measured in [{spec.unit}]. Correct unit"
-            )
-    elif entry.value is not None:
-        raise RigError(f'{place} has a value but no unit. Give unit, e.g. unit = "{spec.unit}"')
-    if entry.role != "free" and entry.value is None:
-        raise RigError(f'{place} is {entry.role} but has no value. Give value, or set role = "free"')
-    if entry.role == "prior" and (entry.sd is None or entry.sd <= 0):
-        got = "no sd" if entry.sd is None else f"sd = {entry.sd}"
-        raise RigError(f"{place} is a prior with {got}; it needs a positive standard deviation. Give sd")
-    if entry.role != "prior" and entry.sd is not None:
-        raise RigError(f'{place} is {entry.role} but has an sd. Remove sd, or set role = "prior"')
-    if spec.positive and entry.value is not None and entry.value <= 0:
-        raise RigError(f"{place} ({spec.meaning}) is {entry.value} {entry.unit}; it must be positive. Correct value")
-    value = unit.to_si(entry.value) if unit is not None and entry.value is not None else None
-    sd = unit.to_si(entry.sd) if unit is not None and entry.sd is not None else None
-    return Parameter(name=spec.name, unit=spec.unit, role=entry.role, value=value, sd=sd)
 
 
 def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[str, float]:
@@ -292,7 +268,7 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
         if quantity == "auto":
             continue
         place = f"{where}: operating_point.{role}"
-        unit = _unit(quantity.unit, f"{place}.unit")
+        unit = unit_of(quantity.unit, f"{place}.unit")
         if unit.si != units[role]:
             raise RigError(f"{place} is in [{quantity.unit}]; it is measured in [{units[role]}]. Correct unit")
         values[role] = unit.to_si(quantity.value)
@@ -329,10 +305,3 @@ def _noise(entry: NoiseEntry) -> Noise:
         current_resolution=entry.resolutions.current,
         voltage_resolution=entry.resolutions.voltage,
     )
-
-
-def _unit(text: str, place: str) -> Unit:
-    try:
-        return parse_unit(text)
-    except UnitError as error:
-        raise RigError(f"{place}: {error}") from None

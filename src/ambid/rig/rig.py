@@ -115,6 +115,38 @@ class Daq:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RigMagnet:
+    """What is known of the law of a magnet (`ambid.physics.coenergy_law`), for nonlinear identification.
+
+    Attributes
+    ----------
+    kind : {"auto", "single", "pair"}
+        One magnet or two that oppose each other; "auto": a pair where the current changes its sign.
+    gap : {"hyperbolic", "exponential"} or None
+        Gap law of one magnet; None: the records decide.
+    saturation : bool
+        Whether the iron may saturate (sigma).
+    rise : bool or None
+        Whether the leakage inductance may rise with the current; None: the records decide.
+    eddy, drift : bool
+        Whether the force has a pole a/(s + a), and whether a slowly walking force takes up what the law leaves over.
+    off_below : float or None
+        Voltage in V at or below which the power stage is off, so that the coil's voltage is not known.
+    parameters : tuple of Parameter
+        Numbers of which something is known, SI; a number that is absent takes its default role.
+    """
+
+    kind: Literal["auto", "single", "pair"] = "auto"
+    gap: Literal["hyperbolic", "exponential"] | None = None
+    saturation: bool = False
+    rise: bool | None = None
+    eddy: bool = False
+    drift: bool = False
+    off_below: float | None = None
+    parameters: tuple[Parameter, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
     """A bench: model, channels and their calibration, parameters, loop, noise. All numbers SI.
 
@@ -129,6 +161,8 @@ class Rig:
     parameters : tuple of Parameter
         One per parameter of the model, in its order. Those that the file does not name are free, or fixed at the
         model's default where it has one.
+    magnet : RigMagnet or None
+        What is known of the nonlinear law of its magnet.
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
@@ -151,6 +185,7 @@ class Rig:
     model: str
     channels: tuple[RigChannel, ...]
     parameters: tuple[Parameter, ...]
+    magnet: RigMagnet | None = None
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
     limits: Limits | None = None

@@ -144,6 +144,19 @@ class DaqEntry(_Entry):
     trip: TripEntry = Field(default_factory=TripEntry)
 
 
+class MagnetEntry(_Entry):
+    """``[magnet]``: what is known of the magnet's law; see :class:`ambid.rig.rig.RigMagnet`."""
+
+    kind: Literal["auto", "single", "pair"] = "auto"
+    gap: Literal["hyperbolic", "exponential"] | None = None
+    saturation: Annotated[bool, Field(strict=True)] = False
+    rise: Annotated[bool, Field(strict=True)] | None = None
+    eddy: Annotated[bool, Field(strict=True)] = False
+    drift: Annotated[bool, Field(strict=True)] = False
+    off_below: Number | None = None
+    parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
+
+
 class RigFile(_Entry):
     """The whole file."""
 
@@ -152,6 +165,7 @@ class RigFile(_Entry):
     model: Text
     channels: dict[str, ChannelEntry] = Field(default_factory=dict)
     parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
+    magnet: MagnetEntry | None = None
     operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
     loop: LoopEntry | None = None
     noise: NoiseEntry | None = None
@@ -164,6 +178,8 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     (): RigFile,
     ("channels", "*"): ChannelEntry,
     ("parameters", "*"): ParameterEntry,
+    ("magnet",): MagnetEntry,
+    ("magnet", "parameters", "*"): ParameterEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,
     ("loop", "limits"): LimitsEntry,
@@ -287,7 +303,8 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     elif kind in ("greater_than_equal", "greater_than"):
         rule = "it must not be negative" if kind == "greater_than_equal" else "it must be positive"
     elif kind in ("model_type", "dict_type"):
-        example = '{ value = 1.0, unit = "…" }' if keys[0] in ("parameters", "operating_point") else "a [table]"
+        known = keys[0] in ("parameters", "operating_point") or (keys[:2] == ["magnet", "parameters"] and len(keys) > 2)
+        example = '{ value = 1.0, unit = "…" }' if known else "a [table]"
         rule = f"it must be {example}"
     elif kind in ("string_pattern_mismatch", "string_too_long"):
         rule = "a name of a column is up to 200 printable characters, not all of them blanks"
@@ -319,7 +336,7 @@ def _unknown_key(keys: list[str]) -> str:
     """Name an unknown key, the table it stands in, and the nearest known key."""
     *table, key = keys
     pattern = tuple(table)
-    entry = _ENTRIES.get(pattern) or _ENTRIES.get((*pattern[:1], "*"), RigFile)
+    entry = _ENTRIES.get(pattern) or _ENTRIES.get((*pattern[:-1], "*"), RigFile)
     known = [field.alias or name for name, field in entry.model_fields.items()]
     inside = f"in [{'.'.join(table)}]" if table else "at the top"
     return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"

@@ -14,7 +14,7 @@ from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from ambid.record.calibration import Calibration
 from ambid.rig.load import role_units
-from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel
+from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
@@ -66,6 +66,8 @@ def rig_text(rig: Rig, folder: Path) -> str:
     for c in rig.channels:
         lines += ["", *_channel_lines(c, folder, is_input=c.role in inputs)]
     lines += ["", "[parameters]", *(_parameter_line(p) for p in rig.parameters)]
+    if rig.magnet is not None:
+        lines += ["", *_magnet_lines(rig.magnet)]
     units = role_units(model(rig.model))
     if rig.operating_point:
         lines += ["", "[operating_point]"]
@@ -125,6 +127,16 @@ def _parameter_line(p: Parameter) -> str:
     entries += [f'unit = "{p.unit}"', f'role = "{p.role}"']
     entries += [f"sd = {p.sd!r}"] if p.sd is not None else []
     return f"{p.name} = {{ {', '.join(entries)} }}"
+
+
+def _magnet_lines(magnet: RigMagnet) -> list[str]:
+    lines = ["[magnet]", f'kind = "{magnet.kind}"']
+    lines += [f'gap = "{magnet.gap}"'] if magnet.gap else []
+    switches = {"saturation": magnet.saturation, "eddy": magnet.eddy, "drift": magnet.drift}
+    lines += [f"{name} = true" for name, on in switches.items() if on]
+    lines += [] if magnet.rise is None else [f"rise = {str(magnet.rise).lower()}"]
+    lines += [] if magnet.off_below is None else [f"off_below = {magnet.off_below!r}"]
+    return [*lines, "[magnet.parameters]", *map(_parameter_line, magnet.parameters)] if magnet.parameters else lines
 
 
 def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:

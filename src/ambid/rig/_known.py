@@ -1,0 +1,175 @@
+"""What a rig says of numbers, ``[parameters]`` and ``[magnet]``: units become SI, the entries are checked."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from ambid.errors import RigError, UnitError, nearest
+from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter, ParameterSpec
+from ambid.rig.rig import RigMagnet
+from ambid.units import Unit, parse_unit
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import MagnetEntry, ParameterEntry
+
+_PAIR_ONLY, _EXPONENTIAL, _HYPERBOLIC = ("i0",), ("L_g", "zeta"), ("k", "s")
+
+
+def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
+    """Convert one parameter to SI and check it against what it is.
+
+    Parameters
+    ----------
+    spec : ParameterSpec
+        What it is.
+    entry : ParameterEntry
+        As written.
+    place : str
+        Where it stands, for messages.
+
+    Returns
+    -------
+    Parameter
+        SI.
+
+    Raises
+    ------
+    RigError
+        If unit, role, value and sd do not go together.
+    """
+    unit = None
+    if entry.unit is not None:
+        unit = unit_of(entry.unit, f"{place}.unit")
+        if unit.si != parse_unit(spec.unit).si:
+            raise RigError(
+                f"{place} ({spec.meaning}) is in [{entry.unit}]; it is measured in [{spec.unit}]. Correct unit"
+            )
+    elif entry.value is not None:
+        raise RigError(f'{place} has a value but no unit. Give unit, e.g. unit = "{spec.unit}"')
+    if entry.role != "free" and entry.value is None:
+        raise RigError(f'{place} is {entry.role} but has no value. Give value, or set role = "free"')
+    if entry.role == "prior" and (entry.sd is None or entry.sd <= 0):
+        got = "no sd" if entry.sd is None else f"sd = {entry.sd}"
+        raise RigError(f"{place} is a prior with {got}; it needs a positive standard deviation. Give sd")
+    if entry.role != "prior" and entry.sd is not None:
+        raise RigError(f'{place} is {entry.role} but has an sd. Remove sd, or set role = "prior"')
+    if spec.positive and entry.value is not None and entry.value <= 0:
+        raise RigError(f"{place} ({spec.meaning}) is {entry.value} {entry.unit}; it must be positive. Correct value")
+    value = unit.to_si(entry.value) if unit is not None and entry.value is not None else None
+    sd = unit.to_si(entry.sd) if unit is not None and entry.sd is not None else None
+    return Parameter(name=spec.name, unit=spec.unit, role=entry.role, value=value, sd=sd)
+
+
+def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
+    """Check ``[magnet]`` against the model and itself.
+
+    Parameters
+    ----------
+    entry : MagnetEntry
+        As written.
+    plant : LinearModel
+        The rig's model.
+    where : str
+        The file, for messages.
+
+    Returns
+    -------
+    RigMagnet
+        SI.
+
+    Raises
+    ------
+    RigError
+        If the model has no magnet with a coil and a position, a number is not known, or two entries exclude each other.
+    """
+    if plant.name != "one-axis":
+        raise RigError(
+            f"{where}: [magnet] is given; model {plant.name!r} has no nonlinear magnet. Remove it, or take 'one-axis'"
+        )
+    if entry.kind == "pair" and entry.gap == "exponential":
+        raise RigError(
+            f"{where}: magnet.gap is 'exponential'; a pair has the hyperbolic law. Remove gap or correct kind"
+        )
+    specs = {spec.name: spec for spec in BEARING_NUMBERS}
+    for name, given in entry.parameters.items():
+        place = f"{where}: magnet.parameters.{name}"
+        if name in ("m", "R", "c"):
+            raise RigError(f"{place} is the linear model's too. Write it in [parameters]")
+        if name not in specs:
+            raise RigError(
+                f"{where}: unknown parameter {name!r} in [magnet.parameters]; a magnet has {', '.join(specs)}."
+                f"{nearest(name, list(specs))}"
+            )
+        if name in NOT_NEGATIVE and given.value is not None and not _allowed(given.value, given.role):
+            rule = "must not be negative" if given.value < 0 else "must be positive unless it is fixed"
+            raise RigError(f"{place} ({specs[name].meaning}) is {given.value} {given.unit}; it {rule}. Correct value")
+        _check_belongs(name, entry, place)
+    return RigMagnet(
+        kind=entry.kind,
+        gap=_gap(entry, where),
+        saturation=entry.saturation,
+        rise=entry.rise,
+        eddy=entry.eddy,
+        drift=entry.drift,
+        off_below=entry.off_below,
+        parameters=tuple(
+            parameter_of(specs[n], p, f"{where}: magnet.parameters.{n}") for n, p in entry.parameters.items()
+        ),
+    )
+
+
+def _allowed(value: float, role: str) -> bool:
+    """The search moves the logarithm: a zero has to be fixed."""
+    return value > 0 or (value == 0 and role == "fixed")
+
+
+def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"] | None:
+    """The gap law, which numbers may tell too."""
+    told: list[Literal["hyperbolic", "exponential"]] = []
+    told += ["hyperbolic"] if any(n in entry.parameters for n in _HYPERBOLIC) else []
+    told += ["exponential"] if any(n in entry.parameters for n in _EXPONENTIAL) else []
+    if len(told) == 2:
+        raise RigError(
+            f"{where}: [magnet.parameters] names numbers of both gap laws (k, s and L_g, zeta). Leave one pair out"
+        )
+    return entry.gap or (told[0] if told else None)
+
+
+def _check_belongs(name: str, entry: MagnetEntry, place: str) -> None:
+    """Refuse a number of a law that the other entries exclude: it would be passed over in silence."""
+    excluded = {
+        f"kind = {entry.kind!r}": _EXPONENTIAL if entry.kind == "pair" else _PAIR_ONLY,
+        "gap = 'hyperbolic'": _EXPONENTIAL if entry.gap == "hyperbolic" else (),
+        "gap = 'exponential'": _HYPERBOLIC if entry.gap == "exponential" else (),
+        "saturation = false": () if entry.saturation else ("sigma",),
+        "rise = false": ("L_rise", "i_knee") if entry.rise is False else (),
+        "eddy = false": () if entry.eddy else ("a",),
+    }
+    for setting, names in excluded.items():
+        if name in names:
+            raise RigError(f"{place} is given, but magnet.{setting} leaves it out. Remove one, or correct it")
+
+
+def unit_of(text: str, place: str) -> Unit:
+    """Read a unit of a rig file.
+
+    Parameters
+    ----------
+    text, place : str
+        The unit, and where it stands, for messages.
+
+    Returns
+    -------
+    Unit
+
+    Raises
+    ------
+    RigError
+        If it is not known.
+    """
+    try:
+        return parse_unit(text)
+    except UnitError as error:
+        raise RigError(f"{place}: {error}") from None
