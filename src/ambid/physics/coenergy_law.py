@@ -11,7 +11,8 @@ motional voltage cannot disagree, whatever the numbers.
 - coil iron S''(i) = L_leak + L_rise i^2/(i^2 + i_knee^2): inductance that does not depend on the position, rising from
   that of initial permeability to that of the open core; L_rise = 0 is plain leakage.
 
-One magnet: d = x (the position is the gap, up to s), j = i. A pair: d = -x, j = i0 + i and d = x, j = i0 - i.
+One magnet: d = x (the position is the gap, up to s), j = i. A pair: d = -x, j = i0 + i0_asym + i with k (1 + k_asym),
+and d = x, j = i0 - i0_asym - i with k (1 - k_asym). Gaps that differ at x = 0 are a centre elsewhere (x_offset).
 """
 
 from __future__ import annotations
@@ -29,11 +30,14 @@ from ambid.physics.magnet import CoEnergy, Number
 
 Array = NDArray[np.float64]
 
-MAGNET_NUMBERS = ("strength", "length", "sigma", "L_leak", "L_rise", "i_knee", "i0")
+MAGNET_NUMBERS = ("strength", "length", "sigma", "L_leak", "L_rise", "i_knee", "i0", "k_asym", "i0_asym")
 """Places of a magnet's numbers in the vector `q`: strength is k or L_g, length is s or zeta."""
 
-FIRST, THIRD = 4, 8
-"""Of W_x, W_xx, W_xi, W_ii, W_xxx, W_xxi, W_xii, W_iii: how many carry derivatives by `q`, and how many there are."""
+ORDERS = ("x", "xx", "xi", "ii", "xxx", "xxi", "xii", "iii", "xxxi", "xxii", "xiii", "iiii")
+"""Derivatives of W' in the order in which they are written."""
+
+SLOPED = ("x", "xx", "xi", "ii", "xxi", "xii", "iii")
+"""Those whose derivatives by `q` are written beside them, in that order."""
 
 _SIGN = np.array([1.0, -1.0, 1.0, 1.0])  # k_x = -W_xx
 
@@ -45,25 +49,28 @@ def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: 
     ----------
     x, i : float
         Position in m, axis current in A.
-    q : ndarray, shape (7,), SI
+    q : ndarray, shape (9,), SI
         See `MAGNET_NUMBERS`.
     exponential, pair : bool
         Gap law, and whether two magnets oppose each other.
-    w : ndarray, shape (8,)
-        Written: W_x, W_xx, W_xi, W_ii, W_xxx, W_xxi, W_xii, W_iii.
-    dw : ndarray, shape (4, 7)
-        Written: derivatives of the first four by `q`.
+    w : ndarray, shape (12,)
+        Written: the derivatives named in `ORDERS`.
+    dw : ndarray, shape (7, 9)
+        Written: derivatives by `q` of those named in `SLOPED`.
     """
-    for a in range(8):
+    for a in range(12):
         w[a] = 0.0
-    for a in range(4):
-        for b in range(7):
+    for a in range(7):
+        for b in range(9):
             dw[a, b] = 0.0
-    k, s, sigma = q[0], q[1], q[2]
+    s, sigma = q[1], q[2]
     for side in range(2 if pair else 1):
         sd = -1.0 if pair and side == 0 else 1.0  # d(gap)/dx
         sc = -1.0 if side == 1 else 1.0  # d(coil current)/di
-        d, j = sd * x, sc * i + (q[6] if pair else 0.0)
+        share = 1.0 - sd * q[7] if pair else 1.0
+        k, d, j = q[0] * share, sd * x, sc * i
+        if pair:
+            j += q[6] + sc * q[8]
         if exponential:
             g = k * math.exp(-d / s)
             g1, g2, g3 = -g / s, g / s**2, -g / s**3
@@ -77,6 +84,9 @@ def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: 
             gs, g1s, g2s = g1, g2, g3
         r = math.sqrt(1.0 + sigma * j * j)
         h, h1, h2, h3 = j * j / (1.0 + r), j / r, r**-3, -3.0 * sigma * j * r**-5
+        h4 = (15.0 * sigma * j * j / (r * r) - 3.0) * sigma * r**-5
+        hs, h1s, h2s = -(j**4) / (2.0 * r * (1.0 + r) ** 2), -(j**3) / (2.0 * r**3), -1.5 * j * j / r**5
+        h3s = (7.5 * sigma * j * j / (r * r) - 3.0) * j * r**-5
         w[0] += sd * g1 * h
         w[1] += g2 * h
         w[2] += sd * sc * g1 * h1
@@ -85,31 +95,39 @@ def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: 
         w[5] += sc * g2 * h1
         w[6] += sd * g1 * h2
         w[7] += sc * g * h3
-        dw[0, 0] += sd * g1 / k * h
-        dw[1, 0] += g2 / k * h
-        dw[2, 0] += sd * sc * g1 / k * h1
-        dw[3, 0] += g / k * h2
-        dw[0, 1] += sd * g1s * h
-        dw[1, 1] += g2s * h
-        dw[2, 1] += sd * sc * g1s * h1
-        dw[3, 1] += gs * h2
-        hs, h1s, h2s = -(j**4) / (2.0 * r * (1.0 + r) ** 2), -(j**3) / (2.0 * r**3), -1.5 * j * j / r**5
-        dw[0, 2] += sd * g1 * hs
-        dw[1, 2] += g2 * hs
-        dw[2, 2] += sd * sc * g1 * h1s
-        dw[3, 2] += g * h2s
-        if pair:
-            dw[0, 6] += sd * g1 * h1
-            dw[1, 6] += g2 * h1
-            dw[2, 6] += sd * sc * g1 * h2
-            dw[3, 6] += g * h3
-    square = i * i + q[5] * q[5]
-    part = i * i / square
+        w[8] += sd * sc * g3 * h1
+        w[9] += g2 * h2
+        w[10] += sd * sc * g1 * h3
+        w[11] += g * h4
+        for b in range(4):  # strength, length, sigma, and the coil current, through which i0 and i0_asym act
+            if b == 0:
+                f0, f1, f2, e0, e1, e2, e3 = g / q[0], g1 / q[0], g2 / q[0], h, h1, h2, h3
+            elif b == 1:
+                f0, f1, f2, e0, e1, e2, e3 = gs, g1s, g2s, h, h1, h2, h3
+            elif b == 2:
+                f0, f1, f2, e0, e1, e2, e3 = g, g1, g2, hs, h1s, h2s, h3s
+            elif pair:
+                f0, f1, f2, e0, e1, e2, e3 = g, g1, g2, h1, h2, h3, h4
+            else:
+                continue
+            at = 6 if b == 3 else b
+            slopes = (sd * f1 * e0, f2 * e0, sd * sc * f1 * e1, f0 * e2, sc * f2 * e1, sd * f1 * e2, sc * f0 * e3)
+            for a in range(7):
+                dw[a, at] += slopes[a]
+                if pair and b == 0:
+                    dw[a, 7] -= sd * q[0] / share * slopes[a]
+                if b == 3:
+                    dw[a, 8] += sc * slopes[a]
+    knee2, square = q[5] * q[5], i * i + q[5] * q[5]
+    part, bend = i * i / square, 2.0 * i * knee2 / square**2
     w[3] += q[3] + q[4] * part
-    w[7] += 2.0 * q[4] * i * q[5] * q[5] / square**2
+    w[7] += q[4] * bend
+    w[11] += 2.0 * q[4] * knee2 * (knee2 - 3.0 * i * i) / square**3
     dw[3, 3] = 1.0
     dw[3, 4] = part
     dw[3, 5] = -2.0 * q[4] * q[5] * part / square
+    dw[6, 4] = bend
+    dw[6, 5] = 4.0 * q[4] * i * q[5] * (i * i - knee2) / square**3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,14 +144,19 @@ class MagnetLaw:
         Whether sigma may differ from zero.
     rise : bool
         Whether the leakage inductance may depend on the current.
+    asymmetric : bool
+        Whether the two magnets of a pair may differ: in strength (k_asym, between -1 and 1) and in bias (i0_asym).
     """
 
     gap: Literal["hyperbolic", "exponential"] = "hyperbolic"
     pair: bool = False
     saturation: bool = False
     rise: bool = False
+    asymmetric: bool = False
 
     def __post_init__(self) -> None:
+        if self.asymmetric and not self.pair:
+            raise ModelError("one magnet has no other to differ from: asymmetric=True wants pair=True")
         if self.pair and self.gap == "exponential":
             raise ModelError("a differential pair wants the hyperbolic gap law; its gap is not open to one side")
 
@@ -145,11 +168,12 @@ class MagnetLaw:
 
     def __str__(self) -> str:
         """Name it in a few words."""
-        extras = [t for t, on in (("saturation", self.saturation), ("rising leakage", self.rise)) if on]
+        kinds = (("unequal", self.asymmetric), ("saturation", self.saturation), ("rising leakage", self.rise))
+        extras = [t for t, on in kinds if on]
         return ", ".join([f"{self.gap} {'pair' if self.pair else 'single magnet'}", *extras])
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Write numbers as `q`, in shape (7,).
+        """Write numbers as `q`, in shape (9,).
 
         Parameters
         ----------
@@ -158,9 +182,9 @@ class MagnetLaw:
 
         Returns
         -------
-        ndarray, shape (7,)
+        ndarray, shape (9,)
         """
-        neutral = {"sigma": 0.0, "L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0}
+        neutral = {"sigma": 0.0, "L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0}
         return np.array([values[n] if n in values else neutral[n] for n in self.names])
 
     def value(self, x: Number, i: Number, values: Mapping[str, float]) -> Number:
@@ -177,11 +201,13 @@ class MagnetLaw:
         -------
         float or complex
         """
-        k, s, sigma, leak, rise, knee, bias = self.vector(values).tolist()
-        sides = ((-x, bias + i), (x, bias - i)) if self.pair else ((x, i),)
+        k, s, sigma, leak, rise, knee, bias, more, other = self.vector(values).tolist()
+        sides: tuple[tuple[float, Number, Number], ...] = ((k, x, i),)
+        if self.pair:
+            sides = (k * (1.0 + more), -x, bias + other + i), (k * (1.0 - more), x, bias - other - i)
         total = 0.0 * x
-        for d, j in sides:
-            g = k * np.exp(-d / s) if self.gap == "exponential" else k / (s + d)
+        for strength, d, j in sides:
+            g = strength * np.exp(-d / s) if self.gap == "exponential" else strength / (s + d)
             total = total + g * j**2 / (1.0 + np.sqrt(1.0 + sigma * j**2))
         core = knee * (i * np.arctan(i / knee) - 0.5 * knee * np.log(1.0 + (i / knee) ** 2))
         found: Number = total + 0.5 * (leak + rise) * i**2 - rise * core
@@ -200,10 +226,10 @@ class MagnetLaw:
         -------
         values : ndarray, shape (n_points, 4)
             In N, N/m (k_x = -df/dx), N/A and H.
-        slopes : ndarray, shape (n_points, 4, 7)
+        slopes : ndarray, shape (n_points, 4, 9)
         """
         found, slopes = self._derivatives(x, i, values)
-        return found[:, :FIRST] * _SIGN, slopes * _SIGN[:, None]
+        return found[:, :4] * _SIGN, slopes[:, :4] * _SIGN[:, None]
 
     def gradients(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
         """Return the derivatives of force, k_x, k_i, L by position and current.
@@ -223,8 +249,8 @@ class MagnetLaw:
         return np.stack([by_x * _SIGN, by_i * _SIGN], axis=2)
 
     def _derivatives(self, x: Array, i: Array, values: Mapping[str, float]) -> tuple[Array, Array]:
-        q, w, dw = self.vector(values), np.zeros(THIRD), np.zeros((FIRST, len(MAGNET_NUMBERS)))
-        found, slopes = np.zeros((x.size, THIRD)), np.zeros((x.size, *dw.shape))
+        q, w, dw = self.vector(values), np.zeros(len(ORDERS)), np.zeros((len(SLOPED), len(MAGNET_NUMBERS)))
+        found, slopes = np.zeros((x.size, len(ORDERS))), np.zeros((x.size, *dw.shape))
         for n, (at, current) in enumerate(zip(x.tolist(), i.tolist(), strict=True)):
             coenergy_derivatives(at, current, q, self.gap == "exponential", self.pair, w, dw)
             found[n], slopes[n] = w, dw
@@ -237,20 +263,23 @@ def law_numbers(coenergy: CoEnergy) -> dict[str, float]:
     Parameters
     ----------
     coenergy : CoEnergy
-        Of a `SingleMagnet` or of a symmetric `DifferentialPair`.
+        Of a `SingleMagnet` or of a `DifferentialPair`.
 
     Returns
     -------
     dict of str to float
-        k in N m^2/A^2, s in m, L_leak in H, i0 in A.
+        k in N m^2/A^2, s in m, L_leak in H, i0 and i0_asym in A, k_asym in 1.
 
     Raises
     ------
     ModelError
-        If the two magnets of a pair are not alike.
+        If the gaps of a pair differ at x = 0: the law counts positions from where they are equal.
     """
-    if coenergy.k_a == 0.0:
-        return {"k": coenergy.k_b, "s": coenergy.s_b, "L_leak": coenergy.leakage, "i0": 0.0}
-    if coenergy.k_a != coenergy.k_b or coenergy.s_a != coenergy.s_b:
-        raise ModelError("the magnets of a pair must be alike: one constant k, one gap s at the centre")
-    return {"k": coenergy.k_a, "s": coenergy.s_a, "L_leak": coenergy.leakage, "i0": coenergy.i0}
+    w = coenergy
+    if w.k_a == 0.0:
+        return {"k": w.k_b, "s": w.s_b, "L_leak": w.leakage, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0}
+    if w.s_a != w.s_b:
+        raise ModelError("the gaps of a pair must be alike at x = 0; count x from where they are")
+    total = w.k_a + w.k_b
+    return {"k": total / 2.0, "s": w.s_a, "L_leak": w.leakage, "i0": w.i0, "k_asym": (w.k_a - w.k_b) / total,
+            "i0_asym": w.i0_asym}  # fmt: skip

@@ -31,7 +31,7 @@ Number = TypeVar("Number", float, complex)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoEnergy:
-    """W'(x, i) = k_a (i0 + i)^2 / (2 (s_a - x)) + k_b (i0 - i)^2 / (2 (s_b + x)) + leakage i^2 / 2.
+    """W'(x, i) = k_a (i0 + j)^2 / (2 (s_a - x)) + k_b (i0 - j)^2 / (2 (s_b + x)) + leakage i^2 / 2, j = i0_asym + i.
 
     Both magnets of this file are cases of it, so that one compiled loop simulates them all.
 
@@ -45,6 +45,8 @@ class CoEnergy:
         Bias current in A.
     leakage : float
         Inductance in H that does not depend on x.
+    i0_asym : float
+        Half the difference of the two bias currents in A.
     """
 
     k_a: float
@@ -53,21 +55,25 @@ class CoEnergy:
     s_b: float
     i0: float
     leakage: float
+    i0_asym: float = 0.0
 
     def value(self, x: Number, i: Number) -> Number:
         """Return W' in J at position `x` in m and axis current `i` in A."""
-        pull_a = self.k_a * (self.i0 + i) ** 2 / (self.s_a - x)
-        pull_b = self.k_b * (self.i0 - i) ** 2 / (self.s_b + x)
+        j = self.i0_asym + i
+        pull_a = self.k_a * (self.i0 + j) ** 2 / (self.s_a - x)
+        pull_b = self.k_b * (self.i0 - j) ** 2 / (self.s_b + x)
         return (pull_a + pull_b + self.leakage * i**2) / 2.0
 
     def force(self, x: Number, i: Number) -> Number:
         """Return the force dW'/dx in N along +x at `x` in m and `i` in A."""
-        a, b = (self.i0 + i) / (self.s_a - x), (self.i0 - i) / (self.s_b + x)
+        j = self.i0_asym + i
+        a, b = (self.i0 + j) / (self.s_a - x), (self.i0 - j) / (self.s_b + x)
         return (self.k_a * a * a - self.k_b * b * b) / 2.0
 
     def flux_linkage(self, x: Number, i: Number) -> Number:
         """Return the flux linkage dW'/di in V s at `x` in m and `i` in A."""
-        return self.k_a * (self.i0 + i) / (self.s_a - x) - self.k_b * (self.i0 - i) / (self.s_b + x) + self.leakage * i
+        j = self.i0_asym + i
+        return self.k_a * (self.i0 + j) / (self.s_a - x) - self.k_b * (self.i0 - j) / (self.s_b + x) + self.leakage * i
 
     def inductance(self, x: Number) -> Number:
         """Return L = dlambda/di in H at `x` in m; it does not depend on the current."""
@@ -76,12 +82,14 @@ class CoEnergy:
     def force_per_current(self, x: Number, i: Number) -> Number:
         """Return k_i = df/di = dlambda/dx in N/A at `x` in m and `i` in A."""
         a, b = 1.0 / (self.s_a - x), 1.0 / (self.s_b + x)
-        return self.k_a * (self.i0 + i) * a * a + self.k_b * (self.i0 - i) * b * b
+        j = self.i0_asym + i
+        return self.k_a * (self.i0 + j) * a * a + self.k_b * (self.i0 - j) * b * b
 
     def displacement_coefficient(self, x: Number, i: Number) -> Number:
         """Return k_x = -df/dx in N/m (negative for any attracting magnet) at `x` in m and `i` in A."""
         a, b = 1.0 / (self.s_a - x), 1.0 / (self.s_b + x)
-        return -(self.k_a * (self.i0 + i) ** 2 * a * a * a + self.k_b * (self.i0 - i) ** 2 * b * b * b)
+        j = self.i0_asym + i
+        return -(self.k_a * (self.i0 + j) ** 2 * a * a * a + self.k_b * (self.i0 - j) ** 2 * b * b * b)
 
 
 class Magnet(Protocol):
@@ -209,6 +217,10 @@ class DifferentialPair:
         Pole half-angle alpha in rad.
     leakage : float
         Leakage inductance of the axis (both coils) in H.
+    k_asym : float
+        How the magnets differ in strength: k (1 + k_asym) along +x, k (1 - k_asym) along -x; between -1 and 1.
+    bias_asym : float
+        How their bias currents differ, in A: i0 + bias_asym along +x, i0 - bias_asym along -x.
     """
 
     turns: float
@@ -217,6 +229,8 @@ class DifferentialPair:
     gap: float
     half_angle: float = 0.0
     leakage: float = 0.0
+    k_asym: float = 0.0
+    bias_asym: float = 0.0
 
     def __post_init__(self) -> None:
         _positive("turns", self.turns, "1")
@@ -226,12 +240,19 @@ class DifferentialPair:
         _not_negative("leakage", self.leakage, "H")
         if not 0.0 <= self.half_angle < math.pi / 2:
             raise ModelError(f"half_angle is {self.half_angle} rad; it must be in [0, pi/2). Give it in rad")
+        if not (abs(self.k_asym) < 1.0 and abs(self.bias_asym) < self.bias):
+            raise ModelError(
+                f"k_asym is {self.k_asym} and bias_asym {self.bias_asym} A; both magnets must keep a strength and a"
+                " bias. Give k_asym between -1 and 1, and bias_asym below the bias"
+            )
 
     @property
     def coenergy(self) -> CoEnergy:
         """W' of both magnets as a function of x and of the differential current."""
         k = MU_0 * self.turns**2 * self.area / 2.0 * math.cos(self.half_angle)
-        return CoEnergy(k_a=k, s_a=self.gap, k_b=k, s_b=self.gap, i0=self.bias, leakage=self.leakage)
+        more, less = k * (1.0 + self.k_asym), k * (1.0 - self.k_asym)
+        return CoEnergy(k_a=more, s_a=self.gap, k_b=less, s_b=self.gap, i0=self.bias, leakage=self.leakage,
+                        i0_asym=self.bias_asym)  # fmt: skip
 
     @property
     def range(self) -> tuple[float, float]:
@@ -241,7 +262,8 @@ class DifferentialPair:
     def holding_current(self, x: float, load: float) -> float:
         """Return the differential current that holds `load` in N (along +x) at `x` in m, with both coils conducting.
 
-        Solves a (i0 + i)^2 - b (i0 - i)^2 + load = 0 with a = k/(2 (s0 - x)^2), b = k/(2 (s0 + x)^2).
+        Solves a (i0 + j)^2 - b (i0 - j)^2 + load = 0 for j = i + bias_asym, with a = k_a/(2 (s0 - x)^2) and
+        b = k_b/(2 (s0 + x)^2).
 
         Parameters
         ----------
@@ -253,7 +275,7 @@ class DifferentialPair:
         Returns
         -------
         float
-            Differential current in A, abs(i) <= i0.
+            Differential current in A, abs(i + bias_asym) <= i0.
 
         Raises
         ------
@@ -272,7 +294,7 @@ class DifferentialPair:
                 f"a load of {load:g} N at {x:g} m needs more than the bias current of {w.i0:g} A; abs(i) must not"
                 " exceed the bias. Lower the load or raise the bias"
             )
-        return i
+        return i - w.i0_asym
 
 
 def _positive(name: str, value: float, unit: str) -> None:

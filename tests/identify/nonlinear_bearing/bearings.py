@@ -10,7 +10,8 @@ from ambid.physics.loop import Limits
 from ambid.physics.presets import Preset, preset
 from ambid.simulate import Simulation, simulate
 
-MAGNITUDE = {"x_offset": 1e-6, "v_offset": 1e-2, "i_offset": 1e-3, "g": 9.81}
+MAGNITUDE = {"x_offset": 1e-6, "v_offset": 1e-2, "i_offset": 1e-3, "g": 9.81, "v_drop": 0.1, "k_asym": 0.1,
+             "i0_asym": 0.1}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def as_seen(done: Simulation, name: str = "record") -> BearingRecord:
 def truth_of(bench: Preset) -> dict[str, float]:
     plant = bench.plant
     rest = {"sigma": 0.0, "L_rise": 0.0, "i_knee": 1.0, "c": plant.c, "g": plant.gravity, "a": 500.0, "x_offset": 0.0,
-            "i_offset": 0.0, "v_offset": 0.0, "m": plant.m, "R": plant.R}  # fmt: skip
+            "i_offset": 0.0, "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02, "m": plant.m, "R": plant.R}  # fmt: skip
     return {**rest, **law_numbers(plant.magnet.coenergy)}
 
 

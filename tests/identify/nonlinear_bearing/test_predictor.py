@@ -35,7 +35,7 @@ def gradient_agrees(problem, vector):
         assert exact[j] == pytest.approx(slope, rel=2e-4, abs=2e-5 * np.linalg.norm(at.J[:, j]) ** 1 + 0.02), j
 
 
-@pytest.mark.parametrize("kind", ["pair", "saturated", "drift", "eddy", "delay"])
+@pytest.mark.parametrize("kind", ["pair", "saturated", "unequal", "drift", "eddy", "delay", "stage"])
 def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
     record, truth = bench
     record = replace(record, u=record.u[:400], loose=record.loose[:400], y=record.y[:400], valid=record.valid[:400])
@@ -46,6 +46,15 @@ def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
         law = MagnetLaw(pair=True, saturation=True, rise=True)
         truth |= {"sigma": 0.2, "L_rise": 1e-3, "i_knee": 0.3}
         estimated = {"sigma", "L_rise", "i_knee", "k", "L_leak", "m"}
+    if kind == "unequal":
+        law = MagnetLaw(pair=True, saturation=True, asymmetric=True)
+        truth |= {"sigma": 0.2, "k_asym": 0.1, "i0_asym": 0.05}
+        estimated = {"k", "s", "k_asym", "i0_asym", "sigma", "i0", "m", "x_offset"}
+    if kind == "stage":
+        truth |= {"v_drop": 0.7, "i_drop": 0.2}
+        estimated = {"v_drop", "i_drop", "R", "k", "L_leak", "v_offset"}
+        settings = {"free_delay": frozenset([record.rate_hz])}
+        record = replace(record, knock=np.where(np.arange(400) // 20 == 5, 3.0, 0.0))
     if kind == "drift":
         settings, estimated = {"drift": True}, {"k", "s", "m", "R", "c"}
     if kind == "eddy":
@@ -53,7 +62,7 @@ def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
         settings, estimated = {"eddy": True, "drift": True}, {"a", "k", "s", "m", "c"}
     if kind == "delay":
         settings, estimated = {"free_delay": frozenset([record.rate_hz])}, {"k", "L_leak"}
-    problem = problem_of([record], truth, law, estimated, NOISE, 0.6 if kind == "delay" else 1.0, **settings)
+    problem = problem_of([record], truth, law, estimated, NOISE, 0.6 if kind in ("delay", "stage") else 1.0, **settings)
     vector = problem.start() + 1e-3 * np.random.default_rng(3).standard_normal(problem.size)
     gradient_agrees(problem, vector)
 
@@ -62,7 +71,7 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
     rng, n = np.random.default_rng(2), 300
     truth = {"L_g": 0.04, "zeta": 6.3e-3, "sigma": 0.1, "L_leak": 0.05, "L_rise": 0.06, "i_knee": 0.28, "i0": 0.0,
              "m": 0.06, "R": 4.2, "c": 0.1, "g": 9.81, "a": 900.0, "x_offset": 0.0, "i_offset": 0.0,
-             "v_offset": 0.1}  # fmt: skip
+             "v_offset": 0.1, "v_drop": 0.3, "i_drop": 0.6, "k_asym": 0.0, "i0_asym": 0.0}  # fmt: skip
     x = 10e-3 + 1e-3 * np.sin(np.arange(n) / 30) + 2e-5 * rng.standard_normal(n)
     i = 0.96 + 0.1 * np.cos(np.arange(n) / 30) + 5e-3 * rng.standard_normal(n)
     valid = np.ones((n, 2), dtype=bool)
@@ -74,7 +83,21 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
     )
     held = replace(moving, name="held", rate_hz=200.0, held=True, u=moving.u + rng.standard_normal(n))
     law = MagnetLaw(gap="exponential", saturation=True, rise=True)
-    estimated = {"L_g", "zeta", "sigma", "L_leak", "L_rise", "i_knee", "m", "R", "c", "a", "v_offset"}
+    estimated = {
+        "L_g",
+        "zeta",
+        "sigma",
+        "L_leak",
+        "L_rise",
+        "i_knee",
+        "m",
+        "R",
+        "c",
+        "a",
+        "v_offset",
+        "v_drop",
+        "i_drop",
+    }
     problem = problem_of(
         [moving, held], truth, law, estimated, [2e-5, 5e-3, 0.05, 0.1, 0.01], 1.45,
         eddy=True, free_delay=frozenset([1000.0, 200.0]),

@@ -1,7 +1,7 @@
 """The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
 
-Physical numbers `theta` (16): the magnet's seven, then m, R, c, g, a, x_offset, i_offset, v_offset, and the delay
-beyond `whole` samples. Columns of all sensitivities: the active ones of these, then the log noise levels.
+Physical numbers `theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and
+the delay beyond `whole` samples. Columns of all sensitivities: the active ones of these, then the log noise levels.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from ambid.physics.coenergy_law import coenergy_derivatives
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+_MAGNET = 9
+_M, _R, _C, _G, _POLE, _X_OFF, _I_OFF, _V_OFF, _V_DROP, _I_DROP, _LATE = range(_MAGNET, _MAGNET + 11)
+_ALL = _LATE + 1
 
 # Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
 _energy: Callable[..., None] = njit(cache=True, nogil=True)(coenergy_derivatives)
@@ -57,8 +61,19 @@ def _sum(x: Array, factor: float, y: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _stage(i: float, th: Array) -> tuple[float, float, float]:
+    """Return what transistors and diodes take of the voltage at a current, its slope, and the slope over v_drop."""
+    if th[_V_DROP] == 0.0:
+        t = math.tanh(i / th[_I_DROP])
+        return 0.0, 0.0, (1.0 - t * t) / th[_I_DROP]
+    t = math.tanh(i / th[_I_DROP])
+    c = (1.0 - t * t) / th[_I_DROP]
+    return th[_V_DROP] * t, th[_V_DROP] * c, c
+
+
+@njit(cache=True, nogil=True)
 def _rates(z: Array, volt: Array, th: Array, flags: Flags, w: Array, dw: Array, g: Array, A: Array, G: Array) -> None:
-    """Write the right-hand side g (n,), its Jacobian A (n, n), and its derivatives G (n, 16) by `theta`.
+    """Write the right-hand side g (n,), its Jacobian A (n, n), and its derivatives G (n, 20) by `theta`.
 
     `volt` is the voltage and its derivative by the delay. Position, velocity and current, then the force behind the
     eddy pole, then a drifting force, where `flags` (exponential, pair, eddy, drift, locked) have them.
@@ -67,48 +82,51 @@ def _rates(z: Array, volt: Array, th: Array, flags: Flags, w: Array, dw: Array, 
         g[a] = 0.0
         for b in range(g.size):
             A[a, b] = 0.0
-        for b in range(16):
+        for b in range(_ALL):
             G[a, b] = 0.0
     x, v, i = z[0], z[1], z[2]
     _energy(x, i, th, flags[0], flags[1], w, dw)
-    m, ell = th[7], w[3]
+    m, ell = th[_M], w[3]
     if not flags[4]:
         pull = z[3] if flags[2] else w[0]
-        net = pull - th[9] * v
+        net = pull - th[_C] * v
         last = g.size - 1
         if flags[3]:
             net += z[last]
             A[1, last] = 1.0 / m
         g[0] = v
-        g[1] = net / m + th[10]
+        g[1] = net / m + th[_G]
         A[0, 1] = 1.0
-        A[1, 1] = -th[9] / m
+        A[1, 1] = -th[_C] / m
         if flags[2]:
             A[1, 3] = 1.0 / m
         else:
             A[1, 0] = w[1] / m
             A[1, 2] = w[2] / m
-            for q in range(7):
+            for q in range(_MAGNET):
                 G[1, q] = dw[0, q] / m
-        G[1, 7] = -net / m**2
-        G[1, 9] = -v / m
-        G[1, 10] = 1.0
-    rate = (volt[0] + th[14] - th[8] * i - w[2] * v) / ell
+        G[1, _M] = -net / m**2
+        G[1, _C] = -v / m
+        G[1, _G] = 1.0
+    drop, steep, c = _stage(i, th)
+    rate = (volt[0] + th[_V_OFF] - drop - th[_R] * i - w[2] * v) / ell
     g[2] = rate
     A[2, 0] = (-w[5] * v - rate * w[6]) / ell
     A[2, 1] = -w[2] / ell
-    A[2, 2] = (-th[8] - w[6] * v - rate * w[7]) / ell
-    for q in range(7):
+    A[2, 2] = (-th[_R] - steep - w[6] * v - rate * w[7]) / ell
+    for q in range(_MAGNET):
         G[2, q] = (-dw[2, q] * v - rate * dw[3, q]) / ell
-    G[2, 8] = -i / ell
-    G[2, 14] = 1.0 / ell
-    G[2, 15] = volt[1] / ell
+    G[2, _R] = -i / ell
+    G[2, _V_OFF] = 1.0 / ell
+    G[2, _V_DROP] = -math.tanh(i / th[_I_DROP]) / ell
+    G[2, _I_DROP] = th[_V_DROP] * c * i / th[_I_DROP] / ell
+    G[2, _LATE] = volt[1] / ell
     if flags[2]:
-        g[3] = th[11] * (w[0] - z[3])
-        A[3, 0], A[3, 2], A[3, 3] = th[11] * w[1], th[11] * w[2], -th[11]
-        for q in range(7):
-            G[3, q] = th[11] * dw[0, q]
-        G[3, 11] = w[0] - z[3]
+        g[3] = th[_POLE] * (w[0] - z[3])
+        A[3, 0], A[3, 2], A[3, 3] = th[_POLE] * w[1], th[_POLE] * w[2], -th[_POLE]
+        for q in range(_MAGNET):
+            G[3, q] = th[_POLE] * dw[0, q]
+        G[3, _POLE] = w[0] - z[3]
 
 
 @njit(cache=True, nogil=True)
@@ -157,37 +175,47 @@ def _advance(
 
 @njit(cache=True, nogil=True)
 def _bend(
-    S: Array, th: Array, active: Integers, chain: Array, flags: Flags, h: float, w: Array, dw: Array,
-    A: Array, dA: Array, dE: Array,
+    z: Array, S: Array, th: Array, active: Integers, chain: Array, flags: Flags, volt: Array, h: float, w: Array,
+    dw: Array, g: Array, A: Array, dA: Array, dE: Array,
 ) -> None:  # fmt: skip
     """Write the total derivatives of A and E of `_spread` by all numbers: by themselves, and through the state."""
     n, p, n_a = S.shape[0], S.shape[2], active.size
-    m, ell, last = th[7], w[3], n - 1
+    m, ell, last, rate, v, i = th[_M], w[3], n - 1, g[2], z[1], z[2]
     push = 3 if flags[2] else 1
-    gain = th[11] if flags[2] else 1.0 / m
+    gain = th[_POLE] if flags[2] else 1.0 / m
     bf = 0.0 if flags[4] else 1.0 / m
+    _, steep, c = _stage(i, th)
+    t, wide = math.tanh(i / th[_I_DROP]), th[_I_DROP]
     _sum(dA, -1.0, dA, dA)
     for j in range(p):
-        dx, di = S[0, 0, j], S[2, 0, j]
+        dx, dv, di = S[0, 0, j], S[1, 0, j], S[2, 0, j]
         q = active[j] if j < n_a else -1
-        xx, xi, ii = w[4] * dx + w[5] * di, w[5] * dx + w[6] * di, w[6] * dx + w[7] * di
         f = chain[j] if j < n_a else 0.0
-        if 0 <= q < 7:
+        xx, xi, ii = w[4] * dx + w[5] * di, w[5] * dx + w[6] * di, w[6] * dx + w[7] * di
+        xxi, xii, iii = w[8] * dx + w[9] * di, w[9] * dx + w[10] * di, w[10] * dx + w[11] * di
+        if 0 <= q < _MAGNET:
             xx, xi, ii = xx + dw[1, q] * f, xi + dw[2, q] * f, ii + dw[3, q] * f
-        dm = f if q == 7 else 0.0
-        dr, dc, da = f if q == 8 else 0.0, f if q == 9 else 0.0, f if q == 11 else 0.0
+            xxi, xii, iii = xxi + dw[4, q] * f, xii + dw[5, q] * f, iii + dw[6, q] * f
+        dm = f if q == _M else 0.0
+        dr, dc, da = f if q == _R else 0.0, f if q == _C else 0.0, f if q == _POLE else 0.0
+        d_drop, d_wide = f if q == _V_DROP else 0.0, f if q == _I_DROP else 0.0
+        d_volt = (f if q == _V_OFF else 0.0) + (volt[1] * f if q == _LATE else 0.0)
+        d_drop_all = t * d_drop + steep * (di - i / wide * d_wide)
+        d_steep = c * d_drop + th[_V_DROP] * (-2.0 * t * c / wide * di + (2.0 * t * i / wide - 1.0) * c / wide * d_wide)
         dgain = da if flags[2] else -dm / m**2
         if not flags[4]:
             dA[push, 0, j] += gain * xx + dgain * w[1]
             dA[push, 2, j] += gain * xi + dgain * w[2]
-            dA[1, 1, j] += -dc / m + th[9] * dm / m**2
-            dA[2, 1, j] = -xi / ell + w[2] * ii / ell**2
+            dA[1, 1, j] += -dc / m + th[_C] * dm / m**2
             if flags[2]:
                 dA[1, 3, j] = -dm / m**2
                 dA[3, 3, j] = -da
             if flags[3]:
                 dA[1, last, j] = -dm / m**2
-        dA[2, 2, j] = -dr / ell + th[8] * ii / ell**2
+        d_rate = (d_volt - d_drop_all - dr * i - th[_R] * di - xi * v - w[2] * dv - rate * ii) / ell
+        dA[2, 0, j] = (-xxi * v - w[5] * dv - d_rate * w[6] - rate * xii - A[2, 0] * ii) / ell
+        dA[2, 1, j] = (-xi - A[2, 1] * ii) / ell
+        dA[2, 2, j] = (-dr - d_steep - xii * v - w[6] * dv - d_rate * w[7] - rate * iii - A[2, 2] * ii) / ell
         dbf = 0.0 if flags[4] else -dm / m**2
         dbv = -ii / ell**2
         for a in range(n):
@@ -200,35 +228,19 @@ def _bend(
 @njit(cache=True, nogil=True)
 def _spread(
     z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags,
-    level2: Array, q2: Array, h: float, slopes: bool, w: Array, dw: Array, A: Array, dA: Array, F: Array, dF: Array,
-    T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
+    level2: Array, q2: Array, volts: Array, h: float, slopes: bool, w: Array, dw: Array, g: Array, A: Array, G: Array,
+    dA: Array, F: Array, dF: Array, T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
 ) -> None:  # fmt: skip
-    """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the plant linearised at rest.
+    """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the linearised plant.
 
-    `q2` is `level2`, force, voltage and drift, with what is not known of the voltage of this sample.
-    F = I + h A + (h A)^2/2 and E = h (I + h A/2) B, A without the terms that are products with the velocity or with
-    di/dt: they move the gain a little, not the predictor's mean, which the full equations carry.
+    `q2` is `level2`, force, voltage and drift, with what is not known of force and voltage of this sample. A is the
+    Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B.
     """
     n, p, n_a = z.size, S.shape[2], active.size
-    _energy(z[0], z[2], th, flags[0], flags[1], w, dw)
-    m, ell, last = th[7], w[3], n - 1
-    for a in range(n):
-        for b in range(n):
-            A[a, b] = 0.0
-    push = 3 if flags[2] else 1  # the row in which the magnet's force enters
-    gain = th[11] if flags[2] else 1.0 / m
-    if not flags[4]:
-        A[0, 1] = 1.0
-        A[1, 1] = -th[9] / m
-        A[push, 0] += gain * w[1]
-        A[push, 2] += gain * w[2]
-        A[2, 1] = -w[2] / ell
-        if flags[2]:
-            A[1, 3] = 1.0 / m
-            A[3, 3] = -th[11]
-        if flags[3]:
-            A[1, last] = 1.0 / m
-    A[2, 2] = -th[8] / ell
+    volt = np.empty(2)
+    volt[0], volt[1] = volts[0], volts[2]
+    _rates(z, volt, th, flags, w, dw, g, A, G)
+    m, ell, last = th[_M], w[3], n - 1
     bf = 0.0 if flags[4] else 1.0 / m
     for a in range(n):
         for b in range(n):
@@ -248,7 +260,7 @@ def _spread(
                 s += P[a, c] * F[b, c]
             T[a, b] = s  # P F'
     if slopes:
-        _bend(S, th, active, chain, flags, h, w, dw, A, dA, dE)
+        _bend(z, S, th, active, chain, flags, volt, h, w, dw, g, A, dA, dE)
         _sum(dF, -1.0, dF, dF)
         _sum(dT, -1.0, dT, dT)
         for a in range(n):
@@ -334,39 +346,39 @@ def _correct(
 
 @njit(cache=True, nogil=True)
 def predict(
-    u: Array, loose: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers, chain: Array,
-    noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, slopes: bool, e: Array, s: Array,
-    rows: Array,
+    u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers,
+    chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, slopes: bool, e: Array,
+    s: Array, rows: Array,
 ) -> bool:  # fmt: skip
     """Run the predictor over one record; False where a gap closes or numbers cease to be finite.
 
-    `u` (n,), `loose` (n,) variance of what is not known of it, `y` (n, 2) position and current, `valid` (n, 2): which
-    of them are measured. `z` (n_states,) and `P` hold the state before sample `first`, and move along. `noise2` holds
-    the squares of the levels of position, current, force, voltage and drift (of one sample). `e`, `s` (n, 2) get
-    innovations and their variances; `rows` (4 n, p + 1)
-    the rows of the likelihood, where `slopes` wants them.
+    `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n,) of what is not known of the force, `y`
+    (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,) and `P` hold the state
+    before sample `first`, and move along. `noise2` holds the squares of the levels of position, current, force,
+    voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows` (4 n, p + 1) the
+    rows of the likelihood, where `slopes` wants them.
     """
     n, n_a = z.size, active.size
     p = n_a + 5
-    w, dw = np.zeros(8), np.zeros((4, 7))
-    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, 16))
+    w, dw = np.zeros(12), np.zeros((7, _MAGNET))
+    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, _ALL))
     S, dP, room = np.zeros((n, 1, p)), np.zeros((n, n, p)), np.zeros((3, n, 1, p))
     dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
     F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
     col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
     none, q2 = np.zeros((2, p + 1)), np.zeros(3)
-    phi = th[15]
+    phi = th[_LATE]
     for k in range(first, u.size):
         for c in range(2):
             if not valid[k, c]:
                 continue
             at = 0 if c == 0 else 2
-            error = y[k, c] - z[at] - th[12 + c]
+            error = y[k, c] - z[at] - th[_X_OFF + c]
             if slopes:
                 for j in range(p):
                     de[j] = -S[at, 0, j]
                 for j in range(n_a):
-                    if active[j] == 12 + c:
+                    if active[j] == _X_OFF + c:
                         de[j] -= chain[j]
                 # the derivative of the innovation is -(d prediction); the correction adds K (dy - dC z) = K de
             out = rows[4 * k + 2 * c : 4 * k + 2 * c + 2] if slopes else none
@@ -377,10 +389,12 @@ def predict(
         volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
         for d in range(3):
             q2[d] = noise2[2 + d]
+        q2[0] += knock[k]
         q2[1] += max(loose[k - whole - 1], loose[k - whole])
         _spread(
-            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, h, slopes, w, dw, A, dA, F, dF, T, dT, E, dE, T2, H
-        )
+            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, volts, h, slopes, w, dw, g, A, G, dA, F, dF, T, dT,
+            E, dE, T2, H,
+        )  # fmt: skip
         _advance(z, S, th, active, chain, flags, volts, h, steps, slopes, w, dw, g, A, G, room)
         low, high = z[0] + th[1], th[1] - z[0]
         if not flags[0] and (low <= 0.0 or (flags[1] and high <= 0.0)):

@@ -113,11 +113,13 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
     theta, whole = problem.theta(vector, record.rate_hz)
     if whole < 0 or whole > problem.skip - 1 or not np.all(np.isfinite(theta)):
         return None
-    names = [*problem.law.names, *[n.name for n in problem.numbers[7:]]]
+    if abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
+        return None
+    names = [n.name for n in problem.numbers]
     active = [names.index(n.name) for n in problem.estimated]
     chain, columns = problem.chain(vector), list(range(n_e))
     if record.rate_hz in problem.free_delay:
-        active.append(15)
+        active.append(len(names))
         chain = np.append(chain, 1.0)
         columns.append(n_e + problem.rates.index(record.rate_hz))
     place, levels = problem.noise_slices[r], problem.levels(r)
@@ -128,10 +130,12 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
     e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
     rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
     steps = problem.substeps * max(1, round(0.25 * max(problem.delays) / record.rate_hz))
+    begun = next(x.value for x in problem.numbers if x.name == "m")
+    knock = np.zeros(n) if record.knock is None else (begun * record.knock) ** 2
     done = predict(
-        record.u, record.loose**2, record.y, record.valid & np.array([not record.held, True]), problem.skip, whole,
-        theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes,
-        e, s, rows,
+        record.u, record.loose**2, knock, record.y, record.valid & np.array([not record.held, True]), problem.skip,
+        whole, theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P,
+        slopes, e, s, rows,
     )  # fmt: skip
     if not done:
         return None

@@ -17,16 +17,16 @@ from ambid.physics.coenergy_law import MagnetLaw
 
 Array = NDArray[np.float64]
 
-BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset")
+BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset", "v_drop", "i_drop")
 """Numbers after those of the magnet, in the order of the kernels."""
 
-SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset"})
+SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"})
 """Numbers that may have either sign with any law; the others are positive, or zero where they are fixed."""
 
 UNITS: Mapping[str, str] = {
     "k": "N m^2/A^2", "s": "m", "L_g": "H", "zeta": "m", "sigma": "1/A^2", "L_leak": "H", "L_rise": "H", "i_knee": "A",
     "i0": "A", "m": "kg", "R": "ohm", "c": "N s/m", "g": "m/s^2", "a": "rad/s", "x_offset": "m", "i_offset": "A",
-    "v_offset": "V",
+    "v_offset": "V", "v_drop": "V", "i_drop": "A", "k_asym": "1", "i0_asym": "A",
 }  # fmt: skip
 """SI unit of every number."""
 
@@ -55,6 +55,9 @@ class BearingRecord:
         Which of them are measured; the predictor runs on through the others.
     held : bool
         The rotor is held at rest at the mean position: only the coil moves.
+    knock : ndarray, shape (n_samples,), m/s^2, or None
+        Standard deviation of an acceleration of unknown origin during each sample, such as at a stop (see `touching`);
+        None: of none.
     """
 
     name: str
@@ -64,6 +67,7 @@ class BearingRecord:
     y: Array
     valid: NDArray[np.bool_]
     held: bool = False
+    knock: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,7 +235,7 @@ class BearingProblem:
 
         Returns
         -------
-        theta : ndarray, shape (16,)
+        theta : ndarray, shape (20,)
         whole : int
         """
         values, delay = self.values(vector), self.delay_at(vector, rate_hz)

@@ -26,6 +26,8 @@ from ambid.physics.parameters import Parameter
 
 Array = NDArray[np.float64]
 
+_FIXED = frozenset({"c", "g", "a", "i_offset", "v_drop", "i_drop"})  # unless they are named
+_ROUND = 0.02  # of the largest current: over which the drop of a stage changes its sign, where nothing is said
 _STRETCH = 8192  # samples for the linear estimate
 _WINDOW_S = 0.1  # over which forces are taken to balance
 _FORCE, _VOLTAGE = (1e-3, 1e-2, 1e-1), (0.03, 0.3)  # noise levels tried, over what the sensors would show as such
@@ -167,7 +169,8 @@ def start_numbers(
     mass = known["m"].value if "m" in known and known["m"].value is not None else lin["m"]
     gravity = known["g"].value if "g" in known and known["g"].value is not None else 0.0 if law.pair else 9.81
     guess = {**lin, "m": mass, "g": gravity, "a": 2.0 * np.pi * 200.0, "sigma": 0.05 / np.max(current**2)}
-    guess |= {"x_offset": 0.0, "i_offset": 0.0, "v_offset": 0.0, "c": 1e-3 * np.sqrt(mass * abs(lin["k_x"]))}
+    guess |= dict.fromkeys(("x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"), 0.0)
+    guess |= {"i_drop": _ROUND * float(np.max(np.abs(current))), "c": 1e-3 * np.sqrt(mass * abs(lin["k_x"]))}
     if law.pair:
         given = known["i0"].value if "i0" in known else None
         guess["i0"] = 1.5 * float(np.max(np.abs(current))) if given is None else given
@@ -189,6 +192,9 @@ def start_numbers(
         "s": 0.1 * float(np.mean(np.abs(position))),
         "x_offset": float(np.std(position)),
         "i_offset": 0.1 * typical,
+        "i0_asym": 0.1 * typical,
+        "k_asym": 0.1,
+        "v_drop": 0.1 * float(np.std(free[0].u)),
     }
     magnitude["v_offset"] = 0.1 * float(np.std(free[0].u))
     return tuple(
@@ -199,12 +205,13 @@ def start_numbers(
 def _number(name: str, known: Parameter | None, guess: float, law: MagnetLaw, magnitude: float) -> Number:
     """One number: as the user says, else free where the law has it."""
     signed = name in SIGNED or (name == "s" and not law.pair)
-    off = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
-    if not off.get(name, True):
+    has = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
+    has |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
+    if not has.get(name, True):
         return Number(name=name, value=1.0 if name == "i_knee" else 0.0, estimated=False)
     if known is None:
-        estimated = name not in ("c", "g", "a", "i_offset") and not (name == "x_offset" and not law.pair)
-        value = guess if estimated or name in ("g", "a") else 0.0
+        estimated = name not in _FIXED and not (name == "x_offset" and not law.pair)
+        value = guess if estimated or name in ("g", "a", "i_drop") else 0.0
         return Number(name=name, value=value, estimated=estimated, signed=signed, magnitude=magnitude)
     value = guess if known.value is None else known.value
     if known.role != "fixed" and not signed and not value > 0.0:
