@@ -11,7 +11,7 @@ from ambid.identify.networks.layout import Layout
 from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import Orthogonal, Ridge, orthogonal_to_physics
 from ambid.identify.networks.search import Tick, search
-from ambid.identify.networks.segments import Penalty, StateProblem, shots
+from ambid.identify.networks.segments import Penalty, StateProblem, largest_pole, shots
 from ambid.identify.networks.start import carried_to_continuous, widened
 from ambid.identify.networks.thesis_training import trained_one_step
 from ambid.identify.nonlinear.fit import LearningCurve
@@ -237,6 +237,8 @@ def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Ti
     damping = 1e-3 if state.layout.neurons else 1e-9  # physics alone begins near: Gauss-Newton at once
     for k in range(_ROUNDS):
         before, problem, best = at.score, at.problem(data), [at.vector]
+        if at.layout.gain:  # a start that is not stable may stay so
+            problem = replace(problem, farthest=max(1.0, largest_pole(at.layout, at.theta) * (1.0 + 1e-9)))
         try:
             found = search(
                 problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),

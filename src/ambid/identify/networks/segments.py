@@ -139,6 +139,25 @@ def slopes(layout: Layout, m: Matrices, shot: Shot, X: Array, E: Array, s: Array
     return out
 
 
+def largest_pole(layout: Layout, theta: Array) -> float:
+    """Return the largest modulus of the poles of the linear predictor, A - K C.
+
+    Parameters
+    ----------
+    layout : Layout
+    theta : ndarray, shape (n_theta,), scaled
+
+    Returns
+    -------
+    float
+        Infinite where the matrices are not finite.
+    """
+    m = layout.matrices(theta)
+    F = m.A.copy()
+    F[:, layout.head_table] -= m.K
+    return float(np.max(np.abs(np.linalg.eigvals(F)))) if np.all(np.isfinite(F)) else np.inf
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateProblem:
     """Weighted errors of a state-space network; unknown are (weights, first state of every shot).
@@ -154,6 +173,9 @@ class StateProblem:
     penalties : sequence of Penalty
     held : tuple of int
         Weights that are not searched for.
+    farthest : float
+        Modulus that no pole of the linear predictor A - K C may reach. Without it the search creeps towards a predictor
+        that runs away from its first state on: on a plant without process noise that fits the sample a little better.
     """
 
     layout: Layout
@@ -162,6 +184,7 @@ class StateProblem:
     jump: Array
     penalties: Sequence[Penalty] = ()
     held: tuple[int, ...] = ()
+    farthest: float = np.inf
 
     def split(self, v: Array) -> tuple[Array, Array]:
         """Return weights and first states.
@@ -210,6 +233,8 @@ class StateProblem:
         if not np.all(np.isfinite(v)) or np.max(np.abs(theta)) > 1e12:
             return np.inf
         with np.errstate(over="ignore", invalid="ignore"):
+            if np.isfinite(self.farthest) and not largest_pole(self.layout, theta) < self.farthest:
+                return np.inf
             X, E = self.errors(v)
             found = sum(float(np.sum((e @ self.weight) ** 2)) for e in E)
             for k in range(1, len(X)):
