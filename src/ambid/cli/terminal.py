@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import typer
 
+from ambid.cli.time_left import TimeLeft, in_words
 from ambid.identify.nonlinear.progress import Tick, silent
 
 if TYPE_CHECKING:
@@ -64,9 +65,10 @@ def painter() -> Paint:
 
 @contextmanager
 def progress(title: str) -> Iterator[Tick]:
-    """Show that a job of unknown length goes on, how long it has taken, and about how long it still will.
+    """Show that a job goes on, how long it has taken, and about how long it still will.
 
-    Nothing is shown in the first second, nor where standard error is no terminal.
+    A job that says what share of it is over shows that too. Nothing is shown in the first second, nor where standard
+    error is no terminal.
 
     Parameters
     ----------
@@ -76,7 +78,7 @@ def progress(title: str) -> Iterator[Tick]:
     Yields
     ------
     callable
-        To be called with the name of the stage at each evaluation.
+        To be called with the name of the stage at each evaluation, and the share that is over where it is known.
     """
     if not sys.stderr.isatty():
         yield silent
@@ -94,15 +96,16 @@ class _Display:
     def __init__(self, title: str) -> None:
         self._begin = self._stage_begin = time.monotonic()
         self._stage, self._count, self._fit_s = title, 0, 0.0
-        self._share: float | None = None
+        self._told = TimeLeft(self._begin)
         self._done = Event()
         self._thread = Thread(target=self._show, daemon=True)
         self._thread.start()
 
     def tick(self, stage: str, done: float | None = None, /) -> None:
-        self._share = done
+        now = time.monotonic()
+        if done is not None:
+            self._told.take(done, now)
         if stage != self._stage or self._count == 0:
-            now = time.monotonic()
             self._fit_s = now - self._stage_begin if self._count else 0.0
             self._stage, self._stage_begin, self._count = stage, now, 0
         self._count += 1
@@ -125,16 +128,18 @@ class _Display:
         with Progress(*shown, console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task(self._stage, total=None, elapsed=0.0, left="")
             while not self._done.wait(0.1):
-                elapsed, left = time.monotonic() - self._begin, self._left_s()
+                now = time.monotonic()
+                share, elapsed = self._told.share, now - self._begin
+                left = self._left_s() if share is None else self._told.left(now)
                 if left is None:
                     bar.update(task, total=None, description=self._stage, elapsed=elapsed, left="")
-                else:
-                    words = f", about {left:.0f} s left" if left >= 1 else ", nearly done"
-                    part = elapsed / (elapsed + left)
-                    bar.update(task, total=1.0, completed=part, description=self._stage, elapsed=elapsed, left=words)
+                    continue
+                part = elapsed / (elapsed + left) if share is None else share
+                words = ", " + in_words(left) if share is None else f", {100 * share:.0f} %, {in_words(left)}"
+                bar.update(task, total=1.0, completed=part, description=self._stage, elapsed=elapsed, left=words)
 
     def _left_s(self) -> float | None:
-        """Time left in s, or None where nothing can be said.
+        """Time left in s of a job that says no shares, such as ``identify``, or None where nothing can be said.
 
         Evaluations come at an even pace, their number is known roughly; the checks refit, which takes about as long.
         """

@@ -13,6 +13,7 @@ from pathlib import Path
 from ambid.errors import EstimationError, nearest
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.nonlinear.fit import NonlinearFit, Settings
+from ambid.identify.nonlinear.progress import part_of
 from ambid.identify.nonlinear.structures import NonlinearStructure, nonlinear_structure
 from ambid.job._progress import Tick, silent
 from ambid.job.blackbox import read_data, same_bench
@@ -21,6 +22,8 @@ from ambid.rig import Rig, load_rig
 
 OWN_STAGES = ("read", "check")
 """Stages outside the search: an exception from `tick` there ends the job; elsewhere the best so far is kept."""
+
+_SEARCH = 0.95  # of the job's time, by experience; the rest are the checks
 
 
 def fit_nonlinear(
@@ -71,7 +74,7 @@ def fit_nonlinear(
     seed : int, optional
         Of everything random, 0 or more: equal seeds give equal results.
     tick : callable, optional
-        Called with the name of the present stage and, where it is known, the share of the search that is over, 0 to 1
+        Called with the name of the present stage and, where it is known, the share of the job that is over, 0 to 1
         (else None): ``tick(stage, done)``. A KeyboardInterrupt that it raises during the search ends that with
         the best model so far, status ``stalled``.
 
@@ -109,10 +112,11 @@ def fit_nonlinear(
         same_bench(data[0].units, data[0].dt, other)
     laps["read"], last = time.perf_counter() - last, time.perf_counter()
     with one_thread():
-        found = of.estimator(data, settings or {}, seed=seed, tick=say)
+        found = of.estimator(data, settings or {}, seed=seed, tick=part_of(say, 0.0, _SEARCH))
         laps["fit"], last = time.perf_counter() - last, time.perf_counter()
-        say("check")
+        say("check", _SEARCH)
         found = judged(found, data, second=second)
+        say("check", 1.0)
         laps["checks"] = time.perf_counter() - last
     return replace(found, timing_s=laps, details={**found.details, "fit_timing_s": dict(found.timing_s)})
 

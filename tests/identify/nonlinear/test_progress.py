@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
-from ambid.identify.nonlinear.progress import part_of, portions, silent
+from ambid.identify.nonlinear.progress import guessed, part_of, portions, silent
 
 
 def test_parts_count_from_nothing_to_all_and_make_up_the_whole() -> None:
@@ -28,6 +30,12 @@ def test_parts_count_from_nothing_to_all_and_make_up_the_whole() -> None:
     assert [x for x, _ in told] == ["a", "a", "a", "b", "c", "c"]
     assert [x for _, x in told if x is not None] == pytest.approx([0.0, 0.375, 0.75, 0.9375, 1.0])
     assert told[2][1] is None
+
+
+def test_a_guess_rises_and_never_ends() -> None:
+    shares = [guessed(k, 6.0) for k in range(200)]
+    assert (shares[0], shares[6]) == (0.0, 0.5)
+    assert all(a < b < 1.0 for a, b in pairwise(shares))
 
 
 def test_without_a_listener_there_is_none_for_the_parts() -> None:

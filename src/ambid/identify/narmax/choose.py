@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,10 +13,10 @@ from ambid.identify.narmax.recursion import Tables, tables
 from ambid.identify.narmax.selection import Selection, select_terms
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Term, lagged, products
+from ambid.identify.nonlinear.progress import Tick, part_of
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,7 +133,7 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
     num, theta, err, passes = [], [], {}, 0
     for o in range(n_y):
         target = np.concatenate([x[s.lag :, o] for x in y])
-        chosen = chosen_terms(s, found, target, tick)
+        chosen = chosen_terms(s, found, target, part_of(tick, o / n_y, (o + 1) / n_y))
         n_best = len(chosen.order) if s.selection == "all" else max(chosen.n_best, 1)  # no model without a term
         picks = chosen.order[:n_best] or (0,)
         err.update({(o, terms[k]): float(x) for k, x in zip(picks, chosen.err, strict=False)})
@@ -167,7 +167,11 @@ def chosen_terms(s: NarmaxSettings, found: Candidates | MatrixCandidates, y: Arr
     """
     most = len(found.terms) if s.selection == "all" else min(s.terms, max(y.size // 5, 1))
     return select_terms(
-        found, y, most=most, criterion=s.criterion, tick=None if tick is None else lambda: tick("choice of terms")
+        found,
+        y,
+        most=most,
+        criterion=s.criterion,
+        tick=None if tick is None else lambda done: tick("choice of terms", done),
     )
 
 

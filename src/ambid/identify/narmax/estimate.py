@@ -7,7 +7,7 @@ makes them too small where a term was a close call (Leeb and Poetscher 2005).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Literal
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.narmax.choose import Draft, process_terms
+from ambid.identify.narmax.costs import stage_costs
 from ambid.identify.narmax.noise_model import with_all_noise, with_noise_terms
 from ambid.identify.narmax.pruning import pruned_by_prediction, pruned_by_simulation
 from ambid.identify.narmax.rational import rational_terms
@@ -28,9 +29,9 @@ from ambid.identify.narmax.selection import information
 from ambid.identify.narmax.settings import NarmaxSettings, narmax_settings
 from ambid.identify.narmax.simulated_choice import terms_by_simulation
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+from ambid.identify.nonlinear.progress import Tick, part_of, portions
 
 Array = NDArray[np.float64]
-Tick = Callable[[str], object]
 
 DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
 
@@ -137,31 +138,32 @@ def _linear_start(s: NarmaxSettings, scaled: Scaled) -> Draft:
 
 def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
     if tick is not None:
-        tick("start")
+        tick("start", 0.0)
+    terms, below, noise, pruning, free = portions(tick, stage_costs(s, scaled.n_outputs, scaled.parts[0][1].shape[1]))
     with _Timed(work, "terms"):
         if s.selection == "simulation":
-            draft = terms_by_simulation(s, scaled.parts, tick, lambda x: _keep_simulated(work, x))
+            draft = terms_by_simulation(s, scaled.parts, terms, lambda x: _keep_simulated(work, x))
         else:
-            draft = process_terms(s, scaled.parts, tick)
+            draft = process_terms(s, scaled.parts, terms)
         if s.kind == "rational":
-            draft = rational_terms(s, draft, scaled.parts, tick)
-            draft = _searched(scaled, draft, work, tick, free=False)
+            draft = rational_terms(s, draft, scaled.parts, part_of(below, 0.0, 0.5))
+            draft = _searched(scaled, draft, work, part_of(below, 0.5, 1.0), free=False)
         if not (s.selection == s.focus == "simulation"):
             draft = _refitted(s, scaled, draft)
             _keep(work, scaled, draft)
     if s.selection == s.focus == "simulation":
         with _Timed(work, "simulation errors"):
-            _fit_to_simulation(scaled, draft, work, tick)
+            _fit_to_simulation(scaled, draft, work, free)
         return
     with _Timed(work, "noise terms"):
         if s.ne:
-            draft = with_noise_terms(s, draft, scaled.parts, tick)
-            draft = _searched(scaled, draft, work, tick, free=False)
+            draft = with_noise_terms(s, draft, scaled.parts, part_of(noise, 0.0, 0.4))
+            draft = _searched(scaled, draft, work, part_of(noise, 0.4, 1.0), free=False)
     with _Timed(work, "pruning"):
-        draft = _pruned(s, scaled, draft, work, tick)
+        draft = _pruned(s, scaled, draft, work, pruning)
     with _Timed(work, "simulation errors"):
         if s.focus == "simulation":
-            _fit_to_simulation(scaled, draft, work, tick)
+            _fit_to_simulation(scaled, draft, work, free)
 
 
 class _Timed:
@@ -241,21 +243,23 @@ def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: T
     if s.pruning == "none":
         return draft
     if s.pruning == "simulation":
-        fewer = pruned_by_simulation(draft, scaled.parts, np.ones(scaled.n_outputs), s.criterion, tick)
-        return draft if fewer is draft else _searched(scaled, fewer, work, tick, free=False)
+        one = np.ones(scaled.n_outputs)
+        fewer = pruned_by_simulation(draft, scaled.parts, one, s.criterion, part_of(tick, 0.0, 0.6))
+        return draft if fewer is draft else _searched(scaled, fewer, work, part_of(tick, 0.6, 1.0), free=False)
     weight = _weight(scaled, draft, free=False)
 
-    def pruned(d: Draft, *, noise: bool = True) -> Draft:
+    def pruned(d: Draft, share: float, *, noise: bool = True) -> Draft:
         fewer = pruned_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
-        return _searched(scaled, fewer, work, tick, free=False)
+        return _searched(scaled, fewer, work, part_of(tick, share, share + 0.25), free=False)
 
-    best = pruned(draft)
+    best = pruned(draft, 0.0)
     ended = work.status
     richer = with_all_noise(s, draft)
     if richer is not draft and draft.tables.noisy:
         # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
         # these are there can the surplus process terms go one by one.
-        other = pruned(pruned(_searched(scaled, richer, work, tick, free=False), noise=False))
+        other = _searched(scaled, richer, work, part_of(tick, 0.25, 0.5), free=False)
+        other = pruned(pruned(other, 0.5, noise=False), 0.75)
         if _value(s, scaled, other, weight) < _value(s, scaled, best, weight):
             best, ended = other, work.status
     work.status = ended

@@ -6,7 +6,7 @@ real pole, a pair, a delay) are laid on a grid, the gain of each fitted to the m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,10 @@ from ambid.identify.narmax.model import OUTPUTS
 from ambid.identify.narmax.search import search
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Factor, Term
+from ambid.identify.nonlinear.progress import Tick
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
 
 _REAL = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)
 _RADII = (0.6, 0.8, 0.9, 0.95, 0.98)
@@ -49,9 +49,10 @@ def linear_folded(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
     inputs = [Factor("u", 0, k) for k in delays]
     terms: tuple[Term, ...] = tuple((f,) for f in (*outputs, *inputs))
     one, best, least = np.ones(1), None, np.inf
-    for start in _starts(order, delays, parts):
+    starts = _starts(order, delays, parts)
+    for k, start in enumerate(starts):
         if tick is not None:
-            tick("sign of the output")
+            tick("sign of the output", k / len(starts))
         draft = Draft(numerators=(terms,), denominators=((),), theta=start, n_inputs=1, folded=OUTPUTS.index(s.output))
         found = search(draft.tables, start, parts, one, free=True, most=30)
         if best is None or found.cost < least:

@@ -6,7 +6,7 @@ digits come from the prediction-error search, whose innovations are those of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,13 @@ from ambid.identify.narmax.recursion import predicted
 from ambid.identify.narmax.selection import select_terms
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Term, noise_terms
+from ambid.identify.nonlinear.progress import Tick, guessed
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
 
 _ROUNDS = 12
+_USUAL = 3.0  # rounds, about half of those that it takes
 _CHOOSING = 3  # rounds in which the choice of noise terms may still change
 
 
@@ -53,7 +54,7 @@ def with_noise_terms(s: NarmaxSettings, draft: Draft, parts: Parts, tick: Tick |
     own, below = _denominators(s, draft, parts)
     for rounds in range(_ROUNDS):
         if tick is not None:
-            tick("extended least squares")
+            tick("extended least squares", guessed(rounds, _USUAL))
         num, theta = [], []
         for o in range(n_y):
             over = below[o]

@@ -7,7 +7,7 @@ run does not pay for it, for terms that predict well for one step may spoil a ru
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from ambid.identify.narmax.choose import Draft
 from ambid.identify.narmax.search import evaluated, triangle
 from ambid.identify.narmax.selection import information, penalty
+from ambid.identify.nonlinear.progress import Tick, guessed
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
+
+_USUAL = 4.0  # terms that are left out, about half of them
 
 
 def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Draft:
@@ -81,10 +83,10 @@ def pruned_by_simulation(draft: Draft, parts: Parts, weight: Array, criterion: s
         cost = evaluated(d.tables, d.theta, parts, weight, free=True).cost
         return information(criterion, cost / n, d.theta.size, n, m) if np.isfinite(cost) else np.inf
 
-    now = value(draft)
+    now, before = value(draft), draft.theta.size
     while draft.theta.size > len(draft.numerators):
         if tick is not None:
-            tick("simulation-error pruning")
+            tick("simulation-error pruning", guessed(before - draft.theta.size, _USUAL))
         R = triangle(draft.tables, draft.theta, parts, weight, free=False)
         if not np.all(np.isfinite(R)):
             return draft

@@ -6,7 +6,7 @@ its place, which makes the equation error the innovation itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from ambid.identify.narmax.candidates import MatrixCandidates, candidates
 from ambid.identify.narmax.choose import Draft, chosen_terms, least_squares
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Term, lagged, products
+from ambid.identify.nonlinear.progress import Tick, part_of
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
 
 _ROUNDS = 4
 
@@ -57,9 +57,10 @@ def rational_terms(s: NarmaxSettings, polynomial: Draft, parts: Parts, tick: Tic
         yhat = own.columns(range(len(own.terms))) @ _own_theta(polynomial, o)
         picks: list[int] = []
         values = np.empty(0)
-        for _ in range(_ROUNDS):
+        for rounds in range(_ROUNDS):
             both = np.hstack([P, -yhat[:, None] * D])
-            found = chosen_terms(s, MatrixCandidates(matrix=both), target, tick)
+            begin, each = (o * _ROUNDS + rounds) / (n_y * _ROUNDS), 1.0 / (n_y * _ROUNDS)
+            found = chosen_terms(s, MatrixCandidates(matrix=both), target, part_of(tick, begin, begin + each))
             trial = list(found.chosen)
             new = least_squares(both[:, trial], target)
             below = [k - len(up) for k in trial if k >= len(up)]

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.narmax.recursion import Tables, predicted, sensitivities
+from ambid.identify.nonlinear.progress import Tick, guessed
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
 """Scaled outputs and inputs of each record."""
 
+_USUAL = 6.0  # iterations, about half of those that it takes
 BLIND = 1e-12  # singular values of the scaled Jacobian below this part of the largest are directions nobody sees
 
 
@@ -106,7 +108,7 @@ def search(
     *,
     free: bool,
     most: int = 40,
-    tick: Callable[[str], object] | None = None,
+    tick: Tick | None = None,
     keep: Callable[[Array], None] | None = None,
 ) -> Fitted:
     """Search for the least sum of squared errors.
@@ -137,9 +139,9 @@ def search(
     seconds, costs, damping, converged = [perf_counter() - began], [best.cost], 1e-4, False
     if not best.finite or not theta.size:
         return best
-    for _ in range(most):
+    for k in range(most):
         if tick is not None:
-            tick("simulation-error search" if free else "prediction-error search")
+            tick("simulation-error search" if free else "prediction-error search", guessed(k, _USUAL))
         R = triangle(t, best.theta, parts, weight, free=free)
         if not np.all(np.isfinite(R)):
             break

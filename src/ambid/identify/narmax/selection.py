@@ -69,7 +69,7 @@ def select_terms(
     most: int,
     criterion: str = "ebic",
     first: Sequence[int] = (),
-    tick: Callable[[], object] | None = None,
+    tick: Callable[[float], object] | None = None,
 ) -> Selection:
     """Choose terms by orthogonal least squares.
 
@@ -86,7 +86,7 @@ def select_terms(
     first : sequence of int, optional
         Candidates that are in the model in any case; they come first.
     tick : callable, optional
-        Called before each pass over the data.
+        Called now and then with a guess at the share that is over, 0 to 1.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
 class _Gram:
     """Scalar products of what is left of candidates and output, orthogonal to those chosen so far."""
 
-    def __init__(self, found: Candidates | MatrixCandidates, y: Array, tick: Callable[[], object] | None) -> None:
+    def __init__(self, found: Candidates | MatrixCandidates, y: Array, tick: Callable[[float], object] | None) -> None:
         self.found, self.y, self.tick = found, y, tick
         self.order: list[int] = []
         self.path: list[float] = []
@@ -251,8 +251,7 @@ class _Gram:
 
     def _measure(self) -> None:
         """Make candidates and output orthogonal to the chosen ones, and multiply them with each other."""
-        if self.tick is not None:
-            self.tick()
+        self._tell(0.0)
         m, k = self.alive.size, len(self.order)
         Q = np.linalg.qr(self.found.columns(self.order))[0] if k else np.empty((self.y.size, 0))
         rest = self.y - Q @ (Q.T @ self.y)
@@ -262,6 +261,7 @@ class _Gram:
             C += Q[rows].T @ values.T
         gram, product, again = np.zeros((m, m)), np.zeros(m), np.zeros((k, m))
         for rows, values in self.found.blocks():
+            self._tell(rows.start / self.y.size)
             if k:
                 values -= C.T @ Q[rows].T
                 again += Q[rows].T @ values.T
@@ -284,3 +284,8 @@ class _Gram:
         self.squared = np.where(self.alive, 1.0, 0.0)
         self.rows, self.since = np.empty((8, m)), 0
         self.passes += 1
+
+    def _tell(self, part: float) -> None:
+        """Say what share is over: the first pass is half of the work or more, each further one half of the rest."""
+        if self.tick is not None:
+            self.tick(1.0 - 0.5**self.passes * (1.0 - 0.5 * part))

@@ -22,12 +22,13 @@ from ambid.identify.narmax.search import evaluated, search, triangle
 from ambid.identify.narmax.selection import information
 from ambid.identify.narmax.settings import NarmaxSettings
 from ambid.identify.narmax.terms import Term, lagged, products
+from ambid.identify.nonlinear.progress import Tick, guessed, part_of
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
-Tick = Callable[[str], object]
 
 _TRIED = 4  # candidates that are tried before it is said that none pays
+_USUAL = 8.0  # trials, about half of those that it takes
 _ONE = np.ones(1)
 
 
@@ -65,7 +66,8 @@ def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep
         cost = evaluated(d.tables, d.theta, parts, _ONE, free=True).cost / n
         return information(s.criterion, cost, d.theta.size, n, len(terms)) if np.isfinite(cost) else np.inf
 
-    draft = replace(_start(s, parts, tick), n_candidates=len(terms))
+    draft = replace(_start(s, parts, part_of(tick, 0.0, 0.3)), n_candidates=len(terms))
+    choice, tried = part_of(tick, 0.3, 1.0), 0
     now = value(draft)
     if not np.isfinite(now):
         return draft
@@ -73,8 +75,9 @@ def terms_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep
     while draft.theta.size < most:
         better = None
         for term in _promising(draft, terms, parts)[:_TRIED]:
-            if tick is not None:
-                tick("choice of terms by simulation")
+            if choice is not None:
+                choice("choice of terms by simulation", guessed(tried, _USUAL))
+            tried += 1
             trial = _pruned(_searched(_with(draft, term), parts), parts, value)
             if value(trial) < now:
                 better = trial

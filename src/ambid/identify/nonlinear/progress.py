@@ -62,6 +62,24 @@ def part_of(tick: Tick | None, begin: float, end: float) -> Tick | None:
     return of_part
 
 
+def guessed(steps: int, usual: float) -> float:
+    """Guess which share of a loop is over that ends when nothing is gained any more.
+
+    Parameters
+    ----------
+    steps : int
+        Done so far.
+    usual : float
+        Such a loop takes about twice as many.
+
+    Returns
+    -------
+    float
+        0 at the begin, one half after the usual number, below 1 however long it takes.
+    """
+    return steps / (steps + usual)
+
+
 def portions(tick: Tick | None, costs: Sequence[float]) -> list[Tick | None]:
     """Return a tick for each of several parts of a search that come one after the other.
 
