@@ -10,6 +10,7 @@ from ambid.identify.blackbox.data import IOData
 
 SETTINGS: Mapping[str, Mapping[str, object]] = {
     "narmax": {},
+    "hybrid": {"neurons": 2},
 }
 """By structure: what it is told here; its own choice where nothing stands."""
 

@@ -13,8 +13,10 @@ from ambid.identify.nonlinear.model import NonlinearModel
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.identify.narmax.model:PolynomialNarmax",
+        "hybrid": "ambid.identify.hybrid.model:HybridNarmax",
         "nn": "ambid.identify.networks.state_model:StateNetwork",
         "narx": "ambid.identify.networks.narx_model:NeuralNarx",
+        "lpv": "ambid.identify.lpv.model:LpvModel",
     }
 )
 """``module:class`` by `NonlinearModel.kind`; imported only when a model of that kind is read."""

@@ -1,0 +1,233 @@
+"""Hybrid NARMAX and network from records, by prediction errors.
+
+Polynomial and noise terms by orthogonal least squares (`narmax`) -> number of neurons by held-out errors -> network on
+what they leave, from several starts -> all numbers together by Levenberg-Marquardt with exact slopes through the
+innovations -> terms that no longer pay, order of C -> covariance by Laplace's approximation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, moved, pruned, trained
+from ambid.identify.hybrid.function import HybridShape
+from ambid.identify.hybrid.result import finished
+from ambid.identify.hybrid.settings import HybridSettings, hybrid_settings
+from ambid.identify.hybrid.train import HybridProblem, problem_at
+from ambid.identify.narmax import PolynomialNarmax, narmax
+from ambid.identify.narmax.scaled import Scaled, scaled_records
+from ambid.identify.networks.failed import failed_fit
+from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.networks.search import Found, search
+from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+from ambid.identify.nonlinear.progress import Tick, portions
+
+Array = NDArray[np.float64]
+
+_ENOUGH = 1e-7  # gain of the cost, errors of unit variance, below which a search is over
+
+
+@dataclass(slots=True)
+class Work:
+    """What a fit has come to, so that an interruption loses nothing.
+
+    Attributes
+    ----------
+    shape : HybridShape
+    theta : ndarray, shape (n_theta,), scaled
+    n_candidates : int
+        Terms that the polynomial's were chosen from.
+    status : {"converged", "stalled"}
+    curves : list of LearningCurve
+    warnings : list of str
+    timing_s : dict of str to float
+    tried : tuple of Tried
+    dropped : tuple of str
+        Terms of the polynomial that the network made superfluous.
+    drawn_in : float
+        By what the roots of the first C were multiplied to make it invertible.
+    """
+
+    shape: HybridShape
+    theta: Array
+    n_candidates: int = 0
+    status: Literal["converged", "stalled"] = "converged"
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+    tried: tuple[Tried, ...] = ()
+    dropped: tuple[str, ...] = ()
+    drawn_in: float = 1.0
+
+    def keep(self, shape: HybridShape, theta: Array) -> None:
+        """Hold on to a model.
+
+        Parameters
+        ----------
+        shape : HybridShape
+        theta : ndarray, shape (n_theta,), scaled
+        """
+        self.shape, self.theta = shape, theta
+
+
+def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+    """Identify polynomial, network and noise model together, yhat = g(y, u) + (C(q^-1) - 1) e (thesis eqs 3.23-3.24).
+
+    Consistent under feedback as long as polynomial, network and C hold the truth.
+
+    Parameters
+    ----------
+    records : sequence of IOData
+        Of one bench.
+    settings : Mapping
+        Described in the register of structures.
+    seed : int, optional
+        Of the network's starts.
+    tick : callable, optional
+        Called with the stage and the share that is over; may raise KeyboardInterrupt.
+
+    Returns
+    -------
+    NonlinearFit
+
+    Raises
+    ------
+    EstimationError
+        If a setting is not known, records do not belong together, are too short, or a channel does not move.
+    """
+    if not records:
+        raise EstimationError("hybrid: no record is given. Pass one at least")
+    s = hybrid_settings(settings, n_inputs=records[0].n_inputs)
+    data = scaled_records("hybrid", records, lag=s.lag, levels=s.levels)
+    ticks = portions(tick, (3.0, 4.0 if s.neurons is None else 0.0, 3.0, 3.0, 2.0))
+    began = perf_counter()
+    first = narmax(records, s.polynomial, seed=seed, tick=ticks[0])
+    timing = {"polynomial": perf_counter() - began}
+    if not isinstance(first.model, PolynomialNarmax):
+        return failed_fit("hybrid", records, s.as_mapping(), seed, first.reason, timing)
+    work = _polynomial(s, first, first.model)
+    work.timing_s.update(timing)
+    try:
+        if any(w.startswith("interrupted") for w in first.warnings):
+            raise KeyboardInterrupt
+        _identify(s, data, work, seed, ticks[1:])
+    except KeyboardInterrupt:
+        work.status = "stalled"
+        work.warnings.insert(0, "interrupted: the best model so far")
+    except np.linalg.LinAlgError as error:
+        return failed_fit("hybrid", records, s.as_mapping(), seed, f"the training broke down: {error}", work.timing_s)
+    else:
+        if work.status == "stalled":
+            work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+    return finished(records, s, data, work, seed=seed)
+
+
+def _polynomial(s: HybridSettings, first: NonlinearFit, model: PolynomialNarmax) -> Work:
+    """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
+    terms = tuple(tuple(x for x in one if all(f.kind != "e" for f in x)) for one in model.numerators)
+    ne = max((f.lag for one in model.numerators for x in one for f in x if f.kind == "e"), default=0)
+    p, m = model.n_outputs, model.n_inputs
+    shape = HybridShape(
+        terms=terms,
+        ne=ne if s.ne is None else s.ne,
+        network=NarxShape(n_outputs=p, n_inputs=m, ny=s.ny, nu=s.nu, nk=s.nk, neurons=0),
+        deep=s.innovations == "network",
+    )
+    known = dict(zip(model.names, model.theta / model.unit, strict=True))
+    theta, factor = inverted(shape, np.array([known.get(name, 0.0) for name in shape.names], dtype=np.float64))
+    found = first.details.get("candidates", 0)
+    return Work(
+        shape=shape,
+        theta=theta,
+        n_candidates=found if isinstance(found, int) else 0,
+        curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
+        drawn_in=factor,
+    )
+
+
+def _identify(s: HybridSettings, data: Scaled, work: Work, seed: int, ticks: list[Tick | None]) -> None:
+    began = perf_counter()
+    work.shape = lean = _lean(work.shape)
+    _searched(s, data, work, "polynomial and noise model", ticks[0])
+    full = replace(lean, network=replace(lean.network, ny=s.ny, nu=s.nu))
+    neurons = s.neurons
+    if neurons is None:
+        neurons, work.tried = chosen_neurons(full, work.theta, data.parts, s.prior, s.held_out, seed, ticks[0])
+        if not neurons:
+            why = (
+                "predicts held-out data as well as with a network" if work.tried else "is all that so few samples carry"
+            )
+            work.warnings.append(f"the polynomial alone {why}: no neurons were added")
+    work.timing_s["choice of neurons"] = perf_counter() - began
+    began = perf_counter()
+    if neurons:
+        shape = full.with_sizes(neurons=neurons)
+        theta, found = trained(shape, work.theta, data.parts, s.prior, s.starts, seed, ticks[1])
+        work.keep(shape, theta)
+        _note(work, found, problem_at(shape, data.parts, theta, s.prior), "network on the residual")
+        problem = _searched(s, data, work, "all together", ticks[2])
+        if s.pruning == "prediction":
+            problem, theta, names = pruned(
+                problem.at(work.theta), work.theta, s.criterion, work.n_candidates, work.keep
+            )
+            work.dropped = tuple(names)
+    if s.ne is None:
+        problem = problem_at(work.shape, data.parts, work.theta, s.prior)
+        work.keep(*chosen_noise(problem, work.theta, s.criterion, ticks[3]))
+        if not neurons:
+            shape = _lean(work.shape)
+            work.keep(shape, moved(work.shape, work.theta, shape))
+    _searched(s, data, work, "all together", ticks[3])
+    work.timing_s["all together"] = perf_counter() - began
+
+
+def _lean(shape: HybridShape) -> HybridShape:
+    """Without neurons, no more lags than the polynomial looks at: a model of as little past as there can be."""
+    reach = {"y": 0, "u": 0}
+    for f in (f for one in shape.terms for x in one for f in x):
+        reach[f.kind] = max(reach[f.kind], f.lag - (shape.network.nk - 1 if f.kind == "u" else 0))
+    if not any(reach.values()):
+        return shape
+    return replace(shape, network=replace(shape.network, ny=reach["y"], nu=reach["u"]))
+
+
+def _searched(s: HybridSettings, data: Scaled, work: Work, stage: str, tick: Tick | None) -> HybridProblem:
+    """Search for all numbers, errors of unit variance."""
+    shape = work.shape
+    problem = problem_at(shape, data.parts, work.theta, s.prior)
+    if tick is not None:
+        tick(stage, 0.0)
+    found = search(
+        problem,
+        work.theta,
+        stage=stage,
+        most=s.iterations,
+        tolerance=1e-10,
+        enough=_ENOUGH,
+        damping=1e-4,
+        tick=tick,
+        keep=lambda theta: work.keep(shape, theta),
+    )
+    work.keep(shape, found.theta)
+    _note(work, found, problem, stage)
+    work.status = "converged" if found.converged else "stalled"
+    return problem
+
+
+def _note(work: Work, found: Found, problem: HybridProblem, stage: str) -> None:
+    size = float(np.sqrt(np.mean(problem.weight**2))) if np.isfinite(found.cost) else 1.0
+    work.curves.append(
+        LearningCurve(
+            method=f"{stage}: Levenberg-Marquardt, prediction errors",
+            seconds=np.array(found.seconds),
+            training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) / size,
+        )
+    )

@@ -1,0 +1,183 @@
+"""The fit that comes out of a hybrid training: model in SI, covariance, noise, what a reader has to be warned of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.hybrid.model import HybridNarmax, units_of
+from ambid.identify.hybrid.settings import HybridSettings
+from ambid.identify.hybrid.train import HybridProblem, problem_at
+from ambid.identify.narmax.scaled import Scaled
+from ambid.identify.networks.cloud import cloud_of
+from ambid.identify.networks.failed import failed_fit, provenance
+from ambid.identify.networks.search import information_inverse
+from ambid.identify.nonlinear.fit import NonlinearFit
+
+if TYPE_CHECKING:
+    from ambid.identify.hybrid.estimate import Work
+
+Array = NDArray[np.float64]
+
+DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+_SHARED = 10.0  # times a standard deviation grows by the network, from which on a term's value is not its own
+_NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
+
+
+def finished(records: Sequence[IOData], s: HybridSettings, data: Scaled, work: Work, *, seed: int) -> NonlinearFit:
+    """Return the fit of trained numbers.
+
+    Parameters
+    ----------
+    records : sequence of IOData
+    s : HybridSettings
+    data : Scaled
+    work : Work
+    seed : int
+
+    Returns
+    -------
+    NonlinearFit
+        Failed where the predictor diverges.
+    """
+    began = perf_counter()
+    shape, theta = work.shape, work.theta
+    used = {**s.as_mapping(), "ne": shape.ne, "neurons": shape.neurons}
+    problem = problem_at(shape, data.parts, theta, s.prior)
+    if not np.isfinite(problem.cost(theta)):
+        return failed_fit("hybrid", records, used, seed, DIVERGED, work.timing_s)
+    covariance, noise, effective, inflated = laplace(problem, theta)
+    unit = units_of(shape, data.y_scale, data.u_scale)
+    warnings = [*work.warnings, *_cautions(records, data, work, inflated)]
+    if covariance is None:
+        warnings.append("no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons")
+    net = shape.network
+    model = HybridNarmax(
+        dt=records[0].dt,
+        shape=shape,
+        theta=theta * unit,
+        u_level=data.u_level,
+        u_scale=data.u_scale,
+        y_level=data.y_level,
+        y_scale=data.y_scale,
+        cloud=cloud_of(np.concatenate([net.regressors(y, u)[shape.lag - net.lag :] for y, u in data.parts])),
+    )
+    work.timing_s["result"] = perf_counter() - began
+    work.timing_s["all"] = sum(work.timing_s.values())
+    return NonlinearFit(
+        structure="hybrid",
+        settings=used,
+        model=model,
+        covariance=None if covariance is None else covariance * unit[:, None] * unit,
+        covariance_from="" if covariance is None else "laplace",
+        n_estimated=int(theta.size),
+        noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
+        seed=seed,
+        status=work.status,
+        curves=tuple(work.curves),
+        warnings=tuple(warnings),
+        timing_s=dict(work.timing_s),
+        details=_details(records, data, work, effective),
+        **provenance(records),
+    )
+
+
+def laplace(problem: HybridProblem, theta: Array) -> tuple[Array | None, Array, float, Array]:
+    """Return the inverse of the information, the prior's included, at the most probable numbers (MacKay 1992).
+
+    Parameters
+    ----------
+    problem : HybridProblem
+    theta : ndarray, shape (n_theta,)
+
+    Returns
+    -------
+    covariance : ndarray, shape (n_theta, n_theta), or None
+        None where the data and the prior together leave a direction open.
+    noise : ndarray, shape (n_outputs, n_outputs), scaled
+    effective : float
+        Numbers that the data determine.
+    inflated : ndarray, shape (n_terms,)
+        By what the network multiplies the standard deviation of each term of the polynomial.
+    """
+    errors = np.concatenate(problem.errors(theta))
+    n, p = errors.shape
+    noise, P, effective = errors.T @ errors / n, None, float(theta.size)
+    n_terms, n_linear = problem.shape.sizes[0], problem.shape.n_linear
+    inflated = np.ones(n_terms)
+    for _ in range(2):  # the degrees of freedom are those that the prior leaves
+        at = replace(problem, weight=1.0 / np.sqrt(np.maximum(np.diag(noise), 1e-14)))
+        R = at.triangle(theta)[:, :-1]
+        P, _condition = information_inverse(R)
+        if P is None:
+            break
+        effective = float(theta.size - np.sum(np.diag(P) * at.precision**2))
+        noise = errors.T @ errors / max(n - effective / p, 1.0)
+        alone, _condition = information_inverse(R[:, :n_linear])
+        if alone is not None:
+            inflated = np.sqrt(np.diag(P)[:n_terms] / np.diag(alone)[:n_terms])
+    return P, noise, effective, inflated
+
+
+def _cautions(records: Sequence[IOData], data: Scaled, work: Work, inflated: Array) -> list[str]:
+    shape, found = work.shape, []
+    if not shape.ne and records[0].n_inputs and not all(x.open_loop for x in records):
+        found.append(
+            "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: "
+            "raise ne, or say --open-loop if there was no feedback"
+        )
+    radius = shape.noise_radius(work.theta)
+    if not shape.deep and radius > _NEAR:
+        found.append(
+            f"C has a root at {radius:.4g}, nearly on the unit circle, where the search must not cross: its standard "
+            "deviation is not to be trusted, and the predictor forgets its beginning slowly. A differenced or "
+            "detrended output does this"
+        )
+    if np.any(inflated > _SHARED):
+        names = ", ".join(name for name, x in zip(shape.names, inflated, strict=False) if x > _SHARED)
+        found.append(
+            f"the network can take over these terms, so that their values are not theirs alone: {names}. Fewer neurons "
+            "or a smaller prior"
+        )
+    ok = [np.all(np.isfinite(shape.free_run(work.theta, y, u))) for y, u in data.parts]
+    if not all(ok):
+        found.append(
+            "the free run diverges on the records that the model was trained on: it predicts, but does not simulate"
+        )
+    return found
+
+
+def _details(records: Sequence[IOData], data: Scaled, work: Work, effective: float) -> dict[str, object]:
+    shape, y_all = work.shape, np.concatenate([y for y, _ in data.parts])
+    names, n_c = iter(shape.names), shape.sizes[0]
+    terms = {
+        out: [{"term": next(names)} for _ in one] for out, one in zip(records[0].outputs, shape.terms, strict=True)
+    }
+    hidden = []
+    for y, u in data.parts:
+        rows = shape.rows(y, u)
+        hidden.append(shape.innovations(work.theta, rows)[1] @ shape.parts(work.theta)[2].T)
+    by_network = np.std(np.concatenate(hidden), axis=0) / np.maximum(np.std(y_all, axis=0), 1e-300)
+    return {
+        "terms": terms,
+        "candidates": work.n_candidates,
+        "effective_parameters": effective,
+        "left_out_beside_the_network": list(work.dropped),
+        "network_share": dict(zip(records[0].outputs, by_network.tolist(), strict=True)),
+        "noise_model": {
+            "largest_root": shape.noise_radius(work.theta),
+            "coefficients": work.theta[n_c : shape.n_linear].tolist(),
+            "start_drawn_in_by": work.drawn_in,
+        },
+        "tried": [{"neurons": x.neurons, "held_out_rms": x.held_out} for x in work.tried],
+        "levels": {
+            **dict(zip(records[0].inputs, data.u_level.tolist(), strict=True)),
+            **dict(zip(records[0].outputs, data.y_level.tolist(), strict=True)),
+        },
+    }
