@@ -14,6 +14,7 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.identify.narmax.model:PolynomialNarmax",
         "hybrid": "ambid.identify.hybrid.model:HybridNarmax",
+        "rbf": "ambid.identify.rbf.model:RbfNetwork",
         "nn": "ambid.identify.networks.state_model:StateNetwork",
         "narx": "ambid.identify.networks.narx_model:NeuralNarx",
         "lpv": "ambid.identify.lpv.model:LpvModel",

@@ -1,0 +1,344 @@
+"""An LPV model with its schedule, scaling and training cloud (implements `NonlinearModel`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.lpv.frozen import Frozen, frozen
+from ambid.identify.lpv.schedule import BASES, Schedule, basis_values
+from ambid.identify.lpv.shape import LpvShape, Part, errors, part_of
+from ambid.identify.networks.cloud import Cloud
+from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.signals import scaled, with_head
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LpvModel:
+    """A linear model of one output whose coefficients follow a scheduling signal; equations in `lpv.shape`.
+
+    The predictor takes the process part before its first prediction as the output, and innovations there as zero.
+
+    Attributes
+    ----------
+    dt : float
+        s.
+    n_inputs : int
+        Channels, with one that only schedules.
+    shape : LpvShape
+    schedule : Schedule
+    theta : ndarray, shape (n_theta,), SI
+        For signals in deviations from `*_level`; each coefficient's weights of the functions of p.
+    u_level, u_scale : ndarray, shape (n_inputs,), SI
+    y_level, y_scale : ndarray, shape (1,), SI
+    cloud : Cloud
+        Of the training regressors and the scheduling signal.
+    """
+
+    dt: float
+    n_inputs: int
+    shape: LpvShape
+    schedule: Schedule
+    theta: Array
+    u_level: Array
+    u_scale: Array
+    y_level: Array
+    y_scale: Array
+    cloud: Cloud
+
+    @property
+    def kind(self) -> str:
+        """Under which files know it."""
+        return "lpv"
+
+    @property
+    def n_outputs(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.shape.lag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient and number of the function of p."""
+        return self.shape.names
+
+    @cached_property
+    def unit(self) -> Array:
+        """What a scaled parameter of 1 is in SI, shape (n_theta,)."""
+        of = self.shape
+        out, y = np.ones(of.n_theta), float(self.y_scale[0])
+        for i, column in enumerate(of.columns):
+            for k in range(of.nb):
+                out[of.place(of.order + i * of.nb + k)] = y / self.u_scale[column]
+        out[of.place(of.n_process - 1)] = y
+        return out
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other parameters.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,), SI
+
+        Returns
+        -------
+        LpvModel
+        """
+        return replace(self, theta=theta)
+
+    def at(self, p: float, covariance: Array | None = None) -> Frozen:
+        """Return the linear model at one value of the scheduling signal.
+
+        Parameters
+        ----------
+        p : float, SI
+            Outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs.
+        covariance : ndarray, shape (n_theta, n_theta), SI, optional
+            Of `theta`; that of the fit.
+
+        Returns
+        -------
+        Frozen
+        """
+        of, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
+        n = len(of.coefficients)
+        G = np.zeros((n, of.n_theta))
+        for k in range(n):
+            where = of.place(k)
+            G[k, where] = basis_values(s, where.stop - where.start, of.basis)[0]
+        values, keep = G @ self.theta, np.arange(n) != of.n_process - 1
+        P = None if covariance is None else (G @ covariance @ G.T)[np.ix_(keep, keep)]
+        b = values[of.order : of.n_process - 1].reshape(len(of.columns), of.nb)
+        d, c = values[of.n_process : of.n_process + of.ar], values[of.n_process + of.ar :]
+        return frozen(float(p), self.dt, of.nk, values[: of.order], b, c, d, P)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """Return one-step-ahead predictions.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, 1), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, 1), SI
+            NaN in the first `lag` rows, and everywhere if the predictor diverges.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        part = self._part(u, y)
+        found = errors(self.shape, part, self.theta / self.unit)
+        out = np.full((part.y.size, 1), np.nan)
+        if found.finite:
+            out[self.lag :, 0] = found.g[self.lag :]
+        predicted: Array = self.y_level + self.y_scale * out
+        return predicted
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """Return the exact derivative of `predict` by `theta`.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, 1), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, 1, n_theta)
+            The first `lag` rows are zero.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        found = errors(self.shape, self._part(u, y), self.theta / self.unit, slopes=2)
+        J = found.J[:, : self.theta.size] if found.finite else np.full((found.e.size, self.theta.size), np.nan)
+        out = (J * (self.y_scale / self.unit))[:, None, :]
+        out[: self.lag] = 0.0
+        return np.asarray(out)
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """Run freely from the first `lag` measured samples on, without noise; a set point is that of the run itself.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (at least lag, 1), SI
+            Only the first `lag` rows are looked at.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, 1), SI
+            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
+            training data.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        from ambid.identify.lpv._kernels import free_run
+
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
+        of, found = self.shape, np.ascontiguousarray(ys[:, 0])
+        share, column = self.schedule.share(self.dt), self.schedule.column
+        s = np.zeros(found.size) if column < 0 else self.schedule.scaled(np.asarray(u, dtype=np.float64)[:, column])
+        level, size = float(self.y_level[0]), float(self.y_scale[0])
+        free_run(
+            found,
+            of.lagged_inputs(us),
+            np.ascontiguousarray(s),
+            of.degree + 1,
+            BASES.index(of.basis),
+            self.theta / self.unit,
+            of.order,
+            head,
+            share,
+            (self.schedule.middle - level) / size,
+            self.schedule.half / size,
+        )
+        out: Array = self.y_level + self.y_scale * found[:, None]
+        out[:head] = whole[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """Return how far scheduling signal and regressors are from those of the training.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, 1), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+            The larger of: distance of p from the middle of its range, over half the range; that of `networks.cloud`.
+            The first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        s = self.scheduling(u, y)
+        out = np.full(ys.shape[0], np.nan)
+        x = regressors(self.shape, ys[:, 0], us, s)
+        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), self.cloud.novelty(x))
+        return out
+
+    def scheduling(self, u: Array, y: Array) -> Array:
+        """Return the scheduling signal, scaled: -1 to 1 in training.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, 1), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+        """
+        p = self.schedule.signal(np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64), self.dt)
+        return self.schedule.scaled(p)
+
+    def _part(self, u: Array, y: Array) -> Part:
+        ys, us = scaled(self, u, y)
+        return part_of(self.shape, ys[:, 0], us, self.scheduling(u, y))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that `from_json` needs.
+
+        Returns
+        -------
+        dict
+        """
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        return {
+            "dt_s": self.dt,
+            "n_inputs": self.n_inputs,
+            "shape": {**asdict(self.shape), "columns": list(self.shape.columns)},
+            "schedule": asdict(self.schedule),
+            **arrays,
+            "cloud": self.cloud.as_json(),
+        }
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back.
+
+        Parameters
+        ----------
+        found : dict
+            That `as_json` made.
+
+        Returns
+        -------
+        LpvModel
+
+        Raises
+        ------
+        EstimationError
+            If something is missing or of another shape.
+        """
+        try:
+            return cls(**_read(found))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise EstimationError(f"no LPV model ({type(error).__name__}: {error}). Write the file again") from error
+
+
+def _read(found: Mapping[str, Any]) -> dict[str, Any]:
+    """What the model is made with, checked."""
+    m, words = int(found["n_inputs"]), ("form", "basis")
+    sizes: dict[str, Any] = {k: int(v) for k, v in found["shape"].items() if k not in ("columns", *words)}
+    columns = tuple(int(k) for k in found["shape"]["columns"])
+    texts: dict[str, Any] = {k: str(found["shape"][k]) for k in words}
+    shape = LpvShape(columns=columns, **sizes, **texts)
+    schedule = Schedule(**found["schedule"])
+    if shape.basis not in BASES or shape.form not in ("equation", "output") or not schedule.high > schedule.low:
+        raise ValueError("form, basis or range of the schedule make no sense")
+    if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes.values()) < 0:
+        raise ValueError("columns or orders make no sense")
+    n = {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": 1, "y_scale": 1}
+    arrays: dict[str, Any] = {k: finite(found[k], size, k) for k, size in n.items()}
+    cloud = Cloud.from_json(found["cloud"], shape.n_process)
+    return {"dt": float(found["dt_s"]), "n_inputs": m, "shape": shape, "schedule": schedule, "cloud": cloud, **arrays}
+
+
+def regressors(shape: LpvShape, y: Array, u: Array, s: Array) -> Array:
+    """Return what predictions depend on: past outputs, inputs, scheduling signal.
+
+    Parameters
+    ----------
+    shape : LpvShape
+    y : ndarray, shape (n_samples,), scaled
+    u : ndarray, shape (n_samples, n_inputs), scaled
+    s : ndarray, shape (n_samples,), scaled
+
+    Returns
+    -------
+    ndarray, shape (n_samples - lag, order + n_exciting nb + 1)
+    """
+    n, lag = y.size, shape.lag
+    if n <= lag:
+        return np.empty((0, shape.n_process))
+    past = [y[lag - k : n - k] for k in range(1, shape.order + 1)]
+    return np.column_stack([*past, shape.lagged_inputs(u)[lag:, :-1], s[lag:]])

@@ -1,0 +1,130 @@
+"""What the LPV estimator may be told, checked and completed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.lpv.schedule import BASES, LEVEL, schedule_column
+from ambid.identify.networks.settings import checked
+
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "order": (1, 10),
+    "error_order": (0, 20),
+    "nb": (0, 50),
+    "nk": (0, 1000),
+    "degree": (0, 8),
+    "error_degree": (0, 8),
+    "time_constant": (0.0, 1e9),
+    "iterations": (1, 2000),
+}
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "error_form": ("auto", "ar", "ma", "arma"),
+    "form": ("auto", "equation", "output"),
+    "basis": BASES,
+    "exciting": ("no", "yes"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpvSettings:
+    """Settings of an LPV fit; described in the register of structures. None: to be chosen.
+
+    Attributes
+    ----------
+    order, error_order, nb, nk, error_degree, iterations : int
+    degree : int or None
+    error_form, form, basis, schedule, exciting : str
+    time_constant : float or None, s
+    column : int
+        Which input the schedule names; -1 for the output.
+    columns : tuple of int
+        Which inputs excite.
+    """
+
+    order: int
+    error_order: int
+    nb: int
+    nk: int
+    degree: int | None
+    error_degree: int
+    error_form: str
+    form: str
+    basis: str
+    schedule: str
+    exciting: str
+    time_constant: float | None
+    iterations: int
+    column: int
+    columns: tuple[int, ...]
+
+    def as_mapping(self) -> dict[str, object]:
+        """Return the settings by the names that the register has for them; those left open are missing.
+
+        Returns
+        -------
+        dict
+        """
+        names = (*_RANGES, *_CHOICES, "schedule")
+        return {k: v for k in names if (v := getattr(self, k)) is not None}
+
+
+def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
+    """Check settings and complete them.
+
+    Parameters
+    ----------
+    given : Mapping[str, object]
+    first : IOData
+        One of the records.
+
+    Returns
+    -------
+    LpvSettings
+
+    Raises
+    ------
+    EstimationError
+        If one is not known, has no such value, or makes no sense with these channels.
+    """
+    name = given.get("schedule", LEVEL)
+    s: dict[str, Any] = checked("lpv", given, _RANGES, {**_CHOICES, "schedule": (str(name),)})
+    if first.n_outputs != 1:
+        raise EstimationError(
+            f"lpv takes one output, not {', '.join(first.outputs)}; fit them one after the other, with the same "
+            "schedule. Name one"
+        )
+    name = str(name)
+    column = schedule_column(name, first)
+    if "exciting" in s and column < 0:
+        raise EstimationError(
+            f"lpv: exciting = {s['exciting']} says whether the scheduling input excites, but schedule = {name} is "
+            "none. Leave it out"
+        )
+    if "time_constant" in s and name != LEVEL:
+        raise EstimationError(
+            f"lpv: time_constant is that of schedule = level; with schedule = {name} the column is taken as it is. "
+            "Leave it out"
+        )
+    excites = s.get("exciting", "no") == "yes"
+    order = int(s.get("order", 2))
+    return LpvSettings(
+        order=order,
+        error_order=int(s.get("error_order", 5)),
+        nb=int(s.get("nb", order)),
+        nk=int(s.get("nk", 1)),
+        degree=s.get("degree"),
+        error_degree=int(s.get("error_degree", 0)),
+        error_form=str(s.get("error_form", "auto")),
+        form=str(s.get("form", "auto")),
+        basis=str(s.get("basis", "legendre")),
+        schedule=name,
+        exciting="yes" if excites else "no",
+        time_constant=s.get("time_constant") if name == LEVEL else 0.0,
+        iterations=int(s.get("iterations", 60)),
+        column=column,
+        columns=tuple(k for k in range(first.n_inputs) if k != column or excites),
+    )

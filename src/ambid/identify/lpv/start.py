@@ -1,0 +1,139 @@
+"""Starts of an LPV fit by least squares: without an error model, and with the innovations of an earlier one.
+
+The second is the pseudo-linear regression of extended least squares (Ljung 1999, sec. 10.1): with v and e of an earlier
+fit in place of the true ones, the predictor is linear in all coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.lpv.shape import LpvShape, Part, errors
+from ambid.identify.networks.search import triangle_of
+
+Array = NDArray[np.float64]
+
+_BLIND = 1e-10
+
+
+def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> tuple[Array, float]:
+    """Fit A y = B u + c + e, all coefficients functions of p.
+
+    Parameters
+    ----------
+    shape : LpvShape
+    parts : sequence of Part
+        Made for it.
+    first : int
+        Equations count from this sample on.
+
+    Returns
+    -------
+    theta : ndarray, shape (n_theta,), scaled
+        The error model is left at zero.
+    cost : float
+        Sum of squared errors.
+    """
+    n = shape.n_process * (shape.degree + 1)
+    found, cost = _solved([_process_rows(shape, p, p.y, first) for p in parts], [p.y[first:] for p in parts])
+    theta = np.zeros(shape.n_theta)
+    theta[:n] = found
+    return theta, cost
+
+
+def from_earlier(shape: LpvShape, parts: Sequence[Part], first: int, old: LpvShape, theta: Array) -> Array | None:
+    """Fit all coefficients with errors and innovations of an earlier model in place of the true ones.
+
+    Parameters
+    ----------
+    shape : LpvShape
+    parts : sequence of Part
+        Made for it.
+    first : int
+        Equations count from this sample on.
+    old : LpvShape
+        Of the same degrees and basis.
+    theta : ndarray, shape (n_theta of old,), scaled
+
+    Returns
+    -------
+    ndarray, shape (n_theta,), scaled; or None
+        None where the earlier model diverges.
+    """
+    rows, targets = [], []
+    for part in parts:
+        found = errors(old, part, theta)
+        if not found.finite:
+            return None
+        v = part.y - found.x
+        n = part.y.size
+        by = [_process_rows(shape, part, found.x if shape.form == "output" else part.y, first)]
+        for signal, size in ((-v, shape.ar), (found.e, shape.ma)):
+            by += [signal[first - k : n - k, None] * part.psi[first:] for k in range(1, size + 1)]
+        rows.append(np.hstack(by))
+        targets.append(part.y[first:])
+    found_theta, _ = _solved(rows, targets)
+    return found_theta if np.all(np.isfinite(found_theta)) else None
+
+
+def padded(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
+    """Carry a model over to one with more functions of p, or with another error model, where both agree.
+
+    Parameters
+    ----------
+    shape : LpvShape
+        Legendre polynomials, or as many functions as before.
+    old : LpvShape
+    theta : ndarray, shape (n_theta of old,)
+
+    Returns
+    -------
+    ndarray, shape (n_theta,)
+        Zeros where the old model has nothing.
+    """
+    out = np.zeros(shape.n_theta)
+    known = {name: k for k, name in enumerate(old.coefficients)}
+    for k, name in enumerate(shape.coefficients):
+        if name in known:
+            source, target = theta[old.place(known[name])], shape.place(k)
+            n = min(source.size, target.stop - target.start)
+            out[target.start : target.start + n] = source[:n]
+    return out
+
+
+def without_error_model(shape: LpvShape) -> LpvShape:
+    """Return the same equation with white errors.
+
+    Parameters
+    ----------
+    shape : LpvShape
+
+    Returns
+    -------
+    LpvShape
+    """
+    return replace(shape, ar=0, ma=0, form="equation")
+
+
+def _process_rows(shape: LpvShape, part: Part, z: Array, first: int) -> Array:
+    """Regressors of A, B and the constant from sample `first` on."""
+    n = part.y.size
+    phi = part.phi[first:]
+    by = [-z[first - k : n - k, None] * phi for k in range(1, shape.order + 1)]
+    by += [part.W[first:, i, None] * phi for i in range(part.W.shape[1])]
+    return np.hstack(by)
+
+
+def _solved(rows: Sequence[Array], targets: Sequence[Array]) -> tuple[Array, float]:
+    """Least squares on columns of unit length, by QR and singular values."""
+    R = triangle_of([np.column_stack([X, t]) for X, t in zip(rows, targets, strict=True)])
+    if not np.all(np.isfinite(R)):
+        return np.zeros(R.shape[1] - 1), np.inf
+    size = np.maximum(np.linalg.norm(R[:, :-1], axis=0), 1e-150)
+    found = np.linalg.lstsq(R[:, :-1] / size, R[:, -1], rcond=_BLIND)[0]
+    rest = R[:, -1] - (R[:, :-1] / size) @ found
+    return found / size, float(rest @ rest)
