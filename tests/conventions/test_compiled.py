@@ -19,14 +19,22 @@ def compiled_functions(tree: ast.Module) -> Iterator[str]:
             yield f"{node.name}-{min(d.lineno for d in node.decorator_list)}"
 
 
+def compiled_here(tree: ast.Module) -> set[str]:
+    """Return the names that a file compiles itself: ``compiled = njit(...)(name)``, plain code of another file."""
+    calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func))
+    return {arg.id for call in calls for arg in call.args if isinstance(arg, ast.Name)}
+
+
 def taken_in(path: Path) -> list[Path]:
     """Return the other files with compiled code from which a file imports, and theirs."""
     found: list[Path] = []
+    here = compiled_here(parsed(path))
     for node in parsed(path).body:
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("ambid."):
             for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
                 other = MODULES.get(name)
-                if other is not None and any(compiled_functions(parsed(other))):
+                wrapped = any(alias.name in here for alias in node.names)
+                if other is not None and (wrapped or any(compiled_functions(parsed(other)))):
                     found += [other, *taken_in(other)]
     return found
 
@@ -51,6 +59,8 @@ def test_what_is_taken_in_and_when_it_is_stale_is_seen(tmp_path: Path) -> None:
     joint = MODULES["ambid.track.joint._kernels"]
     assert MODULES["ambid.track.joint._square_root"] in taken_in(joint)
     assert MODULES["ambid.track.fusion._watch_kernels"] in taken_in(MODULES["ambid.track.fusion._kernels"])
+    bearing = MODULES["ambid.identify.nonlinear_bearing._kernels"]
+    assert MODULES["ambid.physics.coenergy_law"] in taken_in(bearing)  # plain there, compiled here
     kernel, other = tmp_path / "_kernels.py", tmp_path / "_other.py"
     kernel.write_text("@njit(cache=True)\ndef run(x):\n    return x\n", encoding="utf-8")
     other.write_text("", encoding="utf-8")

@@ -1,5 +1,7 @@
 """The nonlinear loop: small signals, energy, order of convergence, touchdown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from ambid.physics.loop import Limits, Loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
+from ambid.physics.power_stage import PowerStage
 from ambid.physics.presets import Preset, preset
 from ambid.simulate import LinearPlant, simulate, simulate_preset
 
@@ -16,6 +19,15 @@ PAIR = NonlinearPlant(
     magnet=DifferentialPair(turns=138, area=470.3e-6, bias=1.0, gap=0.432e-3, half_angle=0.392, leakage=2e-3),
     m=4.0,
     R=0.0,
+)
+
+
+LOSSY = replace(
+    PAIR,
+    magnet=replace(PAIR.magnet, k_asym=0.1, bias_asym=0.05),
+    R=1.6,
+    c=30.0,
+    stage=PowerStage(v_drop=0.8, i_drop=0.3),
 )
 
 
@@ -41,17 +53,19 @@ def test_small_signals_are_linear(name: str, volts: float, order: int) -> None:
 
 
 def energy_error(plant: NonlinearPlant, start: list[float], voltage: float, rate: float, seconds: float) -> float:
-    """Relative error of stored energy against the electric work V times charge (charge by Simpson's rule)."""
+    """Relative error of stored energy against electric work less losses (integrals by Simpson's rule)."""
     n = round(seconds * rate) + 1
     point = OperatingPoint(position=start[0])
     done = simulate(
         plant, np.full(n, voltage), rate_hz=rate, seed=0, start=start, operating_point=point, loop=Loop(delay=0)
     )
     x = [tuple(map(float, row)) for row in (done.states[0], done.states[-1])]
-    i = done.states[:, 2]
-    charge = (i[0] + i[-1] + 4 * i[1:-1:2].sum() + 2 * i[2:-1:2].sum()) / (3 * rate)
+    v, i = done.states[:, 1], done.states[:, 2]
+    drop = np.array([plant.stage.drop(j) for j in i])
+    power = (voltage - drop - plant.R * i) * i - plant.c * v**2
+    work = (power[0] + power[-1] + 4 * power[1:-1:2].sum() + 2 * power[2:-1:2].sum()) / (3 * rate)
     gained = plant.energy((x[1][0], x[1][1], x[1][2])) - plant.energy((x[0][0], x[0][1], x[0][2]))
-    return abs(gained - voltage * charge) / (0.5 * plant.m * x[1][1] ** 2)
+    return float(abs(gained - work)) / (0.5 * plant.m * x[1][1] ** 2)
 
 
 @pytest.mark.parametrize(
@@ -61,6 +75,7 @@ def energy_error(plant: NonlinearPlant, start: list[float], voltage: float, rate
         (LOSSLESS, [0.010, 0.1, 0.5], 3.0, 1000.0, 0.02),
         (PAIR, [2e-5, 0.0, 0.1], 0.0, 5000.0, 0.008),
         (PAIR, [2e-5, -0.02, 0.1], 5.0, 5000.0, 0.008),
+        (LOSSY, [2e-5, -0.02, 0.1], 5.0, 5000.0, 0.008),
     ],
 )
 def test_energy_balance_holds_to_fourth_order(
@@ -132,3 +147,40 @@ def test_leaving_the_air_gap_is_an_error(name: str, volts: float) -> None:
     assert p.plant is not None
     with pytest.raises(ModelError, match=r"air gap or the finite numbers at sample \d+"):
         simulate(p.plant, np.full(4000, volts), rate_hz=p.rate_hz, seed=0, operating_point=p.operating_point)
+
+
+def test_an_eddy_pole_lags_the_force() -> None:
+    p = preset("unstable-bearing")
+    u = np.repeat(np.random.default_rng(1).choice([-4.0, 4.0], 50), 20)
+    runs = {}
+    for pole in (np.inf, 2e5, 2000.0):
+        plant = replace(p.plant, eddy_pole=pole)
+        runs[pole] = simulate(
+            plant, u, rate_hz=p.rate_hz, seed=0, loop=p.loop, operating_point=p.operating_point, substeps=20
+        )
+        assert runs[pole].states.shape == (1000, 3)
+    # a very fast pole is a delay of the force by 1/a; a slow one is another plant
+    size = np.abs(runs[np.inf].states).max(axis=0)
+    assert np.all(np.abs(runs[2e5].states - runs[np.inf].states).max(axis=0) < 0.02 * size)
+    assert np.all(np.abs(runs[2000.0].states - runs[np.inf].states).max(axis=0) > 0.05 * size)
+    # p' = a (f - p): a plant held at rest by its own force stays there
+    still = simulate(replace(p.plant, eddy_pole=2000.0), np.zeros(50), rate_hz=p.rate_hz, seed=0, loop=p.loop)
+    assert np.abs(still.states).max() < 1e-12
+
+
+def test_the_stage_limits_and_drops_what_the_log_does_not_show() -> None:
+    p = preset("levitated-ball")
+    stage = PowerStage(limits=(0.0, 5.0), v_drop=0.6, i_drop=0.05)
+    settings = {"rate_hz": 2000.0, "seed": 0, "start": [0.010, 0.0, 0.95], "operating_point": p.operating_point}
+    u = np.repeat([7.0, 4.5, -3.0], 10)
+    lossy = simulate(replace(p.plant, stage=stage), u - p.operating_point.voltage, **settings)
+    assert lossy.record["voltage"] == pytest.approx(u)  # the command, beyond what the stage can give
+    i = lossy.states[:, 2]
+    same = np.clip(u, 0.0, 5.0) - 0.6 * np.tanh(i / 0.05)
+    straight = simulate(p.plant, same - p.operating_point.voltage, **settings)
+    assert lossy.states == pytest.approx(straight.states, rel=1e-3, abs=1e-6)
+    assert stage.slope(0.0) == pytest.approx(12.0)
+    h = 1e-20
+    assert stage.slope(0.03) == pytest.approx(stage.drop(0.03 + 1j * h).imag / h, rel=1e-12)
+    with pytest.raises(ModelError, match="i_drop"):
+        PowerStage(i_drop=0.0)

@@ -1,6 +1,8 @@
 """The nonlinear one-axis plant: voltage-driven magnet, mass, gravity (thesis eq. 4.9 in physical form).
 
 m x'' = f(x, i) - c x' + m g,  V = R i + dlambda(x, i)/dt, with f and lambda from one co-energy (`physics.magnet`).
+With an eddy pole a the force that acts is p, p' = a (f(x, i) - p) (thesis eq. 1.4). The stage of `physics.power_stage`
+may stand between the voltage that is commanded and V.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from typing import NamedTuple
 
 from ambid.errors import ModelError
 from ambid.physics.magnet import Magnet, Number
+from ambid.physics.power_stage import IDEAL, PowerStage
 
 
 class OperatingPoint(NamedTuple):
@@ -43,6 +46,10 @@ class NonlinearPlant:
         Mechanical damping in N s/m.
     gravity : float
         Gravity along +x in m/s^2; 0 for a horizontal axis.
+    eddy_pole : float
+        Pole a in rad/s of the eddy currents between current and force; infinite for none.
+    stage : PowerStage
+        What the amplifier makes of its command.
     """
 
     magnet: Magnet
@@ -50,6 +57,8 @@ class NonlinearPlant:
     R: float
     c: float = 0.0
     gravity: float = 0.0
+    eddy_pole: float = math.inf
+    stage: PowerStage = IDEAL
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.m) and self.m > 0.0):
@@ -59,18 +68,20 @@ class NonlinearPlant:
                 raise ModelError(f"{name} is {value} {unit}; it must be zero or positive. Correct {name}")
         if not math.isfinite(self.gravity):
             raise ModelError(f"gravity is {self.gravity} m/s^2; it must be a finite number. Correct gravity")
+        if not self.eddy_pole > 0.0:
+            raise ModelError(f"eddy_pole is {self.eddy_pole} rad/s; it must be positive. Give inf for none")
 
     def derivative(
         self, state: tuple[Number, Number, Number], voltage: Number, force: float = 0.0
     ) -> tuple[Number, Number, Number]:
-        """Return the right-hand side of the state equation.
+        """Return the right-hand side of the state equation, without eddy pole and stage.
 
         Parameters
         ----------
         state : tuple
             Position in m, velocity in m/s, current in A.
         voltage : float
-            Axis voltage in V.
+            Axis voltage in V, as the coil gets it.
         force : float
             Disturbing force along +x in N.
 
@@ -95,7 +106,7 @@ class NonlinearPlant:
         Returns
         -------
         OperatingPoint
-            Position in m, current in A and voltage in V.
+            Position in m, current in A and commanded voltage in V.
 
         Raises
         ------
@@ -103,10 +114,12 @@ class NonlinearPlant:
             If the position closes a gap or the magnet cannot hold the load there.
         """
         current = self.magnet.holding_current(position, self.m * self.gravity)
-        return OperatingPoint(position, current, self.R * current)
+        return OperatingPoint(position, current, self.R * current + self.stage.drop(current))
 
     def linearise(self, position: float) -> dict[str, float]:
         """Return the parameters of the linear model ``one-axis`` at the rest point (thesis eq. 4.8).
+
+        R holds what the stage's drop adds to it there; the eddy pole is left out.
 
         Parameters
         ----------
@@ -124,7 +137,7 @@ class NonlinearPlant:
             "m": self.m,
             "k_x": w.displacement_coefficient(x, i),
             "k_i": w.force_per_current(x, i),
-            "R": self.R,
+            "R": self.R + self.stage.slope(i),
             "L": w.inductance(x),
             "c": self.c,
         }

@@ -14,36 +14,44 @@ Integers = NDArray[np.int64]
 
 @njit(cache=True, nogil=True)
 def rate_of_change(
-    x: float, v: float, i: float, voltage: float, force: float, magnet: Array, body: Array
-) -> tuple[float, float]:
-    """Return x'' and i' of the nonlinear plant (`ambid.physics.magnet.CoEnergy`)."""
+    x: float, v: float, i: float, p: float, voltage: float, force: float, magnet: Array, body: Array
+) -> tuple[float, float, float]:
+    """Return x'', i' and p' of the nonlinear plant (`ambid.physics.magnet.CoEnergy`); p lags the force."""
+    j = magnet[6] + i
     gap_a, gap_b = 1.0 / (magnet[1] - x), 1.0 / (magnet[3] + x)
-    flux_a, flux_b = (magnet[4] + i) * gap_a, (magnet[4] - i) * gap_b
+    flux_a, flux_b = (magnet[4] + j) * gap_a, (magnet[4] - j) * gap_b
     pull = 0.5 * (magnet[0] * flux_a * flux_a - magnet[2] * flux_b * flux_b)
     motional = magnet[0] * flux_a * gap_a + magnet[2] * flux_b * gap_b
     inductance = magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
+    lag = 0.0
+    if body[4] < math.inf:
+        lag = body[4] * (pull - p)
+        pull = p
     acceleration = (pull - body[1] * v + force) / body[0] + body[3]
-    return acceleration, (voltage - body[2] * i - motional * v) / inductance
+    if body[5] != 0.0:
+        voltage -= body[5] * math.tanh(i / body[6])
+    return acceleration, (voltage - body[2] * i - motional * v) / inductance, lag
 
 
 @njit(cache=True, nogil=True)
 def runge_kutta(
-    x: float, v: float, i: float, voltage: float, force: float, h: float, magnet: Array, body: Array
-) -> tuple[float, float, float]:
-    """Return position, velocity and current one classical fourth-order step of `h` s later."""
+    x: float, v: float, i: float, p: float, voltage: float, force: float, h: float, magnet: Array, body: Array
+) -> tuple[float, float, float, float]:
+    """Return position, velocity, current and lagging force one classical fourth-order step of `h` s later."""
     v1 = v
-    a1, c1 = rate_of_change(x, v, i, voltage, force, magnet, body)
+    a1, c1, p1 = rate_of_change(x, v, i, p, voltage, force, magnet, body)
     v2 = v + 0.5 * h * a1
-    a2, c2 = rate_of_change(x + 0.5 * h * v1, v2, i + 0.5 * h * c1, voltage, force, magnet, body)
+    a2, c2, p2 = rate_of_change(x + 0.5 * h * v1, v2, i + 0.5 * h * c1, p + 0.5 * h * p1, voltage, force, magnet, body)
     v3 = v + 0.5 * h * a2
-    a3, c3 = rate_of_change(x + 0.5 * h * v2, v3, i + 0.5 * h * c2, voltage, force, magnet, body)
+    a3, c3, p3 = rate_of_change(x + 0.5 * h * v2, v3, i + 0.5 * h * c2, p + 0.5 * h * p2, voltage, force, magnet, body)
     v4 = v + h * a3
-    a4, c4 = rate_of_change(x + h * v3, v4, i + h * c3, voltage, force, magnet, body)
+    a4, c4, p4 = rate_of_change(x + h * v3, v4, i + h * c3, p + h * p3, voltage, force, magnet, body)
     sixth = h / 6.0
     return (
         x + sixth * (v1 + 2.0 * (v2 + v3) + v4),
         v + sixth * (a1 + 2.0 * (a2 + a3) + a4),
         i + sixth * (c1 + 2.0 * (c2 + c3) + c4),
+        p + sixth * (p1 + 2.0 * (p2 + p3) + p4),
     )
 
 
@@ -80,17 +88,20 @@ def advance_nonlinear(
     """Carry the state over one sample in place: first under the voltage `late`, then under `now`."""
     touched = False
     p, v, i = x[0], x[1], x[2]
+    lagging = x[3] if x.size > 3 else 0.0
     for part in range(2):
         length = period * (fraction if part == 0 else 1.0 - fraction)
         if length == 0.0:
             continue
-        voltage = (late if part == 0 else now) + disturbance[1]
+        voltage = min(max(late if part == 0 else now, body[7]), body[8]) + disturbance[1]
         h = length / substeps
         for _ in range(substeps):
-            p, v, i = runge_kutta(p, v, i, voltage, disturbance[0], h, magnet, body)
+            p, v, i, lagging = runge_kutta(p, v, i, lagging, voltage, disturbance[0], h, magnet, body)
             p, v, hit = stop(p, v, low, high)
             touched = touched or hit
     x[0], x[1], x[2] = p, v, i
+    if x.size > 3:
+        x[3] = lagging
     return touched
 
 

@@ -127,7 +127,7 @@ def simulate(
     setpoint : array_like, shape () or (n_samples,), in m, optional
         Wanted position; default the operating point's.
     start : array_like, shape (n_states,), optional
-        Initial state; default at rest at the operating point.
+        Initial state; default at rest at the operating point. With an eddy pole its force comes last.
     substeps : int
         Runge-Kutta steps in each sample (nonlinear only).
 
@@ -184,7 +184,7 @@ def simulate(
     settings = {"rate_hz": rate_hz, "loop": written(loop), "noise": written(noise), "limits": written(limits)}
     return Simulation(
         record=logged(standing, command, measured, rate_hz, seed, settings),
-        states=states,
+        states=states[:, : len(of.states)],
         state_names=of.states,
         truth=MappingProxyType(truth),
         first_contact=None if contact < 0 else contact,

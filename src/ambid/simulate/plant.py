@@ -60,7 +60,7 @@ class Standing:
     point : OperatingPoint
         Where it stands, SI.
     centre : Array, shape (n_states,), SI
-        The states at `point`.
+        The states at `point`; after those of the model the force behind the eddy pole, where there is one.
     centre_input : float
         The input at `point`, SI.
     """
@@ -74,16 +74,19 @@ class Standing:
     @classmethod
     def of(cls, plant: LinearPlant | NonlinearPlant, point: OperatingPoint | None) -> Standing:
         """Return `plant` at `point`, by default at rest at zero."""
+        more: list[float] = []
         if isinstance(plant, LinearPlant):
             of, point = plant.model, point or OperatingPoint()
         else:
             of, point = model("one-axis"), point or plant.equilibrium(0.0)
+            if math.isfinite(plant.eddy_pole):
+                more = [plant.magnet.coenergy.force(point.position, point.current)]
         known = {"position": point.position, "velocity": 0.0, "current": point.current, "voltage": point.voltage}
         return cls(
             plant=plant,
             model=of,
             point=point,
-            centre=np.array([known[s] for s in of.states]),
+            centre=np.array([known[s] for s in of.states] + more),
             centre_input=known[of.inputs[0]],
         )
 
@@ -125,8 +128,15 @@ class Standing:
         return full, now, late, noise
 
     def nonlinear(self) -> tuple[Array, Array]:
-        """Return the co-energy's numbers, shape (6,), and m, c, R, gravity, shape (4,); zeros for a linear plant."""
+        """Return the numbers of co-energy, shape (7,), and of body and stage, shape (9,); zeros for a linear plant.
+
+        Body and stage are m, c, R, gravity, eddy pole, v_drop, i_drop, and the stage's limits.
+        """
         if isinstance(self.plant, LinearPlant):
-            return np.zeros(6), np.zeros(4)
+            return np.zeros(7), np.zeros(9)
         w, p = self.plant.magnet.coenergy, self.plant
-        return np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage]), np.array([p.m, p.c, p.R, p.gravity])
+        stage = p.stage
+        return (
+            np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage, w.i0_asym]),
+            np.array([p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits]),
+        )

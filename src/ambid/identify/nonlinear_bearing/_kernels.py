@@ -1,30 +1,36 @@
 """The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
 
-Physical numbers `theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and
-the delay beyond `whole` samples. Columns of all sensitivities: the active ones of these, then the log noise levels.
+Physical numbers `theta` (20) as in `_plant_kernels`. Columns of all sensitivities: the active ones of these, then the
+log noise levels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ambid.physics.coenergy_law import coenergy_derivatives
+from ambid.identify.nonlinear_bearing._plant_kernels import (
+    DAMPING,
+    I_DROP,
+    LATE,
+    MAGNET,
+    MASS,
+    N_NUMBERS,
+    POLE,
+    RESISTANCE,
+    V_DROP,
+    V_OFF,
+    X_OFF,
+    drop_of,
+    rates,
+)
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
-_MAGNET = 9
-_M, _R, _C, _G, _POLE, _X_OFF, _I_OFF, _V_OFF, _V_DROP, _I_DROP, _LATE = range(_MAGNET, _MAGNET + 11)
-_ALL = _LATE + 1
-
-# Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
-_energy: Callable[..., None] = njit(cache=True, nogil=True)(coenergy_derivatives)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -61,75 +67,6 @@ def _sum(x: Array, factor: float, y: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _stage(i: float, th: Array) -> tuple[float, float, float]:
-    """Return what transistors and diodes take of the voltage at a current, its slope, and the slope over v_drop."""
-    if th[_V_DROP] == 0.0:
-        t = math.tanh(i / th[_I_DROP])
-        return 0.0, 0.0, (1.0 - t * t) / th[_I_DROP]
-    t = math.tanh(i / th[_I_DROP])
-    c = (1.0 - t * t) / th[_I_DROP]
-    return th[_V_DROP] * t, th[_V_DROP] * c, c
-
-
-@njit(cache=True, nogil=True)
-def _rates(z: Array, volt: Array, th: Array, flags: Flags, w: Array, dw: Array, g: Array, A: Array, G: Array) -> None:
-    """Write the right-hand side g (n,), its Jacobian A (n, n), and its derivatives G (n, 20) by `theta`.
-
-    `volt` is the voltage and its derivative by the delay. Position, velocity and current, then the force behind the
-    eddy pole, then a drifting force, where `flags` (exponential, pair, eddy, drift, locked) have them.
-    """
-    for a in range(g.size):
-        g[a] = 0.0
-        for b in range(g.size):
-            A[a, b] = 0.0
-        for b in range(_ALL):
-            G[a, b] = 0.0
-    x, v, i = z[0], z[1], z[2]
-    _energy(x, i, th, flags[0], flags[1], w, dw)
-    m, ell = th[_M], w[3]
-    if not flags[4]:
-        pull = z[3] if flags[2] else w[0]
-        net = pull - th[_C] * v
-        last = g.size - 1
-        if flags[3]:
-            net += z[last]
-            A[1, last] = 1.0 / m
-        g[0] = v
-        g[1] = net / m + th[_G]
-        A[0, 1] = 1.0
-        A[1, 1] = -th[_C] / m
-        if flags[2]:
-            A[1, 3] = 1.0 / m
-        else:
-            A[1, 0] = w[1] / m
-            A[1, 2] = w[2] / m
-            for q in range(_MAGNET):
-                G[1, q] = dw[0, q] / m
-        G[1, _M] = -net / m**2
-        G[1, _C] = -v / m
-        G[1, _G] = 1.0
-    drop, steep, c = _stage(i, th)
-    rate = (volt[0] + th[_V_OFF] - drop - th[_R] * i - w[2] * v) / ell
-    g[2] = rate
-    A[2, 0] = (-w[5] * v - rate * w[6]) / ell
-    A[2, 1] = -w[2] / ell
-    A[2, 2] = (-th[_R] - steep - w[6] * v - rate * w[7]) / ell
-    for q in range(_MAGNET):
-        G[2, q] = (-dw[2, q] * v - rate * dw[3, q]) / ell
-    G[2, _R] = -i / ell
-    G[2, _V_OFF] = 1.0 / ell
-    G[2, _V_DROP] = -math.tanh(i / th[_I_DROP]) / ell
-    G[2, _I_DROP] = th[_V_DROP] * c * i / th[_I_DROP] / ell
-    G[2, _LATE] = volt[1] / ell
-    if flags[2]:
-        g[3] = th[_POLE] * (w[0] - z[3])
-        A[3, 0], A[3, 2], A[3, 3] = th[_POLE] * w[1], th[_POLE] * w[2], -th[_POLE]
-        for q in range(_MAGNET):
-            G[3, q] = th[_POLE] * dw[0, q]
-        G[3, _POLE] = w[0] - z[3]
-
-
-@njit(cache=True, nogil=True)
 def _advance(
     z: Array, S: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
     steps: int, slopes: bool, w: Array, dw: Array, g: Array, A: Array, G: Array, room: Array,
@@ -156,7 +93,7 @@ def _advance(
             volt[1] = volts[2] + volts[3] * where
             for a in range(n):
                 at[a] = z[a] + forth * g[a]
-            _rates(at, volt, th, flags, w, dw, g, A, G)
+            rates(at, volt, th, flags, w, dw, g, A, G)
             for a in range(n):
                 to[a] += weight * g[a]
             if slopes:
@@ -180,12 +117,12 @@ def _bend(
 ) -> None:  # fmt: skip
     """Write the total derivatives of A and E of `_spread` by all numbers: by themselves, and through the state."""
     n, p, n_a = S.shape[0], S.shape[2], active.size
-    m, ell, last, rate, v, i = th[_M], w[3], n - 1, g[2], z[1], z[2]
+    m, ell, last, rate, v, i = th[MASS], w[3], n - 1, g[2], z[1], z[2]
     push = 3 if flags[2] else 1
-    gain = th[_POLE] if flags[2] else 1.0 / m
+    gain = th[POLE] if flags[2] else 1.0 / m
     bf = 0.0 if flags[4] else 1.0 / m
-    _, steep, c = _stage(i, th)
-    t, wide = math.tanh(i / th[_I_DROP]), th[_I_DROP]
+    _, steep, c = drop_of(i, th)
+    t, wide = math.tanh(i / th[I_DROP]), th[I_DROP]
     _sum(dA, -1.0, dA, dA)
     for j in range(p):
         dx, dv, di = S[0, 0, j], S[1, 0, j], S[2, 0, j]
@@ -193,26 +130,26 @@ def _bend(
         f = chain[j] if j < n_a else 0.0
         xx, xi, ii = w[4] * dx + w[5] * di, w[5] * dx + w[6] * di, w[6] * dx + w[7] * di
         xxi, xii, iii = w[8] * dx + w[9] * di, w[9] * dx + w[10] * di, w[10] * dx + w[11] * di
-        if 0 <= q < _MAGNET:
+        if 0 <= q < MAGNET:
             xx, xi, ii = xx + dw[1, q] * f, xi + dw[2, q] * f, ii + dw[3, q] * f
             xxi, xii, iii = xxi + dw[4, q] * f, xii + dw[5, q] * f, iii + dw[6, q] * f
-        dm = f if q == _M else 0.0
-        dr, dc, da = f if q == _R else 0.0, f if q == _C else 0.0, f if q == _POLE else 0.0
-        d_drop, d_wide = f if q == _V_DROP else 0.0, f if q == _I_DROP else 0.0
-        d_volt = (f if q == _V_OFF else 0.0) + (volt[1] * f if q == _LATE else 0.0)
+        dm = f if q == MASS else 0.0
+        dr, dc, da = f if q == RESISTANCE else 0.0, f if q == DAMPING else 0.0, f if q == POLE else 0.0
+        d_drop, d_wide = f if q == V_DROP else 0.0, f if q == I_DROP else 0.0
+        d_volt = (f if q == V_OFF else 0.0) + (volt[1] * f if q == LATE else 0.0)
         d_drop_all = t * d_drop + steep * (di - i / wide * d_wide)
-        d_steep = c * d_drop + th[_V_DROP] * (-2.0 * t * c / wide * di + (2.0 * t * i / wide - 1.0) * c / wide * d_wide)
+        d_steep = c * d_drop + th[V_DROP] * (-2.0 * t * c / wide * di + (2.0 * t * i / wide - 1.0) * c / wide * d_wide)
         dgain = da if flags[2] else -dm / m**2
         if not flags[4]:
             dA[push, 0, j] += gain * xx + dgain * w[1]
             dA[push, 2, j] += gain * xi + dgain * w[2]
-            dA[1, 1, j] += -dc / m + th[_C] * dm / m**2
+            dA[1, 1, j] += -dc / m + th[DAMPING] * dm / m**2
             if flags[2]:
                 dA[1, 3, j] = -dm / m**2
                 dA[3, 3, j] = -da
             if flags[3]:
                 dA[1, last, j] = -dm / m**2
-        d_rate = (d_volt - d_drop_all - dr * i - th[_R] * di - xi * v - w[2] * dv - rate * ii) / ell
+        d_rate = (d_volt - d_drop_all - dr * i - th[RESISTANCE] * di - xi * v - w[2] * dv - rate * ii) / ell
         dA[2, 0, j] = (-xxi * v - w[5] * dv - d_rate * w[6] - rate * xii - A[2, 0] * ii) / ell
         dA[2, 1, j] = (-xi - A[2, 1] * ii) / ell
         dA[2, 2, j] = (-dr - d_steep - xii * v - w[6] * dv - d_rate * w[7] - rate * iii - A[2, 2] * ii) / ell
@@ -239,8 +176,8 @@ def _spread(
     n, p, n_a = z.size, S.shape[2], active.size
     volt = np.empty(2)
     volt[0], volt[1] = volts[0], volts[2]
-    _rates(z, volt, th, flags, w, dw, g, A, G)
-    m, ell, last = th[_M], w[3], n - 1
+    rates(z, volt, th, flags, w, dw, g, A, G)
+    m, ell, last = th[MASS], w[3], n - 1
     bf = 0.0 if flags[4] else 1.0 / m
     for a in range(n):
         for b in range(n):
@@ -360,25 +297,25 @@ def predict(
     """
     n, n_a = z.size, active.size
     p = n_a + 5
-    w, dw = np.zeros(12), np.zeros((7, _MAGNET))
-    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, _ALL))
+    w, dw = np.zeros(12), np.zeros((7, MAGNET))
+    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, N_NUMBERS))
     S, dP, room = np.zeros((n, 1, p)), np.zeros((n, n, p)), np.zeros((3, n, 1, p))
     dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
     F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
     col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
     none, q2 = np.zeros((2, p + 1)), np.zeros(3)
-    phi = th[_LATE]
+    phi = th[LATE]
     for k in range(first, u.size):
         for c in range(2):
             if not valid[k, c]:
                 continue
             at = 0 if c == 0 else 2
-            error = y[k, c] - z[at] - th[_X_OFF + c]
+            error = y[k, c] - z[at] - th[X_OFF + c]
             if slopes:
                 for j in range(p):
                     de[j] = -S[at, 0, j]
                 for j in range(n_a):
-                    if active[j] == _X_OFF + c:
+                    if active[j] == X_OFF + c:
                         de[j] -= chain[j]
                 # the derivative of the innovation is -(d prediction); the correction adds K (dy - dC z) = K de
             out = rows[4 * k + 2 * c : 4 * k + 2 * c + 2] if slopes else none

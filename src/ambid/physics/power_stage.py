@@ -1,0 +1,84 @@
+"""What a power stage makes of the voltage that it is told to give: limits, and a drop against the current.
+
+A transistor that conducts, a diode that carries on, and the dead time between two transistors all act against the
+current, whatever its size: the coil gets v = clip(u, low, high) - v_drop tanh(i/i_drop). For a dead time t_d of a half
+bridge on the supply V_s at the switching frequency f_s, v_drop is V_s t_d f_s (Jeong and Park 1991); drops of
+semiconductors add to it. The sign changes smoothly over i_drop, which is about the ripple of the current: within it,
+both signs occur in every period. For a pair, i is the current of the axis, so this is the stage of a differential
+winding; where each coil has its own stage and its current never changes sign, the drops are constant and cancel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.errors import ModelError
+from ambid.physics.loop import UNLIMITED, Interval
+from ambid.physics.magnet import Number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PowerStage:
+    """Limits and drop of a power stage.
+
+    Attributes
+    ----------
+    limits : (float, float)
+        Between which the supply lets the voltage be, in V. The logged command may lie beyond.
+    v_drop : float
+        Voltage in V that is lost against the current.
+    i_drop : float
+        Current in A over which that loss changes its sign.
+    """
+
+    limits: Interval = UNLIMITED
+    v_drop: float = 0.0
+    i_drop: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not self.limits[0] < self.limits[1]:
+            raise ModelError(
+                f"stage.limits is {self.limits} V; the lower must be below the upper. Swap or correct them"
+            )
+        if not math.isfinite(self.v_drop):
+            raise ModelError(f"stage.v_drop is {self.v_drop} V; it must be a finite number. Correct it")
+        if not (math.isfinite(self.i_drop) and self.i_drop > 0.0):
+            raise ModelError(f"stage.i_drop is {self.i_drop} A; it must be a positive number. Correct it")
+
+    def drop(self, current: Number) -> Number:
+        """Return the voltage that is lost.
+
+        Parameters
+        ----------
+        current : float or complex
+            In A.
+
+        Returns
+        -------
+        float or complex
+            In V.
+        """
+        lost: Number = self.v_drop * np.tanh(current / self.i_drop)
+        return lost
+
+    def slope(self, current: float) -> float:
+        """Return d(drop)/di: what the drop adds to the resistance at a current.
+
+        Parameters
+        ----------
+        current : float
+            In A.
+
+        Returns
+        -------
+        float
+            In ohm.
+        """
+        return self.v_drop / self.i_drop / math.cosh(min(abs(current / self.i_drop), 350.0)) ** 2
+
+
+IDEAL = PowerStage()
+"""Gives what it is told to."""
