@@ -17,7 +17,7 @@ from ambid.signals.outliers import find_outliers
 from ambid.signals.saturation import find_saturation
 from ambid.validate.agreement import Agreement
 from ambid.validate.plausibility import implausible
-from ambid.validate.residuals import ResidualTest, residuals_uncorrelated, residuals_white
+from ambid.validate.residuals import P_LEAST, ResidualTest, residuals_uncorrelated, residuals_white
 
 Array = NDArray[np.float64]
 
@@ -74,6 +74,21 @@ def _agreement_check(moved: Agreement) -> Check:
         values={"largest_shift_sd": moved.largest, "refits": float(len(moved.strides))},
         detail=detail,
     )
+
+
+def explained_by_inputs(*against_inputs: ResidualTest | None) -> bool:
+    """Return whether residuals hold a function of past inputs: then inputs depend on them without any feedback.
+
+    Parameters
+    ----------
+    *against_inputs : ResidualTest or None
+        Tests of residuals against past inputs, or functions of them; None for one that was not made.
+
+    Returns
+    -------
+    bool
+    """
+    return any(x is not None and x.p < P_LEAST for x in against_inputs)
 
 
 def residual_check(test: ResidualTest, what: str) -> Check:

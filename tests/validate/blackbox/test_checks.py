@@ -139,6 +139,33 @@ def test_a_wrong_model_alone_is_no_sign_of_feedback():
     assert fit.checks["feedback"].p > 1e-3
 
 
+def test_what_a_model_misses_is_not_called_a_loop_that_the_user_denies():
+    """A slow input goes on as it did, so that errors which hold a function of it tell what comes next."""
+    rng = np.random.default_rng(2)
+    u = np.convolve(rng.standard_normal(1540), np.ones(40) / 6, "valid")[:1500, None]
+    y = np.zeros((1500, 1))
+    for t in range(30, 1500):
+        y[t] = 0.6 * y[t - 1] + u[t - 1] + u[t - 30] + 0.05 * rng.standard_normal()
+    data = io(u, y, open_loop=True)
+    fit = judged(armax(data, {"na": 1, "nb": 1, "nc": 1, "nk": 1}), data)
+    assert fit.checks["feedback"].values["seen"] == 1.0
+    assert "what the model misses" in fit.checks["feedback"].detail
+    assert not any("open loop" in w for w in fit.warnings)
+
+
+def test_the_present_input_of_a_loop_is_no_sign_of_a_missing_delay():
+    """It depends on the present error, also where the user says that there is no loop."""
+    rng = np.random.default_rng(9)
+    u, y = np.zeros(2000), np.zeros(2000)
+    for k in range(1, 2000):
+        y[k] = 0.8 * y[k - 1] + 0.5 * u[k - 1] + 0.6 * rng.standard_normal()
+        u[k] = rng.standard_normal() - 0.4 * y[k]
+    data = io(u, y, open_loop=True)
+    fit = judged(armax(data, {"na": 1, "nb": 1, "nc": 1, "nk": 1}), data)
+    assert fit.checks["residuals_uncorrelated"].passed
+    assert any("leave --open-loop out" in w for w in fit.warnings)
+
+
 def test_a_periodic_input_says_nothing_of_feedback():
     t = np.arange(800.0)[:, None]
     u = np.sin(0.3 * t) + np.cos(1.1 * t)

@@ -10,7 +10,7 @@ from ambid.identify.blackbox.structures import structure
 from ambid.identify.estimate import Check
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.residual_tests import ResidualTests
-from ambid.validate.checks import residual_check
+from ambid.validate.checks import explained_by_inputs, residual_check
 from ambid.validate.residuals import P_LEAST
 
 
@@ -75,8 +75,8 @@ def _feedback(fit: BlackBoxFit, tests: ResidualTests) -> Check:
     seen, told = test.p < P_LEAST, f"input {tests.feedback_input!r} depends on past residuals"
     if not seen:
         detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
-    elif _explained_by_inputs(tests):
-        detail = f"{told}, which hold what inputs explain: there is feedback, or a nonlinearity that looks like it"
+    elif explained_by_inputs(tests.uncorrelated):
+        detail = f"{told}, which hold what inputs explain: feedback, or what the model misses"
     elif biased:
         detail = f"{told}: there is feedback, and {fit.structure} is biased by it"
     else:
@@ -87,11 +87,6 @@ def _feedback(fit: BlackBoxFit, tests: ResidualTests) -> Check:
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
         detail=f"{detail} (p = {test.p:.2g})",
     )
-
-
-def _explained_by_inputs(tests: ResidualTests) -> bool:
-    """Whether residuals hold a function of past inputs: then inputs depend on them without any feedback."""
-    return tests.uncorrelated is not None and tests.uncorrelated.p < P_LEAST
 
 
 def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> list[str]:
@@ -110,13 +105,14 @@ def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> li
     if tests.feedback is None or tests.feedback.p >= P_LEAST:
         return []
     evidence = f"input {tests.feedback_input!r} depends on past residuals (p = {tests.feedback.p:.2g})"
-    if structure(fit.structure).feedback == "biased":
-        if _explained_by_inputs(tests):
-            return [f"{evidence}: feedback, by which {fit.structure} is biased, or a nonlinearity that looks like it"]
+    biased, missed = structure(fit.structure).feedback == "biased", explained_by_inputs(tests.uncorrelated)
+    if biased:
+        if missed:
+            return [f"{evidence}: feedback, by which {fit.structure} is biased, or what the model misses"]
         return [
             f"there is feedback in this record: {evidence}; {fit.structure} is biased by it. Use bj, armax or pbsid"
         ]
-    if data.open_loop:
+    if data.open_loop and not missed:
         return [f"the record is said to be open loop, but {evidence}: leave --open-loop out"]
     return []
 

@@ -18,7 +18,7 @@ from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.gradient import Gradient
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
-from ambid.validate.residuals import ResidualTest
+from ambid.validate.residuals import P_LEAST, ResidualTest
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,9 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_refere
     )
     white_lags = tuple(k for k in WHITE_LAGS if k < e.shape[0] // 10) or (1,)
     white = [_tested(e[:, o], J, e, white_lags) for o, J in enumerate(slopes.rows)]
-    lags = input_lags(e.shape[0], with_now=data.open_loop)
+    loop = _feedback(u, e)
+    # Under feedback the present input may depend on the present residual, whatever the user says of the loop.
+    lags = input_lags(e.shape[0], with_now=data.open_loop and all(s.p * len(loop) >= P_LEAST for s, _ in loop))
     against = [
         _tested(
             e[:, o],
@@ -121,7 +123,6 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_refere
         for o, J in enumerate(slopes.rows)
         if data.n_inputs
     ]
-    loop = _feedback(u, e)
     k, j, i = (int(np.argmin([s.p for s, _ in x])) if x else 0 for x in (white, against, loop))
     return ResidualTests(
         white=_worst(white, k),

@@ -10,7 +10,7 @@ from ambid.identify.blackbox.data import IOData
 from ambid.identify.estimate import Check
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.identify.nonlinear.structures import nonlinear_structure
-from ambid.validate.checks import residual_check
+from ambid.validate.checks import explained_by_inputs, residual_check
 from ambid.validate.nonlinear.residual_tests import NonlinearTests
 from ambid.validate.nonlinear.runs import Run
 from ambid.validate.residuals import P_LEAST, ResidualTest
@@ -110,7 +110,7 @@ def _feedback(fit: NonlinearFit, tests: NonlinearTests, *, coloured: bool) -> Ch
     seen = test.p < P_LEAST
     if not seen:
         detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
-    elif explained_by_inputs(tests):
+    elif explained_by_inputs(tests.uncorrelated, tests.squares):
         detail = "inputs depend on past residuals, which hold what inputs explain: feedback, or what the model misses"
     elif biased:
         detail = f"inputs depend on past residuals: there is feedback, and this {fit.structure} is biased by it"
@@ -122,20 +122,6 @@ def _feedback(fit: NonlinearFit, tests: NonlinearTests, *, coloured: bool) -> Ch
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
         detail=f"{detail} (p = {test.p:.2g})",
     )
-
-
-def explained_by_inputs(tests: NonlinearTests) -> bool:
-    """Return whether residuals hold a function of past inputs: then inputs depend on them without any feedback.
-
-    Parameters
-    ----------
-    tests : NonlinearTests
-
-    Returns
-    -------
-    bool
-    """
-    return any(x is not None and x.p < P_LEAST for x in (tests.uncorrelated, tests.squares))
 
 
 def feedback_warnings(
@@ -160,7 +146,7 @@ def feedback_warnings(
         return []
     told_open = all(x.open_loop for x in records)
     seen = tests is not None and tests.feedback is not None and tests.feedback.p < P_LEAST
-    if seen and told_open and tests is not None and not explained_by_inputs(tests):
+    if seen and told_open and tests is not None and not explained_by_inputs(tests.uncorrelated, tests.squares):
         return ["the records are said to be open loop, but inputs depend on past residuals: leave --open-loop out"]
     said = any("biased" in x and "open loop" in x for x in fit.warnings)
     if told_open or said or not feedback_biases(fit, coloured=coloured):
