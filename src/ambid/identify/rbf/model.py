@@ -1,0 +1,235 @@
+"""A network of radial basis functions with its scaling and its training cloud (implements `NonlinearModel`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.networks.cloud import Cloud
+from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.signals import scaled, with_head
+from ambid.identify.rbf.shape import RbfShape
+from ambid.identify.rbf.units import UNITS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RbfNetwork:
+    """A network of radial basis functions; the function is that of `RbfShape`, on scaled signals.
+
+    Attributes
+    ----------
+    dt : float
+        s.
+    shape : RbfShape
+    theta : ndarray, shape (n_theta,)
+        Output weights, centres, logarithms of widths, for signals in deviations from `*_level` divided by `*_scale`.
+    u_level, u_scale : ndarray, shape (n_inputs,), SI
+    y_level, y_scale : ndarray, shape (n_outputs,), SI
+    cloud : Cloud
+        Of the training regressors.
+    kind : str
+        ``rbf``.
+    """
+
+    dt: float
+    shape: RbfShape
+    theta: Array
+    u_level: Array
+    u_scale: Array
+    y_level: Array
+    y_scale: Array
+    cloud: Cloud
+    kind: str = "rbf"
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.shape.lags.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.shape.n_outputs
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.shape.lags.lag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all numbers."""
+        return self.shape.names
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other numbers.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        RbfNetwork
+        """
+        return replace(self, theta=theta)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """Return one-step-ahead predictions.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            The first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.full(ys.shape, np.nan)
+        out[self.lag :] = self.shape.values(self.theta, self.shape.lags.regressors(ys, us))
+        found: Array = self.y_level + self.y_scale * out
+        return found
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """Return the exact derivative of `predict` by `theta`.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs, n_theta)
+            The first `lag` rows are zero.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.zeros((*ys.shape, self.theta.size))
+        out[self.lag :] = self.shape.slopes(self.theta, self.shape.lags.regressors(ys, us))
+        return out * self.y_scale[:, None]
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """Run freely from the first `lag` measured samples on.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (at least lag, n_outputs), SI
+            Only the first `lag` rows are looked at.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, n_outputs), SI
+            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
+            training data.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
+        out: Array = self.y_level + self.y_scale * self.shape.free_run(self.theta, ys, us)[:, : self.n_outputs]
+        out[:head] = whole[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """Return how far the regressors are from those of the training (see `networks.cloud`).
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples, n_inputs), SI
+        y : ndarray, shape (n_samples, n_outputs), SI
+
+        Returns
+        -------
+        ndarray, shape (n_samples,)
+            0 in the middle, 1 at the edge, above 1 outside; the first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
+        """
+        ys, us = scaled(self, u, y)
+        out = np.full(ys.shape[0], np.nan)
+        out[self.lag :] = self.cloud.novelty(self.shape.lags.regressors(ys, us))
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that `from_json` needs.
+
+        Returns
+        -------
+        dict
+        """
+        s = self.shape
+        lags = {k: getattr(s.lags, k) for k in ("n_outputs", "n_inputs", "ny", "nu", "nk")}
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        return {
+            "dt_s": self.dt,
+            "sizes": {**lags, "neurons": s.neurons, "linear": int(s.linear)},
+            "unit": s.unit,
+            "metric": s.metric.tolist(),
+            **arrays,
+            "cloud": self.cloud.as_json(),
+        }
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back.
+
+        Parameters
+        ----------
+        found : dict
+            That `as_json` made.
+
+        Returns
+        -------
+        RbfNetwork
+
+        Raises
+        ------
+        EstimationError
+            If something is missing or of another shape.
+        """
+        try:
+            sizes = {k: int(v) for k, v in found["sizes"].items()}
+            neurons, linear = sizes.pop("neurons"), bool(sizes.pop("linear"))
+            lags = NarxShape(**sizes, neurons=0)
+            size = np.size(found["metric"])
+            metric = finite(found["metric"], size, "metric").reshape(-1, lags.n_regressors)
+            unit = UNITS[UNITS.index(found["unit"])]
+            shape = RbfShape(lags=lags, metric=metric, linear=linear, neurons=neurons, unit=unit)
+            m, p = lags.n_inputs, lags.n_outputs
+            arrays: dict[str, Any] = {
+                k: finite(found[k], n, k)
+                for k, n in {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": p, "y_scale": p}.items()
+            }
+            cloud = Cloud.from_json(found["cloud"], lags.n_regressors)
+            return cls(dt=float(found["dt_s"]), shape=shape, cloud=cloud, **arrays)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise EstimationError(
+                f"no network of radial basis functions ({type(error).__name__}: {error}). Write it again"
+            ) from error

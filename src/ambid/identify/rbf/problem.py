@@ -1,0 +1,219 @@
+"""Errors of a radial basis network over records, weighted, with the rows of its prior: what Levenberg-Marquardt sees.
+
+The unknown are the first numbers of theta: the output weights alone, or all with centres and widths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.networks.records import Parts
+from ambid.identify.networks.search import triangle_of
+from ambid.identify.rbf.shape import RbfShape
+
+Array = NDArray[np.float64]
+
+_BLOCK = 4096
+_OPEN = 1e-4  # one over the standard deviation of the linear part and the constant before the data: next to no prior
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RbfProblem:
+    """Weighted errors of a radial basis network.
+
+    Attributes
+    ----------
+    shape : RbfShape
+    parts : tuple of (outputs, inputs), scaled
+    weight : ndarray, shape (n_outputs,)
+        One over the errors' standard deviation.
+    mean, precision : ndarray, shape (n_theta,)
+        Of the prior; one over its standard deviation.
+    n_active : int
+        Numbers that are searched for, the first of theta.
+    fixed : ndarray, shape (n_theta - n_active,)
+        The others.
+    free : bool
+        Errors of the free run instead of the predictions.
+    """
+
+    shape: RbfShape
+    parts: Parts
+    weight: Array
+    mean: Array
+    precision: Array
+    n_active: int
+    fixed: Array
+    free: bool = False
+    _rows: list[tuple[Array, Array]] = field(default_factory=list)
+
+    def rows(self) -> list[tuple[Array, Array]]:
+        """Return regressors and outputs of each part, made once: (n_rows, n_regressors) and (n_rows, n_outputs)."""
+        if not self._rows:
+            lags = self.shape.lags
+            self._rows.extend((lags.regressors(y, u), y[lags.lag :]) for y, u in self.parts)
+        return self._rows
+
+    @property
+    def n_errors(self) -> int:
+        """Errors in all."""
+        return sum((y.shape[0] - self.shape.lags.lag) * y.shape[1] for y, _ in self.parts)
+
+    def whole(self, v: Array) -> Array:
+        """Return all numbers.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_active,)
+
+        Returns
+        -------
+        ndarray, shape (n_theta,)
+        """
+        return np.concatenate([v, self.fixed])
+
+    def errors(self, v: Array) -> list[Array]:
+        """Return the errors of each part, from sample `lag` on, scaled; NaN from where a free run diverges on.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_active,)
+
+        Returns
+        -------
+        list of ndarray, shape (n_rows, n_outputs)
+        """
+        s, theta = self.shape, self.whole(v)
+        if not self.free:
+            return [target - s.values(theta, z) for z, target in self.rows()]
+        return [(y - s.free_run(theta, y, u)[:, : s.n_outputs])[s.lags.lag :] for y, u in self.parts]
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squared weighted errors and of the prior's rows.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_active,)
+
+        Returns
+        -------
+        float
+            Infinite where the model diverges.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = float(np.sum(self._prior(theta) ** 2))
+            found += sum(float(np.sum((e * self.weight) ** 2)) for e in self.errors(theta))
+        return found if np.isfinite(found) else np.inf
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | r], the prior's rows included.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_active,)
+
+        Returns
+        -------
+        ndarray, shape (n_active + 1, n_active + 1)
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = [triangle_of([block]) for block in self._blocks(theta)]
+        found.append(np.hstack([np.diag(self.precision[: self.n_active]), self._prior(theta)[:, None]]))
+        return triangle_of([np.concatenate(found)])
+
+    def _blocks(self, v: Array) -> Iterator[Array]:
+        s, theta, lag, active = self.shape, self.whole(v), self.shape.lags.lag, slice(0, self.n_active)
+        for k, (y, u) in enumerate(self.parts):
+            if self.free:
+                z = s.free_run(theta, y, u)
+                steep = s.free_slopes(theta, z, self.n_active)[lag:]
+                left = (y - z[:, : s.n_outputs])[lag:]
+            else:
+                rows, target = self.rows()[k]
+                left = target - s.values(theta, rows)
+            for first in range(0, left.shape[0], _BLOCK):
+                part = slice(first, first + _BLOCK)
+                J = steep[part] if self.free else s.slopes(theta, rows[part])[:, :, active]
+                yield np.hstack(
+                    [(J * self.weight[:, None]).reshape(-1, self.n_active), (left[part] * self.weight).reshape(-1, 1)]
+                )
+
+    def _prior(self, v: Array) -> Array:
+        out: Array = self.precision[: self.n_active] * (self.mean[: self.n_active] - v)
+        return out
+
+
+def problem_at(
+    shape: RbfShape,
+    parts: Parts,
+    theta: Array,
+    prior: Array,
+    start: Array,
+    *,
+    everything: bool,
+    free: bool = False,
+    noise: Array | None = None,
+) -> RbfProblem:
+    """Return the problem whose errors have unit variance at given numbers.
+
+    Parameters
+    ----------
+    shape : RbfShape
+    parts : tuple of (outputs, inputs), scaled
+    theta : ndarray, shape (n_theta,)
+    prior : ndarray, shape (n_outputs,)
+        Standard deviation of the units' weights before the data.
+    start : ndarray, shape (n_theta,)
+        Where the centres and widths were put: known to within a width, and to within a factor of e.
+    everything : bool
+        Whether centres and widths are searched for as well.
+    free : bool, optional
+        Errors of the free run.
+    noise : ndarray, shape (n_outputs,), optional
+        Variance of the errors, where it is known better than from the errors themselves.
+
+    Returns
+    -------
+    RbfProblem
+    """
+    n_line = sum(shape.sizes[:2])
+    widths = np.exp(shape.parts(start)[4])
+    precision = np.concatenate(
+        [
+            np.full(n_line, _OPEN),
+            np.repeat(1.0 / prior, shape.neurons),
+            np.repeat(1.0 / widths, shape.n_seen),
+            np.ones(shape.neurons),
+        ]
+    )
+    mean = np.concatenate([np.zeros(shape.n_weights), start[shape.n_weights :]])
+    n = shape.n_theta if everything else shape.n_weights
+    one = RbfProblem(
+        shape=shape,
+        parts=parts,
+        weight=np.ones(shape.n_outputs),
+        mean=mean,
+        precision=precision,
+        n_active=n,
+        fixed=theta[n:],
+        free=free,
+    )
+    if noise is None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            noise = np.mean(np.concatenate(one.errors(theta[:n])) ** 2, axis=0)
+    size = np.sqrt(np.where(np.isfinite(noise), np.maximum(noise, 1e-14), 1.0))
+    return RbfProblem(
+        shape=shape,
+        parts=parts,
+        weight=1.0 / size,
+        mean=mean,
+        precision=precision,
+        n_active=n,
+        fixed=theta[n:],
+        free=free,
+        _rows=one._rows,
+    )

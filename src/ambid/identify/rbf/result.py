@@ -1,0 +1,162 @@
+"""The fit that comes out of a training of a radial basis network: model in SI, covariance, noise, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.networks.cloud import cloud_of
+from ambid.identify.networks.failed import failed_fit, provenance
+from ambid.identify.networks.records import Scaled
+from ambid.identify.networks.search import information_inverse
+from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.rbf.choice import error
+from ambid.identify.rbf.model import RbfNetwork
+from ambid.identify.rbf.problem import RbfProblem, problem_at
+
+if TYPE_CHECKING:
+    from ambid.identify.rbf.estimate import Work
+
+Array = NDArray[np.float64]
+
+DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
+
+
+def finished(
+    records: Sequence[IOData], used: Mapping[str, object], data: Scaled, work: Work, *, seed: int
+) -> NonlinearFit:
+    """Return the fit of trained weights.
+
+    Parameters
+    ----------
+    records : sequence of IOData
+    used : Mapping[str, object]
+        Settings.
+    data : Scaled
+    work : Work
+    seed : int
+
+    Returns
+    -------
+    NonlinearFit
+        Failed where the weights or the errors are not finite.
+    """
+    began = perf_counter()
+    shape, theta = work.shape, work.theta
+    problem = problem_at(shape, data.parts, theta, work.prior, work.start, everything=work.everything, free=work.free)
+    if not np.isfinite(problem.cost(theta[: problem.n_active])):
+        return failed_fit("rbf", records, used, seed, DIVERGED, work.timing_s)
+    P, noise, effective, condition = laplace(problem, theta[: problem.n_active])
+    covariance, warnings = _covariance(work, P)
+    regressors = np.concatenate([shape.lags.regressors(y, u) for y, u in data.parts])
+    model = RbfNetwork(
+        dt=records[0].dt,
+        shape=shape,
+        theta=theta,
+        u_level=data.u_level,
+        u_scale=data.u_scale,
+        y_level=data.y_level,
+        y_scale=data.y_scale,
+        cloud=cloud_of(regressors),
+    )
+    work.timing_s["result"] = perf_counter() - began
+    work.timing_s["all"] = sum(work.timing_s.values())
+    return NonlinearFit(
+        structure="rbf",
+        settings={**used, "focus": "simulation" if work.free else "prediction"},
+        model=model,
+        covariance=covariance,
+        covariance_from="" if covariance is None else "laplace",
+        n_estimated=problem.n_active,
+        noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
+        seed=seed,
+        status=work.status,
+        curves=tuple(work.curves),
+        warnings=(*work.warnings, *warnings, *_cautions(records, data, work)),
+        timing_s=dict(work.timing_s),
+        details={
+            "effective_parameters": effective,
+            "condition": condition,
+            "prior_by_output": work.prior.tolist(),
+            "stopped_early": work.stopped_early,
+            "held_out_rms": work.held_out,
+            "tried": [
+                {"ny": x.ny, "nu": x.nu, "neurons": x.neurons, "width": x.width, "score": x.score} for x in work.tried
+            ],
+        },
+        **provenance(records),
+    )
+
+
+def laplace(problem: RbfProblem, v: Array) -> tuple[Array | None, Array, float, float]:
+    """Return the inverse of the information, the prior's included (MacKay 1992).
+
+    Parameters
+    ----------
+    problem : RbfProblem
+    v : ndarray, shape (n_active,)
+        At the optimum.
+
+    Returns
+    -------
+    covariance : ndarray, shape (n_active, n_active), or None
+        None where the data and the prior together leave a direction open.
+    noise : ndarray, shape (n_outputs, n_outputs), scaled
+        Covariance of the errors.
+    effective : float
+        Numbers that the data determine.
+    condition : float
+        Of the scaled Jacobian, the prior's rows included.
+    """
+    errors = np.concatenate(problem.errors(v))
+    n, p = errors.shape
+    noise = errors.T @ errors / n
+    P, effective, condition = None, float(v.size), np.inf
+    for _ in range(2):  # the degrees of freedom are those that the prior leaves
+        weight = 1.0 / np.sqrt(np.maximum(np.diag(noise), 1e-14))
+        P, condition = information_inverse(replace(problem, weight=weight).triangle(v)[:, :-1])
+        if P is None:
+            break
+        effective = float(v.size - np.sum(np.diag(P) * problem.precision[: v.size] ** 2))
+        noise = errors.T @ errors / max(n - effective / p, 1.0)
+    return P, noise, effective, condition
+
+
+def _covariance(work: Work, P: Array | None) -> tuple[Array | None, list[str]]:
+    if work.free:
+        return None, [
+            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white"
+        ]
+    if not work.arrived:
+        return None, ["no standard deviations: the training has not come to an optimum"]
+    if P is None:
+        return None, ["no standard deviations: data and prior do not determine the weights. Fewer units or lags"]
+    whole = np.zeros((work.theta.size, work.theta.size))
+    whole[: P.shape[0], : P.shape[0]] = P
+    return whole, []
+
+
+def _cautions(records: Sequence[IOData], data: Scaled, work: Work) -> list[str]:
+    found = []
+    if records[0].n_inputs and not all(x.open_loop for x in records):
+        what = "the free run" if work.free else "one-step errors"
+        found.append(
+            f"rbf has no noise model: trained on {what}, it is biased under feedback unless its errors are white, and "
+            "nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
+        )
+    if work.stopped_early:
+        found.append(
+            "training was stopped where the held-out error was least: more units than the data carry; standard "
+            "deviations are those of a linearisation there"
+        )
+    if not work.free and not np.isfinite(error(work.shape, work.theta, data.parts, free=True)):
+        found.append(
+            "the free run diverges on the records that the model was trained on: it predicts, but does not simulate"
+        )
+    return found
