@@ -25,15 +25,19 @@ _CLEAR = 10.0  # difference of the criterion from which a faster set point is ta
 _EXTRA = 3  # lags of the trial model beyond the order, so that the colour of the noise does not decide
 
 
-def information(cost: float, n: int, k: int) -> float:
-    """Return Bayes' information criterion.
+def information(criterion: str, cost: float, n: int, k: int, starts: int = 0) -> float:
+    """Return an information criterion.
 
     Parameters
     ----------
+    criterion : {"bic", "aic", "aicc"}
     cost : float
         Sum of squared one-step errors.
     n, k : int
-        Samples and estimated numbers.
+        Samples and estimated parameters.
+    starts : int, optional
+        Numbers that stand for what was before the records: each takes a few squared errors off whatever the model, and
+        counts as for Akaike's criterion.
 
     Returns
     -------
@@ -42,7 +46,10 @@ def information(cost: float, n: int, k: int) -> float:
     """
     if not np.isfinite(cost) or cost < 0:
         return math.inf
-    return n * math.log(max(cost / n, 1e-300)) + k * math.log(n)
+    each = math.log(n) if criterion == "bic" else 2.0
+    if criterion == "aicc":
+        each *= n / (n - k - 1) if n > k + 1 else math.inf
+    return n * math.log(max(cost / n, 1e-300)) + k * each + 2.0 * starts
 
 
 def error_orders(form: str, order: int) -> tuple[tuple[int, int], ...]:
@@ -98,7 +105,7 @@ def chosen_time_constant(shape: LpvShape, records: Sequence[IOData], data: Scale
             for x, (y, u) in zip(records, data.parts, strict=True)
         ]
         n = sum(p.y.size - first for p in parts)
-        values.append(information(least_squares(scheduled, parts, first)[1], n, scheduled.n_theta))
+        values.append(information("bic", least_squares(scheduled, parts, first)[1], n, scheduled.n_theta))
     least = min(values)
     return dt * max(x for x, value in zip(grid, values, strict=True) if not value > least + _CLEAR)
 

@@ -1,6 +1,6 @@
 """LPV models scheduled by set point: system model and error model by prediction error, coefficients functions of p.
 
-Scale -> set point (its low-pass, where left open) -> degree in p -> form and error model, each by Bayes' criterion of
+Scale -> set point (its low-pass, where left open) -> degree in p, form and error model, each by a criterion of
 the one-step errors -> Levenberg-Marquardt with exact derivatives. Starts come from least squares.
 """
 
@@ -117,13 +117,31 @@ class Candidate:
     ----------
     shape : LpvShape
     theta : ndarray, shape (n_theta,), scaled
-    value : float
-        Criterion, the smaller the better; infinite where the predictor diverges.
+    cost : float
+        Sum of squared one-step errors, scaled; infinite where the predictor is unstable.
+    n, starts : int
+        Errors, and numbers that stand for what was before the records.
     """
 
     shape: LpvShape
     theta: Array
-    value: float
+    cost: float = np.inf
+    n: int = 1
+    starts: int = 0
+
+    def value(self, criterion: str) -> float:
+        """Return an information criterion.
+
+        Parameters
+        ----------
+        criterion : {"bic", "aic", "aicc"}
+
+        Returns
+        -------
+        float
+            The smaller the better.
+        """
+        return information(criterion, self.cost, self.n, self.shape.n_theta, self.starts)
 
 
 def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -231,7 +249,7 @@ def _identify(s: LpvSettings, work: Work, tick: Tick | None) -> str:
     work.timing_s["degree"], began = perf_counter() - began, perf_counter()
     best = _by_form(s, work, best, ticks[2])
     work.timing_s["form"], began = perf_counter() - began, perf_counter()
-    if not np.isfinite(best.value):
+    if not np.isfinite(best.cost):
         return UNSTABLE if s.form == "output" else DIVERGED
     _keep(work, best)
     _searched(work, best.shape, best.theta, s.iterations, ticks[3], "prediction errors", last=True)
@@ -250,7 +268,7 @@ def _searched(
     problem = work.problem(shape)
     cost = problem.cost(theta)
     if not np.isfinite(cost):
-        return Candidate(shape=shape, theta=theta, value=np.inf)
+        return Candidate(shape=shape, theta=theta)
     weight = 1.0 / max(np.sqrt(cost / max(problem.n_errors, 1)), 1e-12)
     problem = replace(problem, weight=float(weight))
     count = 0
@@ -276,21 +294,13 @@ def _searched(
                 training=np.sqrt(np.array(found.costs) / problem.n_errors) / weight,
             )
         )
-    value = information(found.cost / weight**2, problem.n_errors, shape.n_theta)
-    return Candidate(shape=shape, theta=found.theta, value=value)
+    starts = len(problem.parts) * shape.n_start
+    return Candidate(shape=shape, theta=found.theta, cost=found.cost / weight**2, n=problem.n_errors, starts=starts)
 
 
 def _noted(work: Work, x: Candidate) -> Candidate:
-    of = x.shape
-    work.tried.append(
-        {
-            "form": of.form,
-            "degree": of.degree,
-            "ar": of.ar,
-            "ma": of.ma,
-            "bic": x.value if np.isfinite(x.value) else None,
-        }
-    )
+    of, found = x.shape, {k: x.value(k) if np.isfinite(x.cost) else None for k in ("aicc", "bic")}
+    work.tried.append({"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found})
     return x
 
 
@@ -306,9 +316,9 @@ def _by_degree(s: LpvSettings, work: Work, tick: Tick | None) -> Candidate:
         if best is not None and s.basis == "legendre":
             starts.append(padded(shape, best.shape, best.theta))
         found = _noted(work, _from_best(work, shape, starts, own, f"degree {degree}"))
-        if best is None or found.value < best.value:
+        if best is None or found.value(s.criterion) < best.value(s.criterion):
             best, worse = found, 0
-            if np.isfinite(found.value):
+            if np.isfinite(found.cost):
                 _keep(work, found)
         else:
             worse += 1
@@ -341,17 +351,17 @@ def _by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> 
             continue
         if shape.form == "output" and s.form == "auto" and not stable_process(best.shape, best.theta):
             continue
-        earlier = [x for x in known.values() if np.isfinite(x.value)]
-        earlier.sort(key=lambda x: (x.shape.form != shape.form, x.value))
+        earlier = [x for x in known.values() if np.isfinite(x.cost)]
+        earlier.sort(key=lambda x: (x.shape.form != shape.form, x.value("bic")))
         parts = work.parts(shape)
         starts: list[Array | None] = [padded(shape, without_error_model(best.shape), _process(best))]
         for x in earlier[:2]:
             starts += [padded(shape, x.shape, x.theta), from_earlier(shape, parts, work.first, x.shape, x.theta)]
         named = f"{shape.form} form, {_named(shape)}"
         found = known[shape] = _noted(work, _from_best(work, shape, starts, own, named))
-        if chosen is None or found.value < chosen.value:
+        if chosen is None or found.value("bic") < chosen.value("bic"):
             chosen = found
-            if np.isfinite(found.value):
+            if np.isfinite(found.cost):
                 _keep(work, found)
     return chosen or best
 

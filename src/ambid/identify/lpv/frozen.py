@@ -35,7 +35,7 @@ class Frozen:
         log(z)/dt of the roots z of A, largest real part first; -inf for a root at 0.
     dc_gain : ndarray, shape (n_exciting,), SI
         B(1)/A(1); negative behind an unstable pole.
-    a_sd, b_sd, c_sd, d_sd : ndarray or None
+    a_sd, b_sd, c_sd, d_sd : ndarray, shapes as a, b, c, d, or None
         Standard deviations; None without a covariance.
     poles_sd : ndarray, shape (order,), complex, rad/s, or None
         Of real and imaginary part.

@@ -26,6 +26,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
     "form": ("auto", "equation", "output"),
     "basis": BASES,
     "exciting": ("no", "yes"),
+    "criterion": ("aicc", "aic", "bic"),
 }
 
 
@@ -37,7 +38,7 @@ class LpvSettings:
     ----------
     order, error_order, nb, nk, error_degree, iterations : int
     degree : int or None
-    error_form, form, basis, schedule, exciting : str
+    error_form, form, basis, schedule, exciting, criterion : str
     time_constant : float or None, s
     column : int
         Which input the schedule names; -1 for the output.
@@ -56,6 +57,7 @@ class LpvSettings:
     basis: str
     schedule: str
     exciting: str
+    criterion: str
     time_constant: float | None
     iterations: int
     column: int
@@ -123,6 +125,7 @@ def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
         basis=str(s.get("basis", "legendre")),
         schedule=name,
         exciting="yes" if excites else "no",
+        criterion=str(s.get("criterion", "aicc")),
         time_constant=s.get("time_constant") if name == LEVEL else 0.0,
         iterations=int(s.get("iterations", 60)),
         column=column,
