@@ -7,7 +7,7 @@ information criterion of the training errors, in which numbers count as far as t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +35,41 @@ class Tried:
     ----------
     ny, nu, neurons : int
     width : float
+    seen : str
     score : float
         Root mean square error in deviations of the outputs, held out; or what stands for it in a criterion.
+    one_step : float
+        The same of the predictions, where `score` is that of the free run.
     """
 
     ny: int
     nu: int
     neurons: int
     width: float
+    seen: str
     score: float
+    one_step: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chosen:
+    """What was chosen.
+
+    Attributes
+    ----------
+    shape : RbfShape
+    theta : ndarray, shape (n_theta,)
+        Centres and widths; weights of zero.
+    width : float
+    seen : str
+    tried : tuple of Tried
+    """
+
+    shape: RbfShape
+    theta: Array
+    width: float
+    seen: str
+    tried: tuple[Tried, ...]
 
 
 def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
@@ -96,7 +122,7 @@ def error(shape: RbfShape, theta: Array, parts: Parts, *, free: bool = False) ->
     return found if np.isfinite(found) else np.inf
 
 
-def chosen(told: Told, parts: Parts, seed: int, tick: Tick | None) -> tuple[RbfShape, Array, float, tuple[Tried, ...]]:
+def chosen(told: Told, parts: Parts, seed: int, tick: Tick | None) -> Chosen:
     """Choose what is left open, and place the units.
 
     Parameters
@@ -108,59 +134,77 @@ def chosen(told: Told, parts: Parts, seed: int, tick: Tick | None) -> tuple[RbfS
 
     Returns
     -------
-    shape : RbfShape
-    theta : ndarray, shape (n_theta,)
-        Centres and widths; weights of zero.
-    width : float
-    tried : tuple of Tried
+    Chosen
     """
-    tried: list[Tried] = []
-    ny, nu = told.ny, told.nu
-    if ny is None or nu is None:
-        short = min(y.shape[0] for y, _ in parts)
-        lags = [k for k in _LAGS if 3 * (k + told.nk) < short * (told.share or 0.2)] or [1]
-        pairs = [(k if told.ny is None else told.ny, k if told.nu is None else told.nu) for k in lags]
-        middle, few = told.width or MIDDLE, min(told.neurons or _FIRST, _FIRST)
-        seen = []
-        for i, (a, b) in enumerate(pairs):
+    ny, nu, tried = _lags(told, parts, seed, tick)
+    neurons, width, seen = told.neurons, told.width, told.seen
+    if neurons is None or width is None or seen is None:
+        questions = [
+            (which, w)
+            for which in (_seen(ny, nu, parts) if seen is None else (seen,))
+            for w in (_WIDTHS if width is None else (width,))
+        ]
+        found: list[Tried] = []
+        for i, (which, w) in enumerate(questions):
             if tick is not None:
-                tick("choice of lags", 0.3 * i / len(pairs))
-            seen += _scores(told, parts, a, b, (few,), (middle,), seed)
-        tried += seen
-        one = _least(seen, told)
-        ny, nu = one.ny, one.nu
-    neurons, width = told.neurons, told.width
-    if neurons is None or width is None:
-        widths = _WIDTHS if width is None else (width,)
-        counts = NEURONS if neurons is None else (neurons,)
-        seen = []
-        for i, w in enumerate(widths):
-            if tick is not None:
-                tick("choice of units", 0.3 + 0.7 * i / len(widths))
-            seen += _scores(told, parts, ny, nu, counts, (w,), seed)
-        tried += seen
-        one = _least(sorted(seen, key=lambda t: t.neurons), told)
-        neurons, width = one.neurons, one.width
+                tick("choice of units", 0.2 + 0.8 * i / len(questions))
+            counts = NEURONS if neurons is None else (neurons,)
+            found += _scores(replace(told, seen=which), parts, ny, nu, counts, w, seed)
+        tried += found
+        one = _least(sorted(found, key=lambda t: t.neurons), told)
+        neurons, width, seen = (one.neurons if neurons is None else neurons), one.width, one.seen
+    told = replace(told, seen=seen)
     placing = Placing(told, shape_of(told, parts, ny, nu, neurons), parts, seed)
-    return *placing.theta(neurons, width), width, tuple(tried)
+    shape, theta = placing.theta(neurons, width)
+    return Chosen(shape=shape, theta=theta, width=width, seen=seen, tried=tuple(tried))
 
 
-def _scores(
-    told: Told, parts: Parts, ny: int, nu: int, counts: Sequence[int], widths: Sequence[float], seed: int
-) -> list[Tried]:
+def _lags(told: Told, parts: Parts, seed: int, tick: Tick | None) -> tuple[int, int, list[Tried]]:
+    """Choose the lags with few units of middle width that see all of them."""
+    if told.ny is not None and told.nu is not None:
+        return told.ny, told.nu, []
+    short = min(y.shape[0] for y, _ in parts)
+    lags = [k for k in _LAGS if 3 * (k + told.nk) < short * (told.share or 0.2)] or [1]
+    few, tried = min(_FIRST if told.neurons is None else told.neurons, _FIRST), list[Tried]()
+    for i, k in enumerate(lags):
+        if tick is not None:
+            tick("choice of lags", 0.2 * i / len(lags))
+        ny, nu = (k if told.ny is None else told.ny), (k if told.nu is None else told.nu)
+        tried += _scores(told, parts, ny, nu, (few,), told.width or MIDDLE, seed)
+    one = _least(tried, told)
+    return one.ny, one.nu if told.nu is None else told.nu, tried
+
+
+def _seen(ny: int, nu: int, parts: Parts) -> tuple[str, ...]:
+    both = ny > 0 and nu > 0 and parts[0][1].shape[1] > 0
+    return ("outputs", "inputs", "all") if both else ("all",)
+
+
+def _scores(told: Told, parts: Parts, ny: int, nu: int, counts: Sequence[int], width: float, seed: int) -> list[Tried]:
     by_criterion = told.choice != "held_out"
     shape = shape_of(told, parts, ny, nu, 0)
     training, held = (parts, ()) if by_criterion else split(parts, told.share or 0.2, shape.lags.lag)
     placing = Placing(told, shape, training, seed)
     out: list[Tried] = []
-    for width in widths:
-        for count in counts:
-            at, found = placing.solved(count, width)
-            if by_criterion:
-                score = _criterion(told.choice, placing, at, found)
-            else:
-                score = error(at, found.theta, held, free=told.free)
-            out.append(Tried(ny=ny, nu=shape.lags.nu, neurons=at.neurons, width=width, score=score))
+    for count in counts:
+        at, found = placing.solved(count, width)
+        if by_criterion:
+            score = one_step = _criterion(told.choice, placing, at, found)
+        else:
+            score = one_step = error(at, found.theta, held)
+            if told.free:
+                score = error(at, found.theta, held, free=True)
+        out.append(
+            Tried(
+                ny=ny,
+                nu=shape.lags.nu,
+                neurons=at.neurons,
+                width=width,
+                seen=told.seen or "all",
+                score=score,
+                one_step=one_step,
+            )
+        )
     return out
 
 
@@ -174,6 +218,8 @@ def _criterion(name: str, placing: Placing, shape: RbfShape, found: Weights) -> 
 
 def _least(tried: Sequence[Tried], told: Told) -> Tried:
     """Return the first that is as good as the best; the best itself by a criterion, which has paid for size."""
-    best = min(x.score for x in tried)
+    scores = [x.score for x in tried]
+    if not np.any(np.isfinite(scores)):  # every free run diverges
+        scores = [x.one_step for x in tried]
     slack = _AS_GOOD if told.choice == "held_out" else 1.0
-    return next((x for x in tried if x.score <= slack * best), tried[0])
+    return tried[next((k for k, x in enumerate(scores) if x <= slack * min(scores)), 0)]

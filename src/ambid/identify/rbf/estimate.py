@@ -62,7 +62,6 @@ _DEFAULTS: Mapping[str, object] = {
     "nk": 1,
     "linear": 1,
     "unit": "gaussian",
-    "seen": "all",
     "metric": "scaled",
     "centres": "ols",
     "choice": "held_out",
@@ -101,6 +100,7 @@ class Work:
     warnings : list of str
     timing_s : dict of str to float
     tried : tuple of Tried
+    seen : str
     held_out, width : float
         NaN without.
     """
@@ -119,6 +119,7 @@ class Work:
     warnings: list[str] = field(default_factory=list)
     timing_s: dict[str, float] = field(default_factory=dict)
     tried: tuple[Tried, ...] = ()
+    seen: str = "all"
     held_out: float = float("nan")
     width: float = float("nan")
 
@@ -155,6 +156,9 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     s.setdefault("passes", 20 if s["training"] == "descent" or s["trained"] == "all" else 1)
     if s.get("ny") == 0 and s.get("nu") == 0:
         raise EstimationError("rbf: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+    nothing = {"outputs": s.get("ny") == 0, "inputs": s.get("nu") == 0 or not records or not records[0].n_inputs}
+    if nothing.get(str(s.get("seen")), False):
+        raise EstimationError(f"rbf: units are to see {s['seen']} alone, and there are none. Say seen = all")
     began = perf_counter()
     data = scaled_records("rbf", records, lag=max(s.get("ny") or 1, s["nk"] + (s.get("nu") or 1) - 1))
     told = _told(s)
@@ -169,13 +173,14 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
         return failed_fit("rbf", records, s, seed, f"the training broke down: {problem}", work.timing_s)
     shape = work.shape
     used = {**s, "ny": shape.lags.ny, "nu": shape.lags.nu, "neurons": shape.neurons, "width": work.width}
+    used["seen"] = work.seen
     used["prior"] = float(np.exp(np.mean(np.log(work.prior))))
     return finished(records, used, data, work, seed=seed)
 
 
 def _told(s: Mapping[str, Any]) -> Told:
-    given: dict[str, Any] = {k: s[k] for k in ("nk", "unit", "centres", "widths", "metric", "seen", "choice")}
-    given |= {k: s.get(k) for k in ("ny", "nu", "neurons", "width", "prior")}
+    given: dict[str, Any] = {k: s[k] for k in ("nk", "unit", "centres", "widths", "metric", "choice")}
+    given |= {k: s.get(k) for k in ("ny", "nu", "neurons", "width", "seen", "prior")}
     return Told(
         **given,
         linear=bool(s["linear"]),
@@ -200,15 +205,16 @@ def _identify(s: Mapping[str, Any], told: Told, data: Scaled, work: Work, seed: 
     began = perf_counter()
     if tick is not None:
         tick("start", 0.0)
-    shape, start, work.width, work.tried = chosen(told, data.parts, seed, ticks[0])
+    found = chosen(told, data.parts, seed, ticks[0])
+    work.width, work.seen, work.tried = found.width, found.seen, found.tried
     work.timing_s["choice"] = perf_counter() - began
     began = perf_counter()
     if ticks[1] is not None:
         ticks[1]("output weights", 0.0)
-    solved = _solve(told, shape, start, data, work)
+    solved = _solve(told, found.shape, found.theta, data, work)
     work.timing_s["output weights"] = perf_counter() - began
     began = perf_counter()
-    work.everything = s["trained"] == "all" and shape.neurons > 0
+    work.everything = s["trained"] == "all" and found.shape.neurons > 0
     if s["training"] != "linear":
         _recur(s, solved, data, work, ticks[2])
     elif work.everything:

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 NEURONS = (2, 4, 8, 16, 32, 48)
 MIDDLE = 1.4
 _NEIGHBOURS = 2
-_MOST_ROWS = 6000  # that are looked at
-_CANDIDATES = 300  # of the data that may become a centre
+_MOST_ROWS = 4000  # that are looked at
+_CANDIDATES = 200  # of the data that may become a centre
 _NARROW = 1e-3  # part of the widest direction below which the whitened metric counts a direction as that wide
 
 
@@ -33,9 +33,11 @@ class Told:
     ny, nu, neurons : int or None
     width : float or None
         In typical sizes of the data, or in distances of neighbours.
+    seen : str or None
+        As in the register; taken as "all" while it is open.
     nk : int
     linear : bool
-    unit, centres, widths, metric, seen, choice : str
+    unit, centres, widths, metric, choice : str
         As in the register.
     prior : float or None
     share : float
@@ -48,13 +50,13 @@ class Told:
     nu: int | None
     neurons: int | None
     width: float | None
+    seen: str | None
     nk: int
     linear: bool
     unit: str
     centres: str
     widths: str
     metric: str
-    seen: str
     choice: str
     prior: float | None
     share: float
@@ -96,7 +98,7 @@ def shape_of(told: Told, parts: Parts, ny: int, nu: int, neurons: int) -> RbfSha
     p, m = parts[0][0].shape[1], parts[0][1].shape[1]
     lags = NarxShape(n_outputs=p, n_inputs=m, ny=ny, nu=nu if m else 0, nk=told.nk, neurons=0)
     outputs = lags.tables[0] < p
-    seen = {"all": np.ones(outputs.size, dtype=bool), "outputs": outputs, "inputs": ~outputs}[told.seen]
+    seen = {"all": np.ones(outputs.size, dtype=bool), "outputs": outputs, "inputs": ~outputs}[told.seen or "all"]
     M = np.eye(outputs.size)[seen]
     if told.metric == "whitened" and M.shape[0]:
         x = np.concatenate([lags.regressors(y, u) for y, u in parts]) @ M.T

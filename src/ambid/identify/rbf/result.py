@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -86,9 +86,7 @@ def finished(
             "prior_by_output": work.prior.tolist(),
             "stopped_early": work.stopped_early,
             "held_out_rms": work.held_out,
-            "tried": [
-                {"ny": x.ny, "nu": x.nu, "neurons": x.neurons, "width": x.width, "score": x.score} for x in work.tried
-            ],
+            "tried": [asdict(x) for x in work.tried],
         },
         **provenance(records),
     )
