@@ -106,7 +106,7 @@ def test_bands_are_those_of_the_delta_method(estimate):
 def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
     stages = []
 
-    def tick(stage):
+    def tick(stage, done=None):
         stages.append(stage)
         if stage == "identify" and stages.count(stage) == 4:
             raise KeyboardInterrupt
@@ -120,5 +120,5 @@ def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
 def test_what_is_asked_wrongly_is_refused(balls, rig):
     with pytest.raises(EstimationError, match="has no number"):
         identify_nonlinear(balls, rig, parameters=[Parameter(name="gap", unit="m")])
-    with pytest.raises(EstimationError, match="holds the rotor"):
+    with pytest.raises(EstimationError, match="every one holds the rotor"):
         identify_nonlinear([], rig, held=balls, magnet="single")

@@ -121,8 +121,8 @@ def start_of_track(track: str | None) -> Estimate | None:
     found = read_estimate(str(track))
     if not isinstance(found, Estimate):
         raise AmbidError(
-            f"--track {track} is a black-box fit; tracking follows physical parameters. Give an estimate of"
-            " 'ambid identify --json'"
+            f"--track {track} is a black-box fit or a nonlinear estimate; tracking follows linear physical parameters."
+            " Give an estimate of 'ambid identify --json' without --nonlinear"
         )
     return found
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ambid.cli.interrupts import Stop, signals
+from ambid.cli.interrupts import Stop, interruptible, signals
 from ambid.cli.options import FAILED_CHECK, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 from ambid.errors import EstimationError, nearest
-from ambid.identify.nonlinear.progress import Tick
 
 if TYPE_CHECKING:
+    from ambid.identify.blackbox.data import IOData
     from ambid.identify.nonlinear.fit import NonlinearFit, Settings
 
 Part = tuple[float | None, float | None]
@@ -98,11 +98,11 @@ def fit_records(
                 validate_to_s=second_part[1],
                 rig=rig,
                 seed=seed,
-                tick=_interruptible(show, stop),
+                tick=interruptible(show, stop),
             )
             if plot is not None and found.model is not None:
                 show("draw")
-                _draw(found, records[0], files, plot, inputs, outputs, part, rate, gaps, rig)
+                _draw(found, records, second, files, plot, inputs, outputs, part, second_part, rate, gaps, rig)
         written = nonlinear_fit_text(found)
         if (path := json_path(json)) is not None:
             files.stage_text(path, written)
@@ -114,20 +114,6 @@ def fit_records(
         raise typer.Exit(stop.code)
     if found.status == "failed" or (strict and not found.passed):
         raise typer.Exit(FAILED_CHECK)
-
-
-def _interruptible(show: Tick, stop: Stop) -> Tick:
-    """Interrupt the search once where that is wished; what judges its result afterwards goes on."""
-    told = False
-
-    def tick(stage: str, done: float | None = None, /) -> None:
-        nonlocal told
-        show(stage, done)
-        if stop.wished() and not told and stage != "check":
-            told = True
-            raise KeyboardInterrupt
-
-    return tick
 
 
 def settings_of(text: str) -> Settings:
@@ -257,12 +243,14 @@ def one_record(records: Sequence[Path], structure: str, settings: str | None, se
 
 def _draw(
     found: NonlinearFit,
-    record: Path,
+    records: Sequence[Path],
+    second: Path | None,
     files: Outputs,
     plot: Path,
     inputs: Sequence[str],
     outputs: Sequence[str],
     part: Part,
+    second_part: Part,
     rate: float | None,
     gaps: str | None,
     rig: Path | None,
@@ -273,5 +261,10 @@ def _draw(
     from ambid.rig import load_rig
 
     bench = None if rig is None else load_rig(rig)
-    page = nonlinear_overview(found, read_data(record, inputs, outputs, part=part, rate_hz=rate, gaps=gaps, rig=bench))
+
+    def read(record: Path, piece: Part) -> IOData:
+        return read_data(record, inputs, outputs, part=piece, rate_hz=rate, gaps=gaps, rig=bench)
+
+    data = [read(x, part) for x in records]
+    page = nonlinear_overview(found, data, None if second is None else read(second, second_part))
     files.stage(plot, lambda path: save(page, path))

@@ -1,13 +1,14 @@
-"""``ambid identify``: physical parameters with uncertainty from one record."""
+"""``ambid identify``: physical parameters with uncertainty from one record, or a nonlinear magnet from several."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RecordFile, RigFile, Strict, To, json_path
+from ambid.cli.identify_nonlinear import Wishes, identify_records, one_record
+from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
+Records = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORD...",
+        help="Record: .csv, .csv.gz, .h5 or .mat; with --nonlinear several, best at several positions.",
+        show_default=False,
+    ),
+]
 PlotFile = Annotated[
     Path | None,
     typer.Option("--plot", metavar="FILE.png", help="Draw signals, residuals, Bode and poles.", show_default=False),
@@ -28,8 +37,44 @@ ReportFile = Annotated[
 
 
 def command(
-    record: RecordFile,
+    records: Records,
     rig: RigFile = None,
+    nonlinear: Annotated[
+        bool,
+        typer.Option("--nonlinear", help="The nonlinear magnet: k_i, k_x and L as curves over position and current."),
+    ] = False,
+    held: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--held",
+            metavar="RECORD",
+            help="Nonlinear: a record with the rotor held at rest, which shows the coil; repeat.",
+            show_default=False,
+        ),
+    ] = None,
+    magnet: Annotated[
+        Literal["auto", "single", "pair"] | None,
+        typer.Option(
+            "--magnet",
+            help="Nonlinear: one magnet, or two that oppose each other; auto looks at the sign of the current.",
+            show_default="as the rig says, or auto",
+        ),
+    ] = None,
+    eddy: Annotated[
+        bool, typer.Option("--eddy", help="Nonlinear: the force follows the current with a pole a/(s + a).")
+    ] = False,
+    drift: Annotated[
+        bool, typer.Option("--drift", help="Nonlinear: let a slowly walking force take up what the law leaves over.")
+    ] = False,
+    off_below: Annotated[
+        float | None,
+        typer.Option(
+            "--off-below",
+            metavar="V",
+            help="Nonlinear: at or below this voltage the power stage is off, and the coil's voltage not known.",
+            show_default="as the rig says",
+        ),
+    ] = None,
     second: Annotated[
         Path | None,
         typer.Option(
@@ -48,7 +93,17 @@ def command(
     """Identify the physical parameters of a bench from a record of voltage, current and position.
 
     Without --rig: columns named voltage, current and position, model one-axis, everything free.
+    With --nonlinear, one model for all records, and curves with bands; what is known of the magnet stands in [magnet]
+    of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
+    wishes = Wishes(held=tuple(held or ()), magnet=magnet, eddy=eddy, drift=drift, off_below=off_below)
+    if nonlinear:
+        identify_records(
+            records, rig, wishes, part=(from_s, to_s), rate=rate, gaps=gaps, second=second, json=json, plot=plot,
+            report=report, strict=strict,
+        )  # fmt: skip
+        return
+    record = one_record(records, wishes)
     from ambid.job import identify, load
     from ambid.rig import default_rig, load_rig
 

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
+from ambid.identify.nonlinear.progress import Tick
+
 
 @contextmanager
 def signals(take: Callable[[int], None]) -> Iterator[None]:
@@ -94,3 +96,30 @@ class Stop:
     def code(self) -> int:
         """Exit code: 0 without a signal, else 128 and its number."""
         return 0 if self.number is None else 128 + self.number
+
+
+def interruptible(show: Tick, stop: Stop) -> Tick:
+    """Return a tick that interrupts a search once where that is wished; what judges its result afterwards goes on.
+
+    Parameters
+    ----------
+    show : Tick
+        Shows the progress.
+    stop : Stop
+        Whether the user wishes to end.
+
+    Returns
+    -------
+    Tick
+        Raises KeyboardInterrupt at the first call after the wish, but not in the stage ``"check"``.
+    """
+    told = False
+
+    def tick(stage: str, done: float | None = None, /) -> None:
+        nonlocal told
+        show(stage, done)
+        if stop.wished() and not told and stage != "check":
+            told = True
+            raise KeyboardInterrupt
+
+    return tick

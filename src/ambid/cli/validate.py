@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.estimate import Estimate
     from ambid.identify.nonlinear.fit import NonlinearFit
+    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
     from ambid.rig import Rig
 
 
@@ -44,6 +45,7 @@ def command(
     """
     from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.nonlinear.fit import NonlinearFit
+    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
     from ambid.job.estimates import read_estimate
 
     with Outputs(estimate, record, rig) as outputs:
@@ -56,9 +58,11 @@ def command(
                 found, lines = _judged_fit(known, record, (from_s, to_s), rate, gaps)
                 model, passed = known.structure, True
             else:
-                found, lines = _judged_estimate(
-                    known, record, _rig_of(known, estimate, rig), (from_s, to_s), rate, gaps
-                )
+                bench = _rig_of(known, estimate, rig)
+                if isinstance(known, NonlinearBearingEstimate):
+                    found, lines = _judged_bearing(known, record, bench, (from_s, to_s), rate, gaps)
+                else:
+                    found, lines = _judged_estimate(known, record, bench, (from_s, to_s), rate, gaps)
                 model, passed = f"model {known.model}", bool(found["passed"])
         document = {"schema": "ambid.validation/1", "estimate": estimate.name, "record": record.name, **found}
         text = json_format.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -90,6 +94,16 @@ def _judged_estimate(
     return found, validation_lines(found, paint=painter())
 
 
+def _judged_bearing(
+    known: NonlinearBearingEstimate, record: Path, bench: Rig, part: Part, rate: float | None, gaps: str | None
+) -> tuple[dict[str, Any], list[str]]:
+    from ambid.job.nonlinear_bearing import validate_bearing
+    from ambid.report.bearing_text import validation_lines
+
+    found = validate_bearing(known, record, bench, from_s=part[0], to_s=part[1], rate_hz=rate, gaps=gaps)
+    return found, validation_lines(found, paint=painter())
+
+
 def _judged_fit(
     known: BlackBoxFit | NonlinearFit, record: Path, part: Part, rate: float | None, gaps: str | None
 ) -> tuple[dict[str, Any], list[str]]:
@@ -112,7 +126,7 @@ def _judged_fit(
     return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
 
 
-def _rig_of(estimate: Estimate, path: Path, rig: Path | None) -> Rig:
+def _rig_of(estimate: Estimate | NonlinearBearingEstimate, path: Path, rig: Path | None) -> Rig:
     """Load the rig that is given, or the one that the estimate remembers."""
     from ambid.rig import load_rig, rig_from_text
 

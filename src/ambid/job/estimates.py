@@ -12,10 +12,11 @@ from ambid.identify.estimate import Estimate
 if TYPE_CHECKING:
     from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.nonlinear.fit import NonlinearFit
+    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
 
 
-def read_estimate(path: str | Path) -> Estimate | BlackBoxFit | NonlinearFit:
-    """Read an estimate, a black-box fit or a nonlinear fit from its file.
+def read_estimate(path: str | Path) -> Estimate | NonlinearBearingEstimate | BlackBoxFit | NonlinearFit:
+    """Read an estimate, linear or nonlinear, or a black-box or nonlinear fit from its file.
 
     Parameters
     ----------
@@ -24,7 +25,7 @@ def read_estimate(path: str | Path) -> Estimate | BlackBoxFit | NonlinearFit:
 
     Returns
     -------
-    Estimate, BlackBoxFit or NonlinearFit
+    Estimate, NonlinearBearingEstimate, BlackBoxFit or NonlinearFit
 
     Raises
     ------
@@ -32,6 +33,7 @@ def read_estimate(path: str | Path) -> Estimate | BlackBoxFit | NonlinearFit:
         If the file cannot be read, is no JSON or no estimate.
     """
     from ambid.identify.blackbox.fit_file import SCHEMA, fit_from_json
+    from ambid.identify.estimate_file import SCHEMA as ESTIMATE
     from ambid.identify.estimate_file import estimate_from_json
     from ambid.record.files import file_bytes, utf8_text
 
@@ -56,4 +58,8 @@ def read_estimate(path: str | Path) -> Estimate | BlackBoxFit | NonlinearFit:
 
             return nonlinear_fit_from_json(document, f"fit {path}")
         return fit_from_json(document, f"fit {path}")
+    if isinstance(document, dict) and document.get("schema") == ESTIMATE and "law" in document:
+        from ambid.identify.nonlinear_bearing.result_file import bearing_from_json
+
+        return bearing_from_json(document, f"estimate {path}")
     return estimate_from_json(document, f"estimate {path}")

@@ -187,8 +187,8 @@ def _read(path: object) -> Estimate:
     found = read_estimate(path)
     if not isinstance(found, Estimate):
         raise EstimationError(
-            f"{path} holds a black-box fit; tracking starts from physical parameters. Give what 'ambid identify --json'"
-            " wrote"
+            f"{path} holds a black-box fit or a nonlinear estimate; tracking starts from linear physical parameters."
+            " Give what 'ambid identify --json' wrote without --nonlinear"
         )
     return found
 

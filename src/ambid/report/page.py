@@ -7,15 +7,19 @@ import io
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ambid.identify.estimate import Estimate
+from ambid.identify.estimate import Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.figures import Evidence, figures, save
 from ambid.report.numbers import quantity
 from ambid.report.text import delay_lines, fit_rows, other_warnings, validation_rows, verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _CAPTIONS = {
     "signals": (
@@ -50,42 +54,71 @@ def report_html(evidence: Evidence, *, made: str = "") -> str:
     str
         HTML; figures are inside it.
     """
+    return rendered(_content(evidence, made))
+
+
+def rendered(content: Mapping[str, Any]) -> str:
+    """Fill the page.
+
+    Parameters
+    ----------
+    content : Mapping[str, object]
+        What its template names.
+
+    Returns
+    -------
+    str
+        HTML; texts are escaped.
+    """
     from jinja2 import Environment, StrictUndefined
 
     source = files("ambid").joinpath("data", "report.html.j2").read_text(encoding="utf-8")
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(source)
-    return template.render(**_content(evidence, made))
+    return template.render(**content)
 
 
 def _content(evidence: Evidence, made: str) -> dict[str, Any]:
     e = evidence.estimate
     samples, rate = int(str(e.record["samples"])), float(str(e.record["rate_hz"]))
-    correlation = _correlations(e)
+    meaning = {spec.name: spec.meaning for spec in model(e.model).parameters}
     return {
         "title": f"{e.record.get('file') or 'record'}: physical parameters",
         "subtitle": f"{e.rig.get('name') or 'no rig'} – model {e.model}, {samples} samples at {rate:g} Hz"
         f" ({samples / rate:.4g} s), search {e.status}",
         "status": e.status,
         "warnings": other_warnings(e),
-        "parameters": _parameters(e),
+        "parameters": parameter_cells(e.parameters, meaning),
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),
-        "correlations": list(zip(e.covariance_names, correlation, strict=True)),
+        "correlations": list(zip(e.covariance_names, correlations(e.covariance), strict=True)),
+        "curves": [],
         "delays": delay_lines(e),
         "fits": fit_rows(e),
         "checks": [{"name": name, "passed": c.passed, "detail": c.detail} for name, c in e.checks.items()],
         "validation": None if e.validation is None else _validation(e.validation),
-        "figures": _figures(evidence),
+        "figures": embedded(figures(evidence), _CAPTIONS),
         "provenance": _provenance(e, made),
         "history": _listed(e.record.get("history")),
         "rig": str(e.rig.get("text") or ""),
     }
 
 
-def _parameters(e: Estimate) -> list[dict[str, str]]:
-    meaning = {spec.name: spec.meaning for spec in model(e.model).parameters}
+def parameter_cells(parameters: Sequence[EstimatedParameter], meaning: Mapping[str, str]) -> list[dict[str, str]]:
+    """Make the rows of the table of parameters.
+
+    Parameters
+    ----------
+    parameters : sequence of EstimatedParameter
+    meaning : Mapping[str, str]
+        What each is, in a line.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``meaning``, ``text``, ``interval``, ``si``, ``verdict`` and ``style`` of each.
+    """
     rows = []
-    for p in e.parameters:
+    for p in parameters:
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
         style = "dim" if p.role == "fixed" else "good" if p.identifiable else "bad"
         interval = f"{q.low} … {q.high}" if q.low else ""
@@ -96,9 +129,19 @@ def _parameters(e: Estimate) -> list[dict[str, str]]:
     return rows
 
 
-def _correlations(e: Estimate) -> list[list[str]]:
-    sd = np.sqrt(np.diag(e.covariance))
-    return [[f"{x:.3f}" for x in row] for row in e.covariance / np.outer(sd, sd)]
+def correlations(covariance: NDArray[np.float64]) -> list[list[str]]:
+    """Write a covariance as correlations.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n)
+
+    Returns
+    -------
+    list of list of str
+    """
+    sd = np.sqrt(np.diag(covariance))
+    return [[f"{x:.3f}" for x in row] for row in covariance / np.outer(sd, sd)]
 
 
 def _validation(validation: Mapping[str, Any]) -> dict[str, Any]:
@@ -106,14 +149,37 @@ def _validation(validation: Mapping[str, Any]) -> dict[str, Any]:
     return {"fits": validation_rows(validation), "checks": checks}
 
 
-def _figures(evidence: Evidence) -> list[dict[str, str]]:
+def embedded(drawn: Mapping[str, Figure], captions: Mapping[str, tuple[str, str]]) -> list[dict[str, str]]:
+    """Put figures into the page.
+
+    Parameters
+    ----------
+    drawn : Mapping[str, matplotlib.figure.Figure]
+    captions : Mapping[str, (str, str)]
+        Title and caption of each.
+
+    Returns
+    -------
+    list of dict
+        ``title``, ``caption`` and ``png`` of each.
+    """
     found = []
-    for name, figure in figures(evidence).items():
-        title, caption = _CAPTIONS[name]
+    for name, figure in drawn.items():
+        title, caption = captions[name]
         buffer = io.BytesIO()
         save(figure, buffer, kind="png")
         found.append({"title": title, "caption": caption, "png": base64.b64encode(buffer.getvalue()).decode()})
     return found
+
+
+def library_versions() -> str:
+    """Name the libraries that a result hangs on, with their versions.
+
+    Returns
+    -------
+    str
+    """
+    return ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
 
 
 def _provenance(e: Estimate, made: str) -> list[tuple[str, str]]:
@@ -122,7 +188,7 @@ def _provenance(e: Estimate, made: str) -> list[tuple[str, str]]:
     rows += [("operating point", ", ".join(f"{role} {x:.6g}" for role, x in e.operating_point.items()) + " (SI)")]
     rows += [("computing time", f"{sum(e.timing_s.values()):.3g} s")] if e.timing_s else []
     rows += [("made", made)] if made else []
-    return [*rows, ("versions", ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]
+    return [*rows, ("versions", library_versions())]
 
 
 def _listed(history: object) -> Sequence[str]:

@@ -14,7 +14,7 @@ from ambid.units import Unit, parse_unit
 if TYPE_CHECKING:
     from ambid.rig.schema import MagnetEntry, ParameterEntry
 
-_PAIR_ONLY, _EXPONENTIAL, _HYPERBOLIC = ("i0",), ("L_g", "zeta"), ("k", "s")
+_EXPONENTIAL, _HYPERBOLIC = ("L_g", "zeta"), ("k", "s")
 
 
 def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
@@ -88,10 +88,6 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
         raise RigError(
             f"{where}: [magnet] is given; model {plant.name!r} has no nonlinear magnet. Remove it, or take 'one-axis'"
         )
-    if entry.kind == "pair" and entry.gap == "exponential":
-        raise RigError(
-            f"{where}: magnet.gap is 'exponential'; a pair has the hyperbolic law. Remove gap or correct kind"
-        )
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
     for name, given in entry.parameters.items():
         place = f"{where}: magnet.parameters.{name}"
@@ -105,19 +101,21 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
         if name in NOT_NEGATIVE and given.value is not None and not _allowed(given.value, given.role):
             rule = "must not be negative" if given.value < 0 else "must be positive unless it is fixed"
             raise RigError(f"{place} ({specs[name].meaning}) is {given.value} {given.unit}; it {rule}. Correct value")
-        _check_belongs(name, entry, place)
-    return RigMagnet(
-        kind=entry.kind,
-        gap=_gap(entry, where),
-        saturation=entry.saturation,
-        rise=entry.rise,
-        eddy=entry.eddy,
-        drift=entry.drift,
-        off_below=entry.off_below,
-        parameters=tuple(
-            parameter_of(specs[n], p, f"{where}: magnet.parameters.{n}") for n, p in entry.parameters.items()
-        ),
-    )
+    known = tuple(parameter_of(specs[n], p, f"{where}: magnet.parameters.{n}") for n, p in entry.parameters.items())
+    try:
+        return RigMagnet(
+            kind=entry.kind,
+            gap=_gap(entry, where),
+            asymmetric=entry.asymmetric,
+            saturation=entry.saturation,
+            rise=entry.rise,
+            eddy=entry.eddy,
+            drift=entry.drift,
+            off_below=entry.off_below,
+            parameters=known,
+        )
+    except RigError as error:
+        raise RigError(f"{where}: {error}") from None
 
 
 def _allowed(value: float, role: str) -> bool:
@@ -135,21 +133,6 @@ def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"]
             f"{where}: [magnet.parameters] names numbers of both gap laws (k, s and L_g, zeta). Leave one pair out"
         )
     return entry.gap or (told[0] if told else None)
-
-
-def _check_belongs(name: str, entry: MagnetEntry, place: str) -> None:
-    """Refuse a number of a law that the other entries exclude: it would be passed over in silence."""
-    excluded = {
-        f"kind = {entry.kind!r}": _EXPONENTIAL if entry.kind == "pair" else _PAIR_ONLY,
-        "gap = 'hyperbolic'": _EXPONENTIAL if entry.gap == "hyperbolic" else (),
-        "gap = 'exponential'": _HYPERBOLIC if entry.gap == "exponential" else (),
-        "saturation = false": () if entry.saturation else ("sigma",),
-        "rise = false": ("L_rise", "i_knee") if entry.rise is False else (),
-        "eddy = false": () if entry.eddy else ("a",),
-    }
-    for setting, names in excluded.items():
-        if name in names:
-            raise RigError(f"{place} is given, but magnet.{setting} leaves it out. Remove one, or correct it")
 
 
 def unit_of(text: str, place: str) -> Unit:

@@ -124,6 +124,8 @@ class RigMagnet:
         One magnet or two that oppose each other; "auto": a pair where the current changes its sign.
     gap : {"hyperbolic", "exponential"} or None
         Gap law of one magnet; None: the records decide.
+    asymmetric : bool or None
+        Whether the magnets of a pair may differ in strength and bias (k_asym, i0_asym); None: the records decide.
     saturation : bool
         Whether the iron may saturate (sigma).
     rise : bool or None
@@ -138,12 +140,50 @@ class RigMagnet:
 
     kind: Literal["auto", "single", "pair"] = "auto"
     gap: Literal["hyperbolic", "exponential"] | None = None
+    asymmetric: bool | None = None
     saturation: bool = False
     rise: bool | None = None
     eddy: bool = False
     drift: bool = False
     off_below: float | None = None
     parameters: tuple[Parameter, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.asymmetric and self.kind != "pair":
+            raise RigError(
+                f"magnet.asymmetric is set; kind = {self.kind!r} is no pair. Remove it, or give kind = 'pair'"
+            )
+        if self.kind == "pair" and self.gap == "exponential":
+            raise RigError("magnet.gap is 'exponential'; a pair has the hyperbolic law. Remove gap, or correct kind")
+        excluded: Mapping[str, tuple[str, ...]] = {
+            f"kind = {self.kind!r}": ("L_g", "zeta") if self.kind == "pair" else ("i0", "k_asym", "i0_asym"),
+            f"gap = {self.gap!r}": ("k", "s") if self.gap == "exponential" else ("L_g", "zeta") if self.gap else (),
+            "asymmetric = false": ("k_asym", "i0_asym") if self.asymmetric is False else (),
+            "saturation = false": () if self.saturation else ("sigma",),
+            "rise = false": ("L_rise", "i_knee") if self.rise is False else (),
+            "eddy = false": () if self.eddy else ("a",),
+        }
+        for p in self.parameters:
+            for setting, names in excluded.items():
+                if p.name in names:  # it would be passed over in silence
+                    raise RigError(
+                        f"magnet.parameters.{p.name} is given, but magnet.{setting} leaves it out. Remove one,"
+                        " or correct it"
+                    )
+
+    def known(self, name: str) -> Parameter | None:
+        """Return what is known of a number.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``"L_leak"``.
+
+        Returns
+        -------
+        Parameter or None
+        """
+        return next((p for p in self.parameters if p.name == name), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

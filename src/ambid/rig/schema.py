@@ -149,6 +149,7 @@ class MagnetEntry(_Entry):
 
     kind: Literal["auto", "single", "pair"] = "auto"
     gap: Literal["hyperbolic", "exponential"] | None = None
+    asymmetric: Annotated[bool, Field(strict=True)] | None = None
     saturation: Annotated[bool, Field(strict=True)] = False
     rise: Annotated[bool, Field(strict=True)] | None = None
     eddy: Annotated[bool, Field(strict=True)] = False

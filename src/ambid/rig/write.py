@@ -132,9 +132,15 @@ def _parameter_line(p: Parameter) -> str:
 def _magnet_lines(magnet: RigMagnet) -> list[str]:
     lines = ["[magnet]", f'kind = "{magnet.kind}"']
     lines += [f'gap = "{magnet.gap}"'] if magnet.gap else []
-    switches = {"saturation": magnet.saturation, "eddy": magnet.eddy, "drift": magnet.drift}
+    switches = {
+        "asymmetric": magnet.asymmetric,
+        "saturation": magnet.saturation,
+        "eddy": magnet.eddy,
+        "drift": magnet.drift,
+    }
     lines += [f"{name} = true" for name, on in switches.items() if on]
-    lines += [] if magnet.rise is None else [f"rise = {str(magnet.rise).lower()}"]
+    choices = {"asymmetric": magnet.asymmetric, "rise": magnet.rise}
+    lines += [f"{name} = {str(on).lower()}" for name, on in choices.items() if on is not None]
     lines += [] if magnet.off_below is None else [f"off_below = {magnet.off_below!r}"]
     return [*lines, "[magnet.parameters]", *map(_parameter_line, magnet.parameters)] if magnet.parameters else lines
 

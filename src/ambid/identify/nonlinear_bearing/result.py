@@ -50,7 +50,10 @@ class Curves:
     position, current : ndarray, shape (n_points,), m and A
     force, k_i, k_x, L : Curve
     inside : ndarray, shape (n_points,), bool
-        Whether the records came there; elsewhere the law extrapolates, and the band does not know it.
+        Whether the free rotor came there; elsewhere the law extrapolates force, k_i and k_x, and the band does not
+        know it.
+    coil_inside : ndarray, shape (n_points,), bool
+        Whether any record came there, of a held rotor too: where L was seen.
     """
 
     position: Array
@@ -60,6 +63,7 @@ class Curves:
     k_x: Curve
     L: Curve
     inside: NDArray[np.bool_]
+    coil_inside: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,6 +75,8 @@ class NonlinearBearingEstimate:
     status : {"converged", "stalled"}
     law : MagnetLaw
         Which co-energy.
+    eddy, drift : bool
+        Whether the force has a pole a/(s + a), and whether a slowly walking force was allowed for.
     records : tuple of Mapping
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` of each.
     parameters : tuple of EstimatedParameter
@@ -86,18 +92,29 @@ class NonlinearBearingEstimate:
     fit : Mapping[str, Mapping[str, OutputFit]]
         By record and output.
     range : Mapping[str, (float, float)]
-        ``position`` and ``current`` between which the records moved, SI.
-    hull : ndarray, shape (n_corners, 2)
-        Corners of the convex hull of all (position, current) of the records, counter-clockwise.
+        ``position`` and ``current`` between which the free rotor moved, SI.
+    usual : Mapping[str, (float, float)]
+        ``position`` and ``current`` between which the free rotor was for 95 % of the time, SI.
+    operating_point : Mapping[str, float]
+        Means of ``position`` and ``current`` of the records in which the rotor moved, SI.
+    hull, coil_hull : ndarray, shape (n_corners, 2)
+        Corners of the convex hull of all (position, current), counter-clockwise: of the records in which the rotor
+        moved, and of all.
     criterion, bic : float
         Twice the negative log-likelihood but for constants, and with its price for each number.
     checks : Mapping[str, Check]
+    validation : Mapping[str, object] or None
+        Results on a further record.
     warnings : tuple of str
     timing_s : Mapping[str, float]
+    rig : Mapping[str, object]
+        Name and text of the rig, so that another record can be read alike.
     """
 
     status: Literal["converged", "stalled"]
     law: MagnetLaw
+    eddy: bool
+    drift: bool
     records: tuple[Mapping[str, object], ...]
     parameters: tuple[EstimatedParameter, ...]
     covariance_names: tuple[str, ...]
@@ -107,12 +124,22 @@ class NonlinearBearingEstimate:
     noise: Mapping[str, Mapping[str, float]]
     fit: Mapping[str, Mapping[str, OutputFit]]
     range: Mapping[str, tuple[float, float]]
+    usual: Mapping[str, tuple[float, float]]
+    operating_point: Mapping[str, float]
     hull: Array
+    coil_hull: Array
     criterion: float
     bic: float
     checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
+    validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def model(self) -> str:
+        """Name of the linear model that it is at each operating point."""
+        return "one-axis"
 
     @property
     def values(self) -> dict[str, float]:
@@ -141,6 +168,32 @@ class NonlinearBearingEstimate:
             If there is none of that name.
         """
         return parameter_named(self.parameters, name)
+
+    def dumps(self) -> str:
+        """Return the estimate as JSON text, schema ``ambid.estimate/1``.
+
+        Returns
+        -------
+        str
+        """
+        from ambid.identify.nonlinear_bearing.result_file import bearing_text
+
+        return bearing_text(self)
+
+    def delay_samples(self, rate_hz: float) -> float | None:
+        """Return the delay of the voltage at a sampling rate.
+
+        Parameters
+        ----------
+        rate_hz : float
+
+        Returns
+        -------
+        float or None
+            In samples; None at a rate that no record had.
+        """
+        found = self.delay.get(f"{rate_hz:g} Hz")
+        return None if found is None else found.samples + found.fraction
 
     def curves(self, position: ArrayLike, current: ArrayLike) -> Curves:
         """Return force, k_i, k_x and L at points, with standard deviations by the delta method.
@@ -171,19 +224,35 @@ class NonlinearBearingEstimate:
         force, k_x, k_i, ell = (
             Curve(unit=unit, value=found[:, c], sd=sd[:, c]) for c, unit in enumerate(("N", "N/m", "N/A", "H"))
         )
+        points = np.column_stack([x, i])
         return Curves(
             position=np.array(x), current=np.array(i), force=force, k_i=k_i, k_x=k_x, L=ell,
-            inside=self._inside(np.column_stack([x, i])),
+            inside=self.covers(points), coil_inside=_within(self.coil_hull, points),
         )  # fmt: skip
 
     def _along(self, x: Array, i: Array, point: int) -> Array:
         """Derivatives of force, k_x, k_i, L by position (0) or current (1), in shape (n_points, 4)."""
         return self.law.gradients(x, i, self.values)[:, :, point]
 
-    def _inside(self, points: Array) -> NDArray[np.bool_]:
-        """Tell which (position, current) lie in the hull, edges included."""
-        size = np.ptp(self.hull, axis=0)
-        corners, at = self.hull / size, points / size
-        edge = np.roll(corners, -1, axis=0) - corners
-        side = edge[:, 0] * (at[:, None, 1] - corners[:, 1]) - edge[:, 1] * (at[:, None, 0] - corners[:, 0])
-        return np.asarray(np.all(side > -1e-9, axis=1))
+    def covers(self, points: Array) -> NDArray[np.bool_]:
+        """Tell which points the free rotor came to: inside the convex hull of its records, edges included.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n_points, 2)
+            Position in m and current in A.
+
+        Returns
+        -------
+        ndarray, shape (n_points,), bool
+        """
+        return _within(self.hull, points)
+
+
+def _within(hull: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points lie left of all edges of a polygon that goes round counter-clockwise."""
+    size = np.ptp(hull, axis=0)
+    corners, at = hull / size, points / size
+    edge = np.roll(corners, -1, axis=0) - corners
+    side = edge[:, 0] * (at[:, None, 1] - corners[:, 1]) - edge[:, 1] * (at[:, None, 0] - corners[:, 0])
+    return np.asarray(np.all(side > -1e-9, axis=1))

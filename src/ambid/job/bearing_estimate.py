@@ -1,0 +1,232 @@
+"""Judging of a nonlinear bearing's fit on its own records, and putting its estimate together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Literal
+
+from ambid.job.bearing_records import TakenRecord
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ambid.identify.estimate import Check, Delay, EstimatedParameter, OutputFit
+    from ambid.identify.nonlinear_bearing.likelihood import BearingFit
+    from ambid.identify.nonlinear_bearing.residual_test import WhitenessTest
+    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.identify.nonlinear_bearing.uncertainty import BearingUncertainty
+
+_P_LEAST = 1e-3  # as for the linear model
+_INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
+_ROLES = ("position", "current")
+
+
+def judged(
+    fit: BearingFit, known: BearingUncertainty, taken: Sequence[TakenRecord], *, delay_given: bool
+) -> NonlinearBearingEstimate:
+    """Check a fit on its own records and put the estimate together.
+
+    Parameters
+    ----------
+    fit : BearingFit
+        Not failed.
+    known : BearingUncertainty
+        Of that fit.
+    taken : sequence of TakenRecord
+        The records that it came from.
+    delay_given : bool
+        Whether the rig gives the delay.
+
+    Returns
+    -------
+    NonlinearBearingEstimate
+        Without validation, timings and rig.
+    """
+    import numpy as np
+
+    from ambid.identify.nonlinear_bearing.problem import LEVELS
+    from ambid.identify.nonlinear_bearing.residual_test import whiteness
+    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+
+    problem, names = fit.problem, _names(fit)
+    tests = [whiteness(fit, r) for r in range(len(problem.records))]
+    white = _white(tests, names)
+    robust = not white.passed or known.inflation > _INFLATION or fit.status != "converged"
+    parameters = _parameters(fit, known, robust=robust)
+    checks = {"residuals_white": white, "identifiable": _shown(parameters)} | _gravity(fit)
+    noise = {
+        n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
+        for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
+    }
+    points = np.concatenate([r.y for r in problem.records])
+    moving = np.concatenate([r.y for r in problem.records if not r.held])
+    changed = tuple(t.warning for t in taken if t.warning)
+    return NonlinearBearingEstimate(
+        status="converged" if fit.status == "converged" else "stalled",
+        law=problem.law,
+        eddy=problem.eddy,
+        drift=problem.drift,
+        records=tuple(t.remembered for t in taken),
+        parameters=parameters,
+        covariance_names=known.names,
+        covariance=known.covariance(robust=robust),
+        covariance_method="robust" if robust else "information",
+        delay=_delays(fit, known, given=delay_given),
+        noise=noise,
+        fit=_fits(fit, tests, names),
+        range=_between(moving.min(axis=0), moving.max(axis=0)),
+        usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
+        operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
+        hull=_hull(moving),
+        coil_hull=_hull(points),
+        criterion=fit.criterion,
+        bic=fit.criterion + problem.size * float(np.log(problem.n_used)),
+        checks=checks,
+        warnings=_warnings(fit, checks, robust=robust) + changed,
+    )
+
+
+def _white(tests: Sequence[WhitenessTest], names: Sequence[str]) -> Check:
+    from ambid.identify.estimate import Check
+
+    worst = min(range(len(tests)), key=lambda r: tests[r].p)
+    return Check(
+        passed=tests[worst].p >= _P_LEAST, p=tests[worst].p,
+        detail=f"one-step errors against their past: p = {tests[worst].p:.2g} on {names[worst]}, largest correlation "
+        f"{max(t.largest for t in tests):.3f}",
+        values={n: t.p for n, t in zip(names, tests, strict=True)},
+    )  # fmt: skip
+
+
+def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
+    import math
+
+    from ambid.identify.estimate import Delay
+
+    found = {}
+    for rate in fit.problem.delays:
+        total = fit.problem.delay_at(fit.vector, rate)
+        whole = math.floor(total)
+        found[f"{rate:g} Hz"] = Delay(
+            samples=whole, fraction=total - whole, sd=known.delay_sd.get(rate), how="given" if given else "estimated"
+        )
+    return found
+
+
+def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
+    import math
+
+    from ambid.identify.estimate import OutputFit
+
+    found: dict[str, dict[str, OutputFit]] = {}
+    for name, record, test in zip(names, fit.problem.records, tests, strict=True):
+        spread = record.y.std(axis=0).tolist()
+        found[name] = {
+            role: OutputFit(one_step=1.0 - sd / spread[c], simulation=None, innovation_sd=sd)
+            for c, (role, sd) in enumerate(zip(_ROLES, test.innovation_sd, strict=True))
+            if math.isfinite(sd)
+        }
+    return found
+
+
+def _between(low: NDArray[np.float64], high: NDArray[np.float64]) -> dict[str, tuple[float, float]]:
+    return {role: (a, b) for role, a, b in zip(_ROLES, low.tolist(), high.tolist(), strict=True)}
+
+
+def _names(fit: BearingFit) -> list[str]:
+    """Names of the records, each its own."""
+    found: list[str] = []
+    for r in fit.problem.records:
+        found.append(r.name if r.name not in found else f"{r.name} ({len(found) + 1})")
+    return found
+
+
+def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
+    """Every number that acts, as it came out."""
+    import numpy as np
+
+    from ambid.identify.estimate import EstimatedParameter
+    from ambid.identify.nonlinear_bearing.problem import UNITS
+    from ambid.identify.uncertainty import WEAK
+
+    law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
+    sds = np.sqrt(np.diag(known.covariance(robust=robust)))
+    acts = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair, "a": fit.problem.eddy}
+    acts |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
+    drop = values["v_drop"] != 0.0 or any(n.name == "v_drop" and n.estimated for n in fit.problem.numbers)
+    acts |= dict.fromkeys(("v_drop", "i_drop"), drop)
+    for n in fit.problem.numbers:
+        if not acts.get(n.name, True):
+            continue
+        j = known.names.index(n.name) if n.estimated else -1
+        sd, value = float(sds[j]) if n.estimated else 0.0, values[n.name]
+        prior = np.isfinite(n.prior_sd)
+        size = max(n.magnitude, abs(value)) if n.signed else value
+        share = None
+        if prior and n.estimated:
+            share = float(np.clip(1.0 - known.information[j, j] / n.prior_sd**2, 0.0, 1.0))
+        role: Literal["free", "fixed", "prior"] = "fixed" if not n.estimated else "prior" if prior else "free"
+        found.append(
+            EstimatedParameter(
+                name=n.name,
+                unit=UNITS[n.name],
+                value=value,
+                sd=sd,
+                ci95=(value - 1.96 * sd, value + 1.96 * sd),
+                role=role,
+                identifiable=not n.estimated or sd < WEAK * abs(size),
+                data_share=share,
+            )
+        )
+    return tuple(found)
+
+
+def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
+    from ambid.identify.estimate import Check
+
+    hidden = [p.name for p in parameters if not p.identifiable]
+    detail = "the records show every number" if not hidden else (
+        f"the records do not show {', '.join(hidden)} (relative standard deviation above 25 %): fix them, "
+        "give a prior, or record with more motion"
+    )  # fmt: skip
+    return Check(passed=not hidden, detail=detail)
+
+
+def _gravity(fit: BearingFit) -> dict[str, Check]:
+    """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
+    import numpy as np
+
+    from ambid.identify.estimate import Check
+
+    law, values = fit.problem.law, fit.problem.values(fit.vector)
+    weight = values["m"] * values["g"]
+    if law.pair or weight == 0.0:
+        return {}
+    means = np.array([r.y.mean(axis=0) for r in fit.problem.records if not r.held])
+    force = law.table(means[:, 0] - values["x_offset"], means[:, 1] - values["i_offset"], values)[0][:, 0]
+    off = float(np.max(np.abs(force / weight + 1.0)))
+    detail = f"the magnet's mean force differs from the weight by at most {off:.1%} on any record"
+    return {"carries_its_weight": Check(passed=off < 0.1, detail=detail, values={"largest": off})}
+
+
+def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners of the convex hull, counter-clockwise."""
+    from scipy.spatial import ConvexHull
+
+    found: NDArray[np.float64] = points[ConvexHull(points / points.std(axis=0)).vertices]
+    return found
+
+
+def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
+    """What a reader has to know before using the numbers, most important first."""
+    found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
+    found += [c.detail for c in checks.values() if not c.passed]
+    if robust:
+        found.append(
+            "the model explains the records only in part: standard deviations are robust ones (scatter over the "
+            "records), and cannot cover a bias that is the same everywhere"
+        )
+    if fit.problem.drift:
+        found.append("a slowly walking force takes up what the law leaves over; forces at rest count for less then")
+    return tuple(found)

@@ -1,0 +1,272 @@
+"""Records of a nonlinear bearing as its predictor sees them, through a rig that says what is known of the magnet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ambid.errors import EstimationError, nearest
+from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.parameters import Parameter
+from ambid.record import Record
+from ambid.rig import Rig, RigMagnet, default_rig, load_rig
+
+if TYPE_CHECKING:
+    from ambid.identify.nonlinear_bearing.problem import BearingRecord
+
+Magnet = MagnetLaw | Literal["auto", "single", "pair"]
+
+_OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
+_LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
+_REVERSED = 0.2  # largest current backwards over that forwards from which two magnets are taken
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TakenRecord:
+    """A record that was read for a nonlinear bearing.
+
+    Attributes
+    ----------
+    record : BearingRecord
+        What the predictor runs over.
+    remembered : Mapping[str, object]
+        ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` and ``history``, for the estimate.
+    warning : str
+        What was changed in it; empty if nothing.
+    start_s : float
+        Time of its first sample in s.
+    """
+
+    record: BearingRecord
+    remembered: Mapping[str, object]
+    warning: str
+    start_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """How files are read.
+
+    Attributes
+    ----------
+    from_s, to_s : float or None
+        Part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones.
+    rate_hz : float or None
+        For files without time.
+    gaps : str or None
+        ``"error"``, ``"interpolate"`` or ``"cut"``.
+    """
+
+    from_s: float | None = None
+    to_s: float | None = None
+    rate_hz: float | None = None
+    gaps: str | None = None
+
+
+def bearing_rig(
+    rig: Rig | str | Path | None,
+    *,
+    magnet: Magnet | None = None,
+    parameters: Sequence[Parameter] = (),
+    eddy: bool = False,
+    drift: bool = False,
+    off_below: float | None = None,
+) -> Rig:
+    """Return a rig whose magnet is known as it says, but for what is given here.
+
+    Parameters
+    ----------
+    rig : Rig, str, Path or None
+        None: nothing is known, columns are named like the roles.
+    magnet : MagnetLaw, str or None
+        Kind or whole law; None: as the rig says.
+    parameters : sequence of Parameter
+        Each instead of the rig's.
+    eddy, drift : bool
+        Beside what the rig says.
+    off_below : float or None
+        In V; None: as the rig says.
+
+    Returns
+    -------
+    Rig
+        With a `magnet`.
+
+    Raises
+    ------
+    EstimationError
+        If the rig is of another model, or a number is not known.
+    RigError
+        If what is known contradicts itself.
+    """
+    from ambid.identify.nonlinear_bearing.problem import UNITS
+
+    bench = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
+    if bench.model != "one-axis":
+        raise EstimationError(
+            f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
+        )
+    for p in parameters:
+        if p.name not in UNITS:
+            raise EstimationError(
+                f"a nonlinear bearing has no number {p.name!r}; it has {', '.join(UNITS)}."
+                f"{nearest(p.name, list(UNITS))}"
+            )
+    before, given = bench.magnet or RigMagnet(), {p.name: p for p in parameters}
+    kept = [p for p in before.parameters if p.name not in given]
+    new = [p for p in parameters if p.name not in _LINEAR]
+    known = replace(
+        before,
+        eddy=before.eddy or eddy,
+        drift=before.drift or drift,
+        off_below=before.off_below if off_below is None else off_below,
+        parameters=(),
+    )
+    if isinstance(magnet, MagnetLaw):
+        kind: Literal["single", "pair"] = "pair" if magnet.pair else "single"
+        known = replace(
+            known,
+            kind=kind,
+            gap=magnet.gap,
+            asymmetric=magnet.asymmetric if magnet.pair else None,
+            saturation=magnet.saturation,
+            rise=magnet.rise,
+        )
+    elif magnet is not None:
+        known = replace(known, kind=magnet)
+    return replace(
+        bench,
+        magnet=replace(known, parameters=(*kept, *new)),
+        parameters=tuple(given.get(p.name, p) for p in bench.parameters),
+    )
+
+
+def known_numbers(rig: Rig) -> dict[str, Parameter]:
+    """Return what a rig knows of the numbers of a nonlinear bearing.
+
+    Parameters
+    ----------
+    rig : Rig
+        With a `magnet`.
+
+    Returns
+    -------
+    dict of str to Parameter
+        Its m, R and c, and those of the magnet.
+    """
+    assert rig.magnet is not None
+    return {**{n: rig.parameter(n) for n in _LINEAR}, **{p.name: p for p in rig.magnet.parameters}}
+
+
+def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
+    """Return the laws between which the likelihood is to decide.
+
+    Parameters
+    ----------
+    known : RigMagnet
+    records : sequence of BearingRecord
+        In which the rotor moves.
+
+    Returns
+    -------
+    laws : list of MagnetLaw
+    extend : bool
+        Whether a rising leakage, and unequal magnets of a pair, are to be tried beyond them.
+    """
+    kind = known.kind
+    if kind == "auto" and known.gap == "exponential":
+        kind = "single"
+    if kind == "auto" and records:
+        low, high = min(r.y[:, 1].min() for r in records), max(r.y[:, 1].max() for r in records)
+        kind = "pair" if low < -_REVERSED * high else "single"
+    rise, pair = bool(known.rise), kind == "pair"
+    gaps: tuple[Literal["hyperbolic", "exponential"], ...] = ("hyperbolic", "exponential")
+    if known.gap or pair:
+        gaps = (known.gap or "hyperbolic",)
+    laws = [
+        MagnetLaw(gap=gap, pair=pair, asymmetric=bool(known.asymmetric), saturation=known.saturation, rise=rise)
+        for gap in gaps
+    ]
+    return laws, known.rise is None and known.asymmetric is None
+
+
+def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
+    """Read a record as the predictor sees it.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+        A file in the rig's columns, or a record whose channels are named by role.
+    rig : Rig
+        With a `magnet`.
+    how : Reading
+    held : bool
+        The rotor is held at rest: all of the record is taken.
+
+    Returns
+    -------
+    TakenRecord
+
+    Raises
+    ------
+    AmbidError
+        If the file, its columns or the part break a rule.
+    """
+    import numpy as np
+
+    from ambid.identify.nonlinear_bearing.problem import BearingRecord
+    from ambid.job.physical import load
+
+    if held:
+        rig, how = (
+            replace(rig, record=replace(rig.record, from_s=None, to_s=None)),
+            replace(how, from_s=None, to_s=None),
+        )
+    bench = load(record, rig, from_s=how.from_s, to_s=how.to_s, rate_hz=how.rate_hz, gaps=how.gaps)
+    u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
+    warning, off = "", None if rig.magnet is None else rig.magnet.off_below
+    if rig.limits is not None:
+        low, high = rig.limits.voltage
+        beyond = int(np.count_nonzero((u < low) | (u > high)))
+        if beyond:
+            u = np.clip(u, low, high)
+            warning = f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
+    y = np.column_stack([bench["position"], bench["current"]])
+    taken = BearingRecord(
+        name=name,
+        rate_hz=bench.rate_hz,
+        u=u,
+        loose=np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0),
+        y=y,
+        valid=np.ones(y.shape, dtype=np.bool_),
+        held=held,
+    )
+    _check_moves(taken)
+    remembered = {
+        "samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
+        "file": bench.provenance.get("file"), "held": held, "history": [str(step) for step in bench.history],
+    }  # fmt: skip
+    return TakenRecord(record=taken, remembered=remembered, warning=warning, start_s=bench.start_s)
+
+
+_LEAST = 100  # samples
+
+
+def _check_moves(record: BearingRecord) -> None:
+    """Refuse what no number can come from."""
+    import numpy as np
+
+    if record.u.size < _LEAST:
+        raise EstimationError(
+            f"{record.name} has {record.u.size} samples; a nonlinear bearing wants {_LEAST} of each record. "
+            "Give a longer one, or leave it out"
+        )
+    channels = {"voltage": record.u, "current": record.y[:, 1]} | ({} if record.held else {"position": record.y[:, 0]})
+    for role, x in channels.items():
+        if not np.ptp(x) > 0.0:
+            raise EstimationError(
+                f"{record.name}: channel {role!r} is constant over the whole record; nothing can be estimated from it. "
+                "Check column and units, or leave it out"
+            )

@@ -1,0 +1,243 @@
+"""A nonlinear bearing on a record: its predictor run again, and judged where nothing is fitted any more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.errors import EstimationError
+from ambid.identify.estimate import Check
+from ambid.identify.nonlinear_bearing.likelihood import BearingFit, run
+from ambid.identify.nonlinear_bearing.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
+from ambid.identify.nonlinear_bearing.residual_test import whiteness
+from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+from ambid.validate.prediction import fit_of
+
+Array = NDArray[np.float64]
+
+_ROLES = ("position", "current")
+_NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
+_P_LEAST = 1e-3  # as at identification
+_RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
+_OUTSIDE = 0.05  # share of the samples beyond what the records covered that a check lets pass
+_WEIGHT = 0.1  # relative error of the force at rest that a check lets pass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingReplay:
+    """A record run through an estimate, SI units.
+
+    Attributes
+    ----------
+    fit : BearingFit
+        The estimate's problem on this record alone, with every number at its estimate.
+    noise_of : str
+        The record of the estimate whose noise levels were taken.
+    first : int
+        Sample at which row 0 of the arrays stands.
+    measured, predicted, innovations, sd : ndarray, shape (n_used, 2)
+        Position and current: measured, predicted from all samples before, their difference, and the standard deviation
+        that the predictor expects of it; of a held rotor the position is not predicted (NaN).
+    """
+
+    fit: BearingFit
+    noise_of: str
+    first: int
+    measured: Array
+    predicted: Array
+    innovations: Array
+    sd: Array
+
+
+def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_of: str | None = None) -> BearingReplay:
+    """Run a record through the predictor of an estimate.
+
+    Parameters
+    ----------
+    estimate : NonlinearBearingEstimate
+    record : BearingRecord
+        Of the same bench, at a rate of the records that it came from.
+    noise_of : str, optional
+        Name of the record of the estimate whose noise levels are taken; default: of those of this rate and kind, that
+        under which this record is likeliest.
+
+    Returns
+    -------
+    BearingReplay
+
+    Raises
+    ------
+    EstimationError
+        If no record of the estimate had this rate, this one is too short, or there is no predictor for it.
+    """
+    delay = estimate.delay_samples(record.rate_hz)
+    kind = [
+        name
+        for name, r in zip(estimate.noise, estimate.records, strict=True)
+        if bool(r["held"]) == record.held and abs(float(str(r["rate_hz"])) / record.rate_hz - 1.0) < 1e-6
+    ]
+    if delay is None or not kind:
+        rates = ", ".join(estimate.delay)
+        raise EstimationError(
+            f"{record.name} is sampled at {record.rate_hz:g} Hz, the estimate's predictor at {rates}; they have to "
+            "agree. Resample the record, or identify with it"
+        )
+    best, found = np.inf, None
+    for name in kind if noise_of is None else [noise_of]:
+        fit = _fit(estimate, record, estimate.noise[name], delay)
+        if fit.criterion < best:
+            best, found = fit.criterion, (name, fit)
+    if found is None:
+        raise EstimationError(
+            f"the estimate makes no predictor for {record.name}. Check that both are of the same bench"
+        )
+    name, fit = found
+    return _replayed(fit, name)
+
+
+def _fit(
+    estimate: NonlinearBearingEstimate, record: BearingRecord, levels: Mapping[str, float], delay: float
+) -> BearingFit:
+    """The estimate's problem on one record, and its criterion there (infinite without a predictor)."""
+    from ambid.identify.nonlinear_bearing.likelihood import criterion
+
+    values, law = estimate.values, estimate.law
+    numbers = tuple(
+        Number(
+            name=n,
+            value=values.get(n, _NEUTRAL.get(n, 0.0)),
+            estimated=n in estimate.covariance_names,
+            signed=n in SIGNED or (n == "s" and not law.pair),
+        )
+        for n in (*law.names, *BODY)
+    )
+    centre = np.log([[levels.get(name, min(levels.values())) for name in LEVELS]])
+    known = estimate.delay[f"{record.rate_hz:g} Hz"]
+    problem = BearingProblem(
+        law=law,
+        records=(record,),
+        numbers=numbers,
+        delays={record.rate_hz: delay},
+        free_delay=frozenset({record.rate_hz} if known.sd is not None else ()),
+        eddy=estimate.eddy,
+        drift=estimate.drift,
+        noise_center=centre,
+        skip=int(delay) + 8,
+    )
+    if record.u.size < problem.skip + 60:
+        raise EstimationError(
+            f"{record.name} has {record.u.size} samples; too few to judge an estimate. Give a longer one"
+        )
+    vector = problem.start()
+    value = criterion(problem, vector)
+    return BearingFit(problem=problem, vector=vector, at=None, criterion=value, status="stalled", evaluations=1)
+
+
+def _replayed(fit: BearingFit, name: str) -> BearingReplay:
+    record, first = fit.problem.records[0], fit.problem.skip
+    found = run(fit.problem, fit.vector, 0, slopes=False)
+    assert found is not None  # its criterion is finite
+    e, s = found.e[first:], found.s[first:]
+    return BearingReplay(
+        fit=fit,
+        noise_of=name,
+        first=first,
+        measured=record.y[first:],
+        predicted=record.y[first:] - e,
+        innovations=e,
+        sd=np.sqrt(s),
+    )
+
+
+def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[str, object]:
+    """Judge an estimate on a further record: nothing is fitted but the state at its beginning.
+
+    Parameters
+    ----------
+    estimate : NonlinearBearingEstimate
+    record : BearingRecord
+        Of a rotor that moves.
+
+    Returns
+    -------
+    dict
+        ``fit``: by output one_step, simulation (None: one magnet falls or clings), innovation_rms in SI and ratio to
+        that at identification; ``checks``: residuals_white, innovations_consistent, inside_range (how much of the
+        record lies beyond the positions and currents that the estimate has seen) and, for one magnet,
+        carries_its_weight, each with ``passed`` and ``detail``; ``passed``; ``samples``; ``outside``, share of the
+        record.
+
+    Raises
+    ------
+    EstimationError
+        As `replay`.
+    """
+    found = replay(estimate, record)
+    rms = np.sqrt(np.mean(found.innovations**2, axis=0))
+    before = [estimate.fit[found.noise_of][role].innovation_sd for role in _ROLES]
+    one_step, ratio = fit_of(found.innovations, found.measured), rms / np.array(before)
+    outside = 1.0 - float(np.mean(estimate.covers(record.y)))
+    test = whiteness(found.fit, 0)
+    checks = {
+        "residuals_white": Check(
+            passed=test.p >= _P_LEAST,
+            p=test.p,
+            detail=f"one-step errors against their past: p = {test.p:.2g}, largest correlation {test.largest:.3f}",
+        ),
+        "innovations_consistent": _consistent(ratio, found.noise_of),
+        "inside_range": _inside(estimate, record, outside),
+        **_carries(estimate, record),
+    }
+    return {
+        "fit": {
+            role: {
+                "one_step": float(one_step[j]),
+                "simulation": None,
+                "innovation_rms": float(rms[j]),
+                "ratio": float(ratio[j]),
+            }
+            for j, role in enumerate(_ROLES)
+        },
+        "checks": {n: {"passed": c.passed, "p": c.p, "detail": c.detail, **c.values} for n, c in checks.items()},
+        "passed": all(c.passed for c in checks.values()),
+        "samples": int(record.u.size),
+        "outside": outside,
+        "noise_of": found.noise_of,
+    }
+
+
+def _consistent(ratio: Array, noise_of: str) -> Check:
+    worst = int(np.argmax(np.abs(np.log(ratio))))
+    return Check(
+        passed=bool(np.all((ratio > 1 / _RATIO) & (ratio < _RATIO))),
+        values={f"{role}_ratio": float(x) for role, x in zip(_ROLES, ratio, strict=True)},
+        detail=f"one-step errors of {_ROLES[worst]} are {ratio[worst]:.2f} times as large as on {noise_of} "
+        f"at identification (within a factor {_RATIO:g})",
+    )
+
+
+def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:
+    low, high = record.y.min(axis=0), record.y.max(axis=0)
+    seen = estimate.range
+    detail = f"{100 * outside:.2g} % of the record lies outside the positions and currents that the estimate has seen"
+    if outside > _OUTSIDE:
+        detail += (
+            f" (here {1e3 * low[0]:.4g} to {1e3 * high[0]:.4g} mm, {low[1]:.3g} to {high[1]:.3g} A; seen "
+            f"{1e3 * seen['position'][0]:.4g} to {1e3 * seen['position'][1]:.4g} mm, "
+            f"{seen['current'][0]:.3g} to {seen['current'][1]:.3g} A): the law extrapolates there"
+        )
+    return Check(passed=outside <= _OUTSIDE, detail=detail, values={"outside": outside})
+
+
+def _carries(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[str, Check]:
+    """For one magnet: is the mean force on this record the weight?"""
+    weight = estimate.values["m"] * estimate.values["g"]
+    if estimate.law.pair or weight == 0.0:
+        return {}
+    at = estimate.curves(record.y[:, 0], record.y[:, 1])
+    off = float(np.mean(at.force.value)) / weight + 1.0
+    detail = f"the magnet's mean force differs from the weight by {off:.1%} on this record"
+    return {"carries_its_weight": Check(passed=abs(off) < _WEIGHT, detail=detail, values={"relative": off})}
