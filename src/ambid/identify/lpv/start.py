@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.identify.lpv.schedule import basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors
 from ambid.identify.networks.search import triangle_of
 
@@ -81,27 +82,33 @@ def from_earlier(shape: LpvShape, parts: Sequence[Part], first: int, old: LpvSha
 
 
 def padded(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
-    """Carry a model over to one with more functions of p, or with another error model, where both agree.
+    """Carry a model over to one with other functions of p, or with another error model.
 
     Parameters
     ----------
     shape : LpvShape
-        Legendre polynomials, or as many functions as before.
     old : LpvShape
+        Of the same basis.
     theta : ndarray, shape (n_theta of old,)
 
     Returns
     -------
     ndarray, shape (n_theta,)
-        Zeros where the old model has nothing.
+        Coefficients as near as can be over the range of p; zeros where the old model has none.
     """
+    grid = np.linspace(-1.0, 1.0, 33)
+
+    def carried(values: Array, n: int) -> Array:
+        before, after = (basis_values(grid, k, shape.basis) for k in (values.size, n))
+        return np.asarray(np.linalg.lstsq(after, before @ values, rcond=None)[0], dtype=np.float64)
+
     out = np.zeros(shape.n_theta)
     known = {name: k for k, name in enumerate(old.coefficients)}
     for k, name in enumerate(shape.coefficients):
         if name in known:
             source, target = theta[old.place(known[name])], shape.place(k)
-            n = min(source.size, target.stop - target.start)
-            out[target.start : target.start + n] = source[:n]
+            n = target.stop - target.start
+            out[target] = source if n == source.size else carried(source, n)
     return out
 
 

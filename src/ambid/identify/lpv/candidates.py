@@ -1,0 +1,332 @@
+"""Degree, form and error model of an LPV fit: candidates fitted and compared, and the search for their numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.lpv.choice import error_orders, information
+from ambid.identify.lpv.problem import LpvProblem
+from ambid.identify.lpv.schedule import Schedule
+from ambid.identify.lpv.settings import LpvSettings
+from ambid.identify.lpv.shape import LpvShape, Part, part_of, stable_process
+from ambid.identify.lpv.start import from_earlier, least_squares, padded, without_error_model
+from ambid.identify.networks.records import Scaled
+from ambid.identify.networks.search import search
+from ambid.identify.nonlinear.fit import LearningCurve
+from ambid.identify.nonlinear.progress import Tick, guessed, portions
+
+Array = NDArray[np.float64]
+
+_DEGREES = (0, 1, 2, 3)
+_SHORT, _USUAL = 15, 6.0  # iterations of a candidate; half of what a search takes
+_ENOUGH = 0.5  # gain of a candidate's criterion by an iteration below which it is judged
+
+
+@dataclass(slots=True)
+class Work:
+    """What a fit has come to, so that an interruption loses nothing.
+
+    Attributes
+    ----------
+    data : Scaled
+    records : sequence of IOData
+    schedule : Schedule
+    shape : LpvShape
+    theta : ndarray, shape (n_theta,), scaled
+    first : int
+        Errors count from this sample on.
+    status : {"converged", "stalled"}
+    curves : list of LearningCurve
+    warnings : list of str
+    tried : list of dict
+        Candidates with their criterion.
+    timing_s : dict of str to float
+    """
+
+    data: Scaled
+    records: Sequence[IOData]
+    schedule: Schedule
+    shape: LpvShape
+    theta: Array
+    first: int
+    status: Literal["converged", "stalled"] = "converged"
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    tried: list[dict[str, object]] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+    def parts(self, shape: LpvShape, schedule: Schedule | None = None) -> tuple[Part, ...]:
+        """Return the records, ready for a shape.
+
+        Parameters
+        ----------
+        shape : LpvShape
+        schedule : Schedule, optional
+            Another one than that of the fit.
+
+        Returns
+        -------
+        tuple of Part
+        """
+        of = schedule or self.schedule
+        return tuple(
+            part_of(shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
+            for x, (y, u) in zip(self.records, self.data.parts, strict=True)
+        )
+
+    def problem(self, shape: LpvShape, weight: float = 1.0) -> LpvProblem:
+        """Return what is searched in for a shape.
+
+        Parameters
+        ----------
+        shape : LpvShape
+        weight : float, optional
+            One over the standard deviation of the errors.
+
+        Returns
+        -------
+        LpvProblem
+        """
+        return LpvProblem(shape=shape, parts=self.parts(shape), first=self.first, weight=weight)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A fitted shape.
+
+    Attributes
+    ----------
+    shape : LpvShape
+    theta : ndarray, shape (n_theta,), scaled
+    cost : float
+        Sum of squared one-step errors, scaled; infinite where the predictor is unstable.
+    n, starts : int
+        Errors, and numbers that stand for what was before the records.
+    """
+
+    shape: LpvShape
+    theta: Array
+    cost: float = np.inf
+    n: int = 1
+    starts: int = 0
+
+    def value(self, criterion: str) -> float:
+        """Return an information criterion.
+
+        Parameters
+        ----------
+        criterion : {"bic", "aic", "aicc"}
+
+        Returns
+        -------
+        float
+            The smaller the better.
+        """
+        return information(criterion, self.cost, self.n, self.shape.n_theta, self.starts)
+
+
+def searched(
+    work: Work, shape: LpvShape, theta: Array, most: int, tick: Tick | None, stage: str, *, last: bool = False
+) -> Candidate:
+    """Search from a start.
+
+    Parameters
+    ----------
+    work : Work
+    shape : LpvShape
+    theta : ndarray, shape (n_theta,), scaled
+    most : int
+        Iterations.
+    tick : Tick or None
+        Of this part.
+    stage : str
+        For it.
+    last : bool, optional
+        Whether this is the last search of a fit, which is taken over as it goes and written down.
+
+    Returns
+    -------
+    Candidate
+        With infinite cost where the predictor is unstable at the start.
+    """
+    problem = work.problem(shape)
+    cost = problem.cost(theta)
+    if not np.isfinite(cost):
+        return Candidate(shape=shape, theta=theta)
+    weight = 1.0 / max(np.sqrt(cost / max(problem.n_errors, 1)), 1e-12)
+    problem = replace(problem, weight=float(weight))
+    count = 0
+
+    def counted(_: str, done: float | None = None, /) -> None:
+        nonlocal count
+        del done
+        if tick is not None:
+            tick(stage, guessed(count, _USUAL))
+        count += 1
+
+    def keep(found: Array) -> None:
+        if last:
+            work.theta = found
+
+    found = search(
+        problem,
+        theta,
+        stage=stage,
+        most=most,
+        tolerance=1e-9,
+        enough=1e-4 if last else _ENOUGH,
+        tick=counted,
+        keep=keep,
+    )
+    if last:
+        work.theta, work.status = found.theta, "converged" if found.converged else "stalled"
+        work.curves.append(
+            LearningCurve(
+                method="Levenberg-Marquardt, prediction errors",
+                seconds=np.array(found.seconds),
+                training=np.sqrt(np.array(found.costs) / problem.n_errors) / weight,
+            )
+        )
+    starts = len(problem.parts) * shape.n_start
+    return Candidate(shape=shape, theta=found.theta, cost=found.cost / weight**2, n=problem.n_errors, starts=starts)
+
+
+def _noted(work: Work, x: Candidate) -> Candidate:
+    of, found = x.shape, {k: x.value(k) if np.isfinite(x.cost) else None for k in ("aicc", "bic")}
+    work.tried.append({"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found})
+    return x
+
+
+def by_degree(s: LpvSettings, work: Work, tick: Tick | None) -> Candidate:
+    """Fit the equation form with an autoregressive error model, degree by degree.
+
+    Parameters
+    ----------
+    s : LpvSettings
+    work : Work
+        Holds on to the best.
+    tick : Tick or None
+        Of this part.
+
+    Returns
+    -------
+    Candidate
+        The best.
+    """
+    degrees = _DEGREES if s.degree is None else (s.degree,)
+    best = None
+    for degree, own in zip(degrees, portions(tick, [1.0 + d for d in degrees]), strict=True):
+        white = replace(work.shape, degree=degree, ar=0, ma=0)
+        shape = replace(white, ar=s.error_order)
+        start = padded(shape, white, least_squares(white, work.parts(white), work.first)[0])
+        starts: list[Array | None] = [start]
+        if best is not None:
+            starts.append(padded(shape, best.shape, best.theta))
+        found = _noted(work, _from_best(work, shape, starts, own, f"degree {degree}"))
+        best = _better(work, found, best, s.criterion)
+    assert best is not None
+    return best
+
+
+def other_degrees(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> Candidate:
+    """Choose the degree once more, now that form and error model are known: a wrong error model may have decided on it.
+
+    Parameters
+    ----------
+    s : LpvSettings
+    work : Work
+        Holds on to the best.
+    best : Candidate
+        So far.
+    tick : Tick or None
+        Of this part.
+
+    Returns
+    -------
+    Candidate
+        The best.
+    """
+    degrees = [d for d in _DEGREES if d != best.shape.degree]
+    if s.degree is not None or not np.isfinite(best.cost):
+        return best
+    for degree, own in zip(degrees, portions(tick, [1.0 + d for d in degrees]), strict=True):
+        shape = replace(best.shape, degree=degree)
+        start = padded(shape, best.shape, best.theta)
+        found = _noted(work, _from_best(work, shape, [start], own, f"degree {degree}"))
+        best = _better(work, found, best, s.criterion)
+    return best
+
+
+def _better(work: Work, found: Candidate, best: Candidate | None, criterion: str) -> Candidate:
+    """The better of two, which is held on to."""
+    if best is not None and not found.value(criterion) < best.value(criterion):
+        return best
+    if np.isfinite(found.cost):
+        work.shape, work.theta = found.shape, found.theta
+    return found
+
+
+def _from_best(work: Work, shape: LpvShape, starts: Sequence[Array | None], tick: Tick | None, stage: str) -> Candidate:
+    """Search from the start with the least cost."""
+    problem = work.problem(shape)
+    ranked = sorted(((problem.cost(x), k) for k, x in enumerate(starts) if x is not None), key=lambda x: x[0])
+    start = starts[ranked[0][1]]
+    assert start is not None
+    return searched(work, shape, start, _SHORT, tick, stage)
+
+
+def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> Candidate:
+    """Fit the forms and error models that are asked for.
+
+    Parameters
+    ----------
+    s : LpvSettings
+    work : Work
+        Holds on to the best.
+    best : Candidate
+        What the degree was chosen with.
+    tick : Tick or None
+        Of this part.
+
+    Returns
+    -------
+    Candidate
+        The best.
+    """
+    wanted = [
+        replace(best.shape, form=form, ar=ar, ma=ma)
+        for form in (("equation", "output") if s.form == "auto" else (s.form,))
+        for ar, ma in error_orders(s.error_form, s.error_order)
+    ]
+    known = {best.shape: best}
+    chosen = best if best.shape in wanted else None
+    for shape, own in zip(wanted, portions(tick, [1.0] * len(wanted)), strict=True):
+        if shape in known:
+            continue
+        earlier = [x for x in known.values() if np.isfinite(x.cost)]
+        earlier.sort(key=lambda x: (x.shape.form != shape.form, x.value("bic")))
+        if shape.form == "output" and s.form == "auto" and not stable_process(earlier[0].shape, earlier[0].theta):
+            continue  # earlier[0]: the best of the equation form, or of the output form, which is stable
+        parts = work.parts(shape)
+        starts: list[Array | None] = [padded(shape, without_error_model(best.shape), _process(best))]
+        for x in earlier[:2]:
+            starts += [padded(shape, x.shape, x.theta), from_earlier(shape, parts, work.first, x.shape, x.theta)]
+        named = f"{shape.form} form, {_named(shape)}"
+        found = known[shape] = _noted(work, _from_best(work, shape, starts, own, named))
+        chosen = _better(work, found, chosen, "bic")
+    return chosen or best
+
+
+def _process(x: Candidate) -> Array:
+    return x.theta[: x.shape.n_process * (x.shape.degree + 1)]
+
+
+def _named(shape: LpvShape) -> str:
+    kinds = [f"{k} {n}" for k, n in (("AR", shape.ar), ("MA", shape.ma)) if n]
+    return ", ".join(kinds) + " errors" if kinds else "white errors"
