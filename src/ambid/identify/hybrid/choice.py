@@ -1,8 +1,7 @@
-"""What is left open of a hybrid model: neurons by held-out errors, terms and the order of C by a criterion."""
+"""What is left open of a hybrid model: neurons by held-out errors, the order of C by a criterion."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,14 +10,15 @@ from numpy.typing import NDArray
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.settings import MOST_NOISE
 from ambid.identify.hybrid.train import HybridProblem, Parts, problem_at, random_start
-from ambid.identify.narmax.selection import information, penalty
-from ambid.identify.networks.search import Found, information_inverse, search
-from ambid.identify.nonlinear.progress import Tick, part_of
+from ambid.identify.narmax.selection import information
+from ambid.identify.networks.search import Found, search
+from ambid.identify.nonlinear.progress import Tick, part_of, portions
 
 Array = NDArray[np.float64]
+Counted = tuple[NDArray[np.bool_], ...]
 
 NEURONS = (0, 1, 2, 4, 8)
-_MOST_ROWS = 8000  # that a comparison looks at
+_MOST_ROWS = 6000  # that a comparison looks at, all stretches together
 _BATCHES = 20  # of held-out data, over which squared errors are compared
 _SURE = 2.0  # standard errors by which a larger network has to be better
 _FIRST = 12  # iterations of every start, with the network alone and then with all numbers
@@ -86,9 +86,19 @@ def inverted(shape: HybridShape, theta: Array) -> tuple[Array, float]:
 
 
 def trained(
-    shape: HybridShape, linear: Array, parts: Parts, prior: float, starts: int, seed: int, tick: Tick | None
+    shape: HybridShape,
+    linear: Array,
+    parts: Parts,
+    prior: float,
+    starts: int,
+    seed: int,
+    tick: Tick | None,
+    counted: Counted | None = None,
 ) -> tuple[Array, Found]:
     """Train a network on what polynomial and C leave, then all numbers for a while, from several random starts.
+
+    Every other start takes C as 1 and the polynomial as free: what this could not do alone has coloured the errors, and
+    gone into the first C.
 
     Parameters
     ----------
@@ -100,6 +110,8 @@ def trained(
     starts : int
     seed : int
     tick : callable or None
+    counted : tuple of ndarray of bool, shape (n_samples,), optional
+        Samples of each record that are trained on; all of them without.
 
     Returns
     -------
@@ -109,17 +121,20 @@ def trained(
         Its search with the network alone.
     """
     rng, best, best_cost, curve = np.random.default_rng(seed), None, np.inf, None
-    network = np.arange(shape.n_theta) >= shape.n_linear
+    place = np.arange(shape.n_theta)
     level = np.concatenate([linear, np.zeros(shape.n_theta - linear.size)])
-    alone = problem_at(shape, parts, level, prior, live=network)
-    every = replace(alone, live=np.ones(shape.n_theta, dtype=np.bool_))  # one set of regressors, one weight for all
+    coloured = problem_at(shape, parts, level, prior, live=place >= shape.n_linear, counted=counted)
+    in_c = (place >= shape.sizes[0]) & (place < shape.n_linear)
+    white = coloured.at(np.where(in_c, 0.0, level), ~in_c)
+    every = replace(coloured, live=np.ones(shape.n_theta, dtype=np.bool_))  # one weight for all
     for k in range(starts):
-        start = random_start(shape, linear, rng)
+        alone = white if k % 2 else coloured
+        start = random_start(alone, rng)
         share = part_of(tick, k / starts, (k + 1) / starts)
         if share is not None:
             share("network on the residual", 0.0)
         found = search(
-            alone, start[network], stage="network on the residual", most=_FIRST, tick=part_of(share, 0.0, 0.5)
+            alone, start[alone.live], stage="network on the residual", most=_FIRST, tick=part_of(share, 0.0, 0.5)
         )
         both = search(
             every, alone.whole(found.theta), stage="starts of all together", most=_FIRST, tick=part_of(share, 0.5, 1.0)
@@ -134,10 +149,11 @@ def trained(
 def chosen_neurons(
     shape: HybridShape, linear: Array, parts: Parts, prior: float, share: float, seed: int, tick: Tick | None
 ) -> tuple[int, tuple[Tried, ...]]:
-    """Choose the number of hidden units by one-step errors on the held-out end of each record.
+    """Choose the number of hidden units by one-step errors on held-out stretches of each record.
 
     The smallest whose squared errors are not above those of the best by more than two standard errors of the
-    difference, taken over batches of time; 0 where no network does better.
+    difference, taken over batches of time; 0 where no network does better. A long record holds out its end, a short
+    one each stretch in turn. The predictor runs through what is held out; only its errors do not count.
 
     Parameters
     ----------
@@ -148,7 +164,7 @@ def chosen_neurons(
     parts : Parts
     prior : float
     share : float
-        Held out of each record.
+        Held out of each record at a time.
     seed : int
     tick : callable or None
 
@@ -159,38 +175,46 @@ def chosen_neurons(
     """
     most = max(_MOST_ROWS // len(parts), 10 * shape.lag + 60)
     parts = tuple((y[:most], u[:most]) for y, u in parts)
-    cuts = [max(round(y.shape[0] * (1.0 - share)), shape.lag + 5) for y, _ in parts]
-    training = tuple((y[:c], u[:c]) for (y, u), c in zip(parts, cuts, strict=True))
-    if sum(max(y.shape[0] - c, 0) for (y, _), c in zip(parts, cuts, strict=True)) < 2 * _BATCHES:
+    n = sum(y.shape[0] - shape.lag for y, _ in parts)
+    folds = int(np.clip(_MOST_ROWS // max(n, 1), 1, round(1.0 / share)))
+    if n * share * folds < 2 * _BATCHES:
         return 0, ()
     squares: list[Array] = []
     tried: list[Tried] = []
     for k, h in enumerate(NEURONS):
-        now = part_of(tick, k / len(NEURONS), (k + 1) / len(NEURONS))
-        one = shape.with_sizes(neurons=h)
-        theta = linear
-        if h:
-            theta, _ = trained(one, linear, training, prior, 2, seed, now)
-        problem = problem_at(one, training, theta, prior)
-        theta = search(problem, theta, stage="choice of neurons", most=_FIRST, tick=now).theta
-        squares.append(_held_out(one, parts, cuts, theta))
+        one, found = shape.with_sizes(neurons=h), []
+        for j in range(folds):
+            now = part_of(tick, (k + j / folds) / len(NEURONS), (k + (j + 1) / folds) / len(NEURONS))
+            held = tuple(_stretch(y.shape[0], shape.lag, share, j) for y, _ in parts)
+            found.append(_held_out(one, linear, parts, prior, held, seed, now))
+        squares.append(np.concatenate(found))
         tried.append(Tried(neurons=h, held_out=float(np.sqrt(np.mean(squares[-1])))))
-        if k >= 3 and not any(_better(squares[j], squares[i]) for j in (k, k - 1) for i in [k - 2]):
+        if k >= 3 and not any(_better(squares[j], squares[k - 2]) for j in (k, k - 1)):
             break
     best = int(np.argmin([x.held_out for x in tried]))
-    for x, errors in zip(tried, squares, strict=True):
-        if not _better(squares[best], errors):
-            return x.neurons, tuple(tried)
-    return tried[best].neurons, tuple(tried)
+    fits = next(x for x, e in zip(tried, squares, strict=True) if x is tried[best] or not _better(squares[best], e))
+    return fits.neurons, tuple(tried)
 
 
-def _held_out(shape: HybridShape, parts: Parts, cuts: list[int], theta: Array) -> Array:
-    """Squared errors behind the cuts, in multiples of each output's mean square; infinite where a model diverges."""
-    found = []
-    for part, cut in zip(parts, cuts, strict=True):
-        e = problem_at(shape, (part,), theta, 1.0, first=cut).errors(theta)[0]
-        found.append(np.sum(e**2, axis=1))
-    out = np.concatenate(found)
+def _stretch(n: int, lag: int, share: float, which: int) -> NDArray[np.bool_]:
+    """Samples of a record that are held out: its end, or a stretch of that length before."""
+    length = (n - lag) * share
+    t = np.arange(n)
+    return (t >= max(n - (which + 1) * length, lag)) & (t < n - which * length)
+
+
+def _held_out(
+    shape: HybridShape, linear: Array, parts: Parts, prior: float, held: Counted, seed: int, tick: Tick | None
+) -> Array:
+    """Squared errors of held-out samples after training on the others; infinite where a model diverges."""
+    training = tuple(~x for x in held)
+    theta = linear
+    if shape.neurons:
+        theta, _ = trained(shape, linear, parts, prior, 2, seed, part_of(tick, 0.0, 0.8), training)
+    problem = problem_at(shape, parts, theta, prior, counted=training)
+    theta = search(problem, theta, stage="choice of neurons", most=_FIRST, tick=part_of(tick, 0.8, 1.0)).theta
+    errors = np.concatenate(replace(problem, counted=held).errors(theta))
+    out = np.sum(errors**2, axis=1)
     return np.where(np.isfinite(out), out, np.inf)
 
 
@@ -203,59 +227,6 @@ def _better(one: Array, other: Array) -> bool:
     batches = min(_BATCHES, one.size)
     gains = np.array([np.mean(x) for x in np.array_split(other - one, batches)])
     return bool(np.mean(gains) > _SURE * np.std(gains, ddof=1) / np.sqrt(batches))
-
-
-def pruned(
-    problem: HybridProblem, theta: Array, criterion: str, n_candidates: int, keep: Callable[[HybridShape, Array], None]
-) -> tuple[HybridProblem, Array, list[str]]:
-    """Leave out terms of the polynomial that no longer pay once the network is there.
-
-    Parameters
-    ----------
-    problem : HybridProblem
-        Around `theta`, its errors of unit variance.
-    theta : ndarray, shape (n_theta,)
-        At the optimum.
-    criterion : str
-    n_candidates : int
-        That the terms were chosen from.
-    keep : callable
-        Given each smaller model and its numbers, shape (n_theta,).
-
-    Returns
-    -------
-    problem : HybridProblem
-    theta : ndarray, shape (n_theta,)
-    dropped : list of str
-        Names.
-    """
-    dropped: list[str] = []
-    n = max(problem.n_errors // problem.shape.n_outputs, 2)
-    while True:
-        shape = problem.shape
-        P, _ = information_inverse(problem.triangle(theta)[:, :-1])
-        owner = [(o, k) for o, terms in enumerate(shape.terms) for k in range(len(terms)) if len(terms) > 1]
-        if P is None or not owner:
-            return problem, theta, dropped
-        place = {x: j for j, x in enumerate((o, k) for o, t in enumerate(shape.terms) for k in range(len(t)))}
-        loss = [theta[place[x]] ** 2 / P[place[x], place[x]] for x in owner]
-        o, k = owner[int(np.argmin(loss))]
-        count, m = shape.n_linear, max(n_candidates, shape.n_linear)
-        if not min(loss) < penalty(criterion, count, n, m) - penalty(criterion, count - 1, n, m):
-            return problem, theta, dropped
-        terms = tuple(
-            tuple(x for j, x in enumerate(t) if (q, j) != (o, k)) for q, t in enumerate(shape.terms)
-        )  # fmt: skip
-        smaller = replace(shape, terms=terms)
-        start = moved(shape, theta, smaller)
-        trial = problem_at(smaller, problem.parts, start, problem.prior, first=problem.first)
-        trial = replace(trial, weight=problem.weight)
-        found = search(trial, start, stage="pruning", most=_FIRST)
-        if not found.cost - problem.cost(theta) < penalty(criterion, count, n, m) - penalty(criterion, count - 1, n, m):
-            return problem, theta, dropped
-        dropped.append(shape.names[place[(o, k)]])
-        problem, theta = trial, found.theta
-        keep(smaller, theta)
 
 
 def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tick | None) -> tuple[HybridShape, Array]:
@@ -274,10 +245,11 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
     shape : HybridShape
     theta : ndarray, shape (n_theta,)
     """
-    first = max(problem.shape.lag, MOST_NOISE)
+    first = max(problem.shape.lag, MOST_NOISE)  # for all orders the same errors
+    counted = tuple(np.arange(y.shape[0]) >= first for y, _ in problem.parts)
 
     def searched(shape: HybridShape, start: Array, share: Tick | None) -> tuple[float, Array]:
-        at = problem_at(shape, problem.parts, start, problem.prior, first=first)
+        at = problem_at(shape, problem.parts, start, problem.prior, counted=counted)
         at = replace(at, weight=problem.weight)
         found = search(at, start, stage="order of the noise model", most=_FIRST, tick=share)
         n = max(at.n_errors // shape.n_outputs, 2)
@@ -286,6 +258,7 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
 
     shape = problem.shape
     value, theta = searched(shape, theta, part_of(tick, 0.0, 0.2))
+    tries = iter(portions(part_of(tick, 0.2, 1.0), [1.0] * (2 * MOST_NOISE)))
     for step in (1, -1):
         better = False
         for _ in range(MOST_NOISE):
@@ -293,7 +266,7 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
             if not 0 <= ne <= MOST_NOISE:
                 break
             other = shape.with_sizes(ne=ne)
-            trial_value, trial = searched(other, moved(shape, theta, other), part_of(tick, 0.2, 1.0))
+            trial_value, trial = searched(other, moved(shape, theta, other), next(tries))
             if not trial_value < value:
                 break
             shape, theta, value, better = other, trial, trial_value, True

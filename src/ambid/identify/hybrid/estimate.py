@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, moved, pruned, trained
+from ambid.identify.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, moved, trained
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.result import finished
+from ambid.identify.hybrid.revision import Candidates, revised
 from ambid.identify.hybrid.settings import HybridSettings, hybrid_settings
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax import PolynomialNarmax, narmax
 from ambid.identify.narmax.scaled import Scaled, scaled_records
+from ambid.identify.narmax.terms import Term, lagged, products
 from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.search import Found, search
@@ -50,8 +52,8 @@ class Work:
     warnings : list of str
     timing_s : dict of str to float
     tried : tuple of Tried
-    dropped : tuple of str
-        Terms of the polynomial that the network made superfluous.
+    added, dropped : tuple of str
+        Terms of the polynomial that pay only beside the network, and that it made superfluous.
     drawn_in : float
         By what the roots of the first C were multiplied to make it invertible.
     """
@@ -64,6 +66,7 @@ class Work:
     warnings: list[str] = field(default_factory=list)
     timing_s: dict[str, float] = field(default_factory=dict)
     tried: tuple[Tried, ...] = ()
+    added: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     drawn_in: float = 1.0
 
@@ -107,7 +110,7 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
         raise EstimationError("hybrid: no record is given. Pass one at least")
     s = hybrid_settings(settings, n_inputs=records[0].n_inputs)
     data = scaled_records("hybrid", records, lag=s.lag, levels=s.levels)
-    ticks = portions(tick, (3.0, 4.0 if s.neurons is None else 0.0, 3.0, 3.0, 2.0))
+    ticks = portions(tick, _costs(s))
     began = perf_counter()
     first = narmax(records, s.polynomial, seed=seed, tick=ticks[0])
     timing = {"polynomial": perf_counter() - began}
@@ -128,6 +131,12 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
         if work.status == "stalled":
             work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
     return finished(records, s, data, work, seed=seed)
+
+
+def _costs(s: HybridSettings) -> tuple[float, ...]:
+    """What the parts of a fit are expected to take, of each other: as `_identify` goes through them."""
+    h = float(s.neurons if s.neurons is not None else 4)
+    return 3.0, 1.0, 8.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
 
 
 def _polynomial(s: HybridSettings, first: NonlinearFit, model: PolynomialNarmax) -> Work:
@@ -157,10 +166,10 @@ def _identify(s: HybridSettings, data: Scaled, work: Work, seed: int, ticks: lis
     began = perf_counter()
     work.shape = lean = _lean(work.shape)
     _searched(s, data, work, "polynomial and noise model", ticks[0])
-    full = replace(lean, network=replace(lean.network, ny=s.ny, nu=s.nu))
+    full, start = _prepared(s, lean, work.theta)
     neurons = s.neurons
     if neurons is None:
-        neurons, work.tried = chosen_neurons(full, work.theta, data.parts, s.prior, s.held_out, seed, ticks[0])
+        neurons, work.tried = chosen_neurons(full, start, data.parts, s.prior, s.held_out, seed, ticks[1])
         if not neurons:
             why = (
                 "predicts held-out data as well as with a network" if work.tried else "is all that so few samples carry"
@@ -170,23 +179,39 @@ def _identify(s: HybridSettings, data: Scaled, work: Work, seed: int, ticks: lis
     began = perf_counter()
     if neurons:
         shape = full.with_sizes(neurons=neurons)
-        theta, found = trained(shape, work.theta, data.parts, s.prior, s.starts, seed, ticks[1])
+        theta, found = trained(shape, start, data.parts, s.prior, s.starts, seed, ticks[2])
         work.keep(shape, theta)
         _note(work, found, problem_at(shape, data.parts, theta, s.prior), "network on the residual")
-        problem = _searched(s, data, work, "all together", ticks[2])
+        problem = _searched(s, data, work, "all together", ticks[3])
         if s.pruning == "prediction":
-            problem, theta, names = pruned(
-                problem.at(work.theta), work.theta, s.criterion, work.n_candidates, work.keep
-            )
-            work.dropped = tuple(names)
+            found_terms = Candidates(terms=_candidates(s, full), criterion=s.criterion)
+            revised(problem.at(work.theta), work.theta, found_terms, work.keep, ticks[4])
+            old, new = (x.names[: x.sizes[0]] for x in (lean, work.shape))
+            work.added, work.dropped = (tuple(x for x in a if x not in b) for a, b in ((new, old), (old, new)))
     if s.ne is None:
         problem = problem_at(work.shape, data.parts, work.theta, s.prior)
-        work.keep(*chosen_noise(problem, work.theta, s.criterion, ticks[3]))
+        work.keep(*chosen_noise(problem, work.theta, s.criterion, ticks[5]))
         if not neurons:
             shape = _lean(work.shape)
             work.keep(shape, moved(work.shape, work.theta, shape))
-    _searched(s, data, work, "all together", ticks[3])
+    _searched(s, data, work, "all together", ticks[6])
     work.timing_s["all together"] = perf_counter() - began
+
+
+def _prepared(s: HybridSettings, lean: HybridShape, theta: Array) -> tuple[HybridShape, Array]:
+    """The shape that a network joins, with all its regressors in the polynomial too: it shall not do what is linear."""
+    shape = replace(lean, network=replace(lean.network, ny=s.ny, nu=s.nu))
+    if s.pruning == "none":
+        return shape, theta
+    linear = tuple((f,) for f in lagged(shape.n_outputs, shape.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk, ne=0))
+    shape = replace(shape, terms=tuple((*t, *(x for x in linear if x not in t)) for t in shape.terms))
+    return shape, moved(lean, theta, shape)
+
+
+def _candidates(s: HybridSettings, shape: HybridShape) -> tuple[Term, ...]:
+    """What the terms of the polynomial are chosen from."""
+    factors = lagged(shape.n_outputs, shape.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk, ne=0)
+    return products(factors, s.degree, constant=bool(s.constant))
 
 
 def _lean(shape: HybridShape) -> HybridShape:

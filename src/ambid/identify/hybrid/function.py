@@ -80,7 +80,7 @@ class HybridShape:
         """The terms as the compiled recursions want them."""
         return tables(self.terms, ((),) * self.n_outputs, self.n_inputs)
 
-    @property
+    @cached_property
     def lag(self) -> int:
         """Samples of the past that a prediction needs."""
         return max(self.tables.lag, self.network.lag, self.ne)
@@ -90,13 +90,13 @@ class HybridShape:
         """Past innovations that enter the hidden layer."""
         return self.n_outputs * self.ne if self.deep else 0
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int, int, int, int]:
         """Numbers in the polynomial, in C, W2, W1, b1."""
         p, h, d = self.n_outputs, self.neurons, self.network.n_regressors + self.n_deep
         return sum(map(len, self.terms)), p * p * self.ne, p * h, h * d, h
 
-    @property
+    @cached_property
     def n_theta(self) -> int:
         """Numbers in all."""
         return sum(self.sizes)
@@ -153,10 +153,11 @@ class HybridShape:
             Coefficients (n_terms,), C (n_outputs, n_outputs ne), W2 (n_outputs, neurons), W1 (neurons, n_regressors)
             and b1 (neurons,).
         """
-        p, h = self.n_outputs, self.neurons
-        c, C, W2, W1, b1 = np.split(np.ascontiguousarray(theta), np.cumsum(self.sizes)[:-1])
-        d = self.network.n_regressors + self.n_deep
-        return c, C.reshape(p, p * self.ne), W2.reshape(p, h), W1.reshape(h, d), b1
+        p, h, d = self.n_outputs, self.neurons, self.network.n_regressors + self.n_deep
+        theta, (n_p, n_c, n_2, n_1, _) = np.ascontiguousarray(theta), self.sizes
+        a, b, c = n_p + n_c, n_p + n_c + n_2, n_p + n_c + n_2 + n_1
+        C, W2, W1 = theta[n_p:a].reshape(p, p * self.ne), theta[a:b].reshape(p, h), theta[b:c].reshape(h, d)
+        return theta[:n_p], C, W2, W1, theta[c:]
 
     def rows(self, y: Array, u: Array) -> Rows:
         """Return regressors and outputs of every sample from `lag` on.

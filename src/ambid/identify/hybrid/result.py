@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.hybrid.model import HybridNarmax, units_of
+from ambid.identify.hybrid.revision import SHARED, inflation
 from ambid.identify.hybrid.settings import HybridSettings
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax.scaled import Scaled
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
-_SHARED = 10.0  # times a standard deviation grows by the network, from which on a term's value is not its own
 _NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
 
 
@@ -119,9 +119,7 @@ def laplace(problem: HybridProblem, theta: Array) -> tuple[Array | None, Array, 
             break
         effective = float(theta.size - np.sum(np.diag(P) * at.precision**2))
         noise = errors.T @ errors / max(n - effective / p, 1.0)
-        alone, _condition = information_inverse(R[:, :n_linear])
-        if alone is not None:
-            inflated = np.sqrt(np.diag(P)[:n_terms] / np.diag(alone)[:n_terms])
+        inflated = inflation(R, P, n_linear)[:n_terms]
     return P, noise, effective, inflated
 
 
@@ -139,8 +137,8 @@ def _cautions(records: Sequence[IOData], data: Scaled, work: Work, inflated: Arr
             "deviation is not to be trusted, and the predictor forgets its beginning slowly. A differenced or "
             "detrended output does this"
         )
-    if np.any(inflated > _SHARED):
-        names = ", ".join(name for name, x in zip(shape.names, inflated, strict=False) if x > _SHARED)
+    if np.any(inflated > SHARED):
+        names = ", ".join(name for name, x in zip(shape.names, inflated, strict=False) if x > SHARED)
         found.append(
             f"the network can take over these terms, so that their values are not theirs alone: {names}. Fewer neurons "
             "or a smaller prior"
@@ -168,6 +166,7 @@ def _details(records: Sequence[IOData], data: Scaled, work: Work, effective: flo
         "terms": terms,
         "candidates": work.n_candidates,
         "effective_parameters": effective,
+        "added_beside_the_network": list(work.added),
         "left_out_beside_the_network": list(work.dropped),
         "network_share": dict(zip(records[0].outputs, by_network.tolist(), strict=True)),
         "noise_model": {

@@ -11,6 +11,7 @@ alone say nothing; there only a divergence over the records is refused.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -24,6 +25,8 @@ Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
 
 _BLOCK = 4096
+_DRAWS = 12  # of a random hidden layer
+_DRAWN_ON = 2000  # rows by which they are compared
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,8 +45,8 @@ class HybridProblem:
         All numbers; those that are not searched stay as they are here.
     live : ndarray of bool, shape (n_theta,)
         What is searched.
-    first : int
-        First sample of each record whose error counts; at least `lag` counts from.
+    counted : tuple of ndarray of bool, shape (n_samples,), or None
+        Samples of each record whose errors count, of those from `lag` on; all of them without.
     """
 
     shape: HybridShape
@@ -52,7 +55,7 @@ class HybridProblem:
     prior: float
     base: Array
     live: NDArray[np.bool_]
-    first: int = 0
+    counted: tuple[NDArray[np.bool_], ...] | None = None
     _rows: list[Rows] = field(default_factory=list)
 
     def rows(self) -> list[Rows]:
@@ -61,16 +64,25 @@ class HybridProblem:
             self._rows.extend(self.shape.rows(y, u) for y, u in self.parts)
         return self._rows
 
-    @property
-    def skip(self) -> int:
-        """Rows of each record that do not count."""
-        return max(self.first - self.shape.lag, 0)
+    def counts(self, record: int) -> NDArray[np.bool_]:
+        """Return which rows of a record count.
+
+        Parameters
+        ----------
+        record : int
+
+        Returns
+        -------
+        ndarray of bool, shape (n_rows,)
+        """
+        y = self.parts[record][0]
+        every = np.ones(y.shape[0], dtype=np.bool_) if self.counted is None else self.counted[record]
+        return every[self.shape.lag :]
 
     @property
     def n_errors(self) -> int:
         """Errors in all."""
-        first = max(self.first, self.shape.lag)
-        return sum(max(y.shape[0] - first, 0) * y.shape[1] for y, _ in self.parts)
+        return self.shape.n_outputs * sum(int(np.count_nonzero(self.counts(r))) for r in range(len(self.parts)))
 
     def whole(self, x: Array) -> Array:
         """Return all numbers.
@@ -88,7 +100,7 @@ class HybridProblem:
         return out
 
     def errors(self, theta: Array) -> list[Array]:
-        """Return the one-step errors of each record, scaled.
+        """Return the one-step errors of each record that count, scaled.
 
         Parameters
         ----------
@@ -100,7 +112,7 @@ class HybridProblem:
         list of ndarray, shape (n_rows, n_outputs)
             NaN from a divergence on.
         """
-        return [self.shape.innovations(theta, rows)[0][self.skip :] for rows in self.rows()]
+        return [self.shape.innovations(theta, rows)[0][self.counts(r)] for r, rows in enumerate(self.rows())]
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squared weighted errors and of the prior's rows.
@@ -135,8 +147,8 @@ class HybridProblem:
         """
         whole, found = self.whole(theta), []
         with np.errstate(over="ignore", invalid="ignore"):
-            for rows in self.rows():
-                found += self._reduced(whole, rows)
+            for r, rows in enumerate(self.rows()):
+                found += self._reduced(whole, rows, self.counts(r))
         hidden = np.flatnonzero(self.live & (self.precision > 0))
         prior = np.zeros((hidden.size, whole.size + 1))
         prior[np.arange(hidden.size), hidden] = self.precision[hidden]
@@ -144,7 +156,7 @@ class HybridProblem:
         found.append(prior[:, np.append(self.live, True)])
         return triangle_of([np.concatenate(found)])
 
-    def _reduced(self, theta: Array, rows: Rows) -> list[Array]:
+    def _reduced(self, theta: Array, rows: Rows, counts: NDArray[np.bool_]) -> list[Array]:
         """Triangles of blocks of one record; slopes go on from block to block."""
         s, out, before = self.shape, [], None
         E, T = s.innovations(theta, rows)
@@ -153,15 +165,14 @@ class HybridProblem:
             part = slice(k, min(k + _BLOCK, E.shape[0]))
             D = s.slopes(theta, rows, E, T, part, before)
             before = D[D.shape[0] - s.ne :].copy() if s.ne else None
-            low = max(self.skip - k, 0)
-            J = D[low:] * self.weight[:, None]
-            r = (E[part][low:] * self.weight).reshape(-1, 1)
+            J = D[counts[part]] * self.weight[:, None]
+            r = (E[part][counts[part]] * self.weight).reshape(-1, 1)
             both = np.hstack([J.reshape(r.size, -1), r])[:, columns]
             if both.shape[0]:
                 out.append(triangle_of([both]))
         return out
 
-    @property
+    @cached_property
     def precision(self) -> Array:
         """One over the prior's standard deviation of every number, shape (n_theta,); 0 for the polynomial and C."""
         out = np.full(self.shape.n_theta, 1.0 / self.prior)
@@ -192,7 +203,7 @@ def problem_at(
     prior: float,
     *,
     live: NDArray[np.bool_] | None = None,
-    first: int = 0,
+    counted: tuple[NDArray[np.bool_], ...] | None = None,
 ) -> HybridProblem:
     """Return the problem whose errors have unit variance at given numbers.
 
@@ -204,8 +215,8 @@ def problem_at(
     prior : float
     live : ndarray of bool, shape (n_theta,), optional
         What is searched; everything without.
-    first : int, optional
-        First sample whose error counts.
+    counted : tuple of ndarray of bool, shape (n_samples,), optional
+        Samples of each record whose errors count; all of them without.
 
     Returns
     -------
@@ -213,7 +224,7 @@ def problem_at(
     """
     every = np.ones(shape.n_theta, dtype=np.bool_)
     one = HybridProblem(
-        shape=shape, parts=parts, weight=np.ones(shape.n_outputs), prior=prior, base=theta, live=every, first=first
+        shape=shape, parts=parts, weight=np.ones(shape.n_outputs), prior=prior, base=theta, live=every, counted=counted
     )
     return one.at(theta, every if live is None else live)
 
@@ -235,21 +246,48 @@ def unit_weight(errors: list[Array]) -> Array:
     return out
 
 
-def random_start(shape: HybridShape, linear: Array, rng: np.random.Generator) -> Array:
-    """Return numbers with a random hidden layer whose units bend inside the data, and hardly act yet.
+def random_start(problem: HybridProblem, rng: np.random.Generator) -> Array:
+    """Return numbers with a random hidden layer whose units bend inside the data.
+
+    Of several draws the one is taken whose units explain most of the errors, passed through 1/C as they will be; their
+    output weights are those of least squares, and so are coefficients of the polynomial that are searched too.
 
     Parameters
     ----------
-    shape : HybridShape
-    linear : ndarray, shape (n_linear,)
-        Polynomial and C.
+    problem : HybridProblem
+        Around numbers whose polynomial and C are taken.
     rng : numpy.random.Generator
 
     Returns
     -------
     ndarray, shape (n_theta,)
     """
-    _, _, n_2, n_1, n_b = shape.sizes
-    d = n_1 // max(n_b, 1)
-    hidden = rng.standard_normal(n_1) / np.sqrt(max(d, 1))
-    return np.concatenate([linear, 0.01 * rng.standard_normal(n_2), hidden, rng.standard_normal(n_b)])
+    shape = problem.shape
+    n_p, n_c, n_2, n_1, n_b = shape.sizes
+    place = np.arange(shape.n_theta)
+    columns = np.flatnonzero(problem.live & ((place < n_p) | ((place >= n_p + n_c) & (place < n_p + n_c + n_2))))
+    prior = np.diag(problem.precision[columns])
+    best, least = np.empty(0), np.inf
+    for _ in range(_DRAWS):
+        hidden = rng.standard_normal(n_1) / np.sqrt(max(n_1 // max(n_b, 1), 1))
+        theta = np.concatenate([problem.base[: n_p + n_c], np.zeros(n_2), hidden, rng.standard_normal(n_b)])
+        A, r = _linear_rows(problem, theta, columns)
+        A, r = np.vstack([A, prior]), np.append(r, np.zeros(columns.size))
+        step = np.linalg.lstsq(A, r, rcond=1e-12)[0]
+        left = float(np.sum((r - A @ step) ** 2))
+        theta[columns] += step
+        if not best.size or left < least:
+            best, least = theta, left
+    return best
+
+
+def _linear_rows(problem: HybridProblem, theta: Array, columns: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Slopes by some numbers and errors, weighted, over the first rows of each record."""
+    s, A, r = problem.shape, [], []
+    some = slice(0, _DRAWN_ON // len(problem.parts))
+    for k, rows in enumerate(problem.rows()):
+        E, T = s.innovations(theta, rows)
+        D, counts = s.slopes(theta, rows, E, T, some)[:, :, columns], problem.counts(k)[some]
+        A.append((D * problem.weight[:, None])[counts].reshape(-1, columns.size))
+        r.append((E[some] * problem.weight)[counts].ravel())
+    return np.concatenate(A), np.concatenate(r)
