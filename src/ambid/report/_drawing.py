@@ -147,4 +147,5 @@ def note(axes: Axes, text: str) -> None:
 def grid(*axes: Axes) -> None:
     for a in axes:
         a.grid(True, color="#dddddd", linewidth=0.6)
+        a.set_axisbelow(True)  # bands of long records would have lines across
         a.tick_params(labelsize=9)

@@ -110,7 +110,12 @@ def parameter_table(fit: NonlinearFit) -> list[str]:
     return said
 
 
-_SOURCES = {"information": "the information matrix", "laplace": "Laplace's approximation", "bootstrap": "bootstrap"}
+_SOURCES = {
+    "information": "the information matrix",
+    "laplace": "Laplace's approximation",
+    "sandwich": "the sandwich formula, for coloured errors",
+    "bootstrap": "bootstrap",
+}
 
 
 def term_lines(fit: NonlinearFit) -> list[str]:
@@ -138,7 +143,7 @@ def term_lines(fit: NonlinearFit) -> list[str]:
     rows = []
     for k, name in enumerate(fit.model.names[:_SHOWN]):
         err = ratio.get(name)
-        rows.append((name, _coefficient(float(theta[k]), None if sd is None else float(sd[k])), _percent(err)))
+        rows.append((name, coefficient_text(float(theta[k]), None if sd is None else float(sd[k])), _percent(err)))
     rest = theta.size - len(rows)
     more = [f"… and {rest} more; --json has them all"] if rest else []
     head = ("term", "coefficient" if sd is None else "coefficient ± sd", "ERR")
@@ -152,8 +157,19 @@ def _percent(err: object) -> str:
     return f"{100 * err:.3f} %" if err >= 1e-4 or err == 0 else f"{100 * err:.1e} %"
 
 
-def _coefficient(value: float, sd: float | None) -> str:
-    """Value ± sd; in a power of ten where decimals would be too many to read."""
+def coefficient_text(value: float, sd: float | None) -> str:
+    """Write value ± sd; in a power of ten where decimals would be too many to read.
+
+    Parameters
+    ----------
+    value : float
+    sd : float or None
+        Standard deviation, or another spread.
+
+    Returns
+    -------
+    str
+    """
     largest = max(abs(value), sd or 0.0)
     exponent = int(np.floor(np.log10(largest))) if largest else 0
     if sd is None:
