@@ -123,8 +123,11 @@ def test_simulation_errors_fall_where_the_noise_is_on_the_sensor() -> None:
         assert fit.model is not None
         errors.append(float(np.std(fit.model.simulate(record.u, record.y)[20:, 0] - x[20:])))
     assert errors[1] < 0.35 * errors[0]
-    assert fit.covariance is None
-    assert any("standard deviations" in w for w in fit.warnings)
+    assert fit.covariance_from == "sandwich"
+    told = {"ny": 2, "nu": 2, "neurons": 3, "focus": "simulation", "uncertainty": "laplace"}
+    white = narx([record], told)  # which the errors of a free run are not taken for
+    assert white.covariance is None
+    assert any("standard deviations" in w for w in white.warnings)
 
 
 def test_two_outputs_and_two_inputs() -> None:

@@ -20,12 +20,13 @@ from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.narx_choice import Tried, chosen_sizes, held_out_error, problem_at, split
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_result import finished
-from ambid.identify.networks.narx_spread import bootstrapped
 from ambid.identify.networks.narx_train import linear_start, random_start
 from ambid.identify.networks.records import Scaled, scaled_records
-from ambid.identify.networks.search import Found, Tick, search
+from ambid.identify.networks.search import Found, search
 from ambid.identify.networks.settings import checked
+from ambid.identify.networks.spread import bootstrapped
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+from ambid.identify.nonlinear.progress import Tick, part_of, portions
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ _RANGES: Mapping[str, tuple[float, float]] = {
 }
 _CHOICES: Mapping[str, tuple[str, ...]] = {
     "focus": ("prediction", "simulation"),
-    "uncertainty": ("laplace", "bootstrap", "none"),
+    "uncertainty": ("auto", "laplace", "sandwich", "bootstrap", "none"),
 }
 _DEFAULTS: Mapping[str, object] = {
     "nk": 1,
@@ -50,7 +51,7 @@ _DEFAULTS: Mapping[str, object] = {
     "prior": 10.0,
     "iterations": 60,
     "focus": "prediction",
-    "uncertainty": "laplace",
+    "uncertainty": "auto",
 }
 _FIRST = 12  # iterations of every start; only the best goes on
 
@@ -115,7 +116,7 @@ def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: 
     EstimationError
         If a setting is not known, records do not belong together, are too short, or a channel does not move.
     """
-    s = {**_DEFAULTS, **checked("narx", settings, _RANGES, _CHOICES)}
+    s = {**_DEFAULTS, **checked("narx", settings, _RANGES, _CHOICES, auto=("ny", "nu", "neurons"))}
     if s.get("ny") == 0 and s.get("nu") == 0:
         raise EstimationError("narx: ny and nu are both 0; nothing is left to predict from. Raise one of them")
     began = perf_counter()
@@ -145,8 +146,8 @@ def _linear(s: Mapping[str, object], data: Scaled) -> Work:
 
 
 def _identify(s: Mapping[str, object], data: Scaled, work: Work, seed: int, tick: Tick | None) -> None:
-    if tick is not None:
-        tick("start")
+    free, many = s["focus"] == "simulation", s["uncertainty"] == "bootstrap"
+    choice, training, refining, last = portions(tick, (3.0, 5.0, 8.0 * free, 4.0 * many))
     share, prior = float(s["held_out"]), float(s["prior"])  # type: ignore[arg-type]
     began = perf_counter()
     ny, nu, neurons, work.tried = chosen_sizes(
@@ -156,22 +157,22 @@ def _identify(s: Mapping[str, object], data: Scaled, work: Work, seed: int, tick
         share=share or 0.2,
         prior=prior,
         seed=seed,
-        tick=tick,
+        tick=choice,
     )
     y, u = data.parts[0]
     shape = NarxShape(n_outputs=y.shape[1], n_inputs=u.shape[1], ny=ny, nu=nu, nk=int(s["nk"]), neurons=neurons)  # type: ignore[call-overload]
     work.timing_s["choice"] = perf_counter() - began
     began = perf_counter()
-    _train(s, shape, data, work, seed, tick)
+    _train(s, shape, data, work, seed, training)
     work.timing_s["training"] = perf_counter() - began
     if s["focus"] == "simulation":
         began = perf_counter()
-        _refine(s, data, work, tick)
+        _refine(s, data, work, refining)
         work.timing_s["simulation errors"] = perf_counter() - began
     if s["uncertainty"] == "bootstrap":
         began = perf_counter()
         problem = problem_at(work.shape, data.parts, work.theta, prior, free=work.free)
-        work.covariance = bootstrapped(problem, work.theta, seed, tick)
+        work.covariance = bootstrapped(problem.sample_rows(work.theta), problem.prior_rows(work.theta), seed, last)
         work.timing_s["bootstrap"] = perf_counter() - began
 
 
@@ -184,17 +185,27 @@ def _train(s: Mapping[str, object], shape: NarxShape, data: Scaled, work: Work, 
     rng = np.random.default_rng(seed)
     watch = (lambda t: held_out_error(shape, held, t)) if held else None
     best, best_error = linear, np.inf
-    for _ in range(int(s["starts"]) if shape.neurons else 1):  # type: ignore[call-overload]
+    starts = int(s["starts"]) if shape.neurons else 1  # type: ignore[call-overload]
+    first, second, third = portions(tick, (starts * _FIRST, 2 * _FIRST, 2 * _FIRST * bool(held)))
+    for k in range(starts):
         start = random_start(shape, linear, rng)
         problem = problem_at(shape, training, start, prior)
-        found = search(problem, start, stage="starts", most=min(_FIRST, most), held_out=watch, slack=0.0, tick=tick)
+        found = search(
+            problem,
+            start,
+            stage="starts",
+            most=min(_FIRST, most),
+            held_out=watch,
+            slack=0.0,
+            tick=part_of(first, k / starts, (k + 1) / starts),
+        )
         error = min(found.held_out) if held else found.cost
         if error < best_error:
             best, best_error = found.theta, error
             _keep(work, shape, best)
     problem = problem_at(shape, training, best, prior)
     found = search(
-        problem, best, stage="training", most=most, held_out=watch, tick=tick, keep=lambda t: _keep(work, shape, t)
+        problem, best, stage="training", most=most, held_out=watch, tick=second, keep=lambda t: _keep(work, shape, t)
     )
     _keep(work, shape, found.theta)
     _note(work, found, problem.n_errors, float(np.sqrt(np.mean(problem.weight**2))), "prediction")
@@ -202,7 +213,7 @@ def _train(s: Mapping[str, object], shape: NarxShape, data: Scaled, work: Work, 
     work.held_out = held_out_error(shape, held, found.theta) if held else float("nan")
     if held and not found.stopped_early:  # nothing is overfitted: the held-out part may teach as well
         problem = problem_at(shape, data.parts, found.theta, prior)
-        found = search(problem, found.theta, stage="all data", most=most, tick=tick)
+        found = search(problem, found.theta, stage="all data", most=most, tick=third)
         _keep(work, shape, found.theta)
     work.status = "converged" if found.converged else "stalled"
 
@@ -232,12 +243,13 @@ def _refine(s: Mapping[str, object], data: Scaled, work: Work, tick: Tick | None
             "the free run diverges, so that the weights are those of the one-step errors: fewer neurons or other lags"
         )
         return
-    for _ in range(2):  # the errors' sizes are known only afterwards
+    for k in range(2):  # the errors' sizes are known only afterwards
 
         def keep(theta: Array) -> None:
             work.theta, work.free = theta, True
 
-        found = search(problem, work.theta, stage="simulation errors", most=most, tick=tick, keep=keep)
+        own = part_of(tick, 0.5 * k, 0.5 * (k + 1))
+        found = search(problem, work.theta, stage="simulation errors", most=most, tick=own, keep=keep)
         keep(found.theta)
         _note(work, found, problem.n_errors, float(np.sqrt(np.mean(problem.weight**2))), "simulation")
         work.status = "converged" if found.converged else "stalled"

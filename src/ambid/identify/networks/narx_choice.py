@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_train import NarxProblem, linear_start, random_start
 from ambid.identify.networks.records import Parts
-from ambid.identify.networks.search import Tick, search
+from ambid.identify.networks.search import search
+from ambid.identify.nonlinear.progress import Tick
 
 Array = NDArray[np.float64]
 
@@ -125,7 +126,7 @@ def chosen_sizes(
 
     def run(a: int, b: int, h: int) -> Tried:
         if tick is not None:
-            tick("choice of lags and neurons")
+            tick("choice of lags and neurons", len(tried) / (len(_LAGS) + len(_NEURONS)))
         shape = NarxShape(n_outputs=parts[0][0].shape[1], n_inputs=n_u, ny=a, nu=b if n_u else 0, nk=nk, neurons=h)
         found = Tried(ny=a, nu=shape.nu, neurons=h, held_out=_compared(shape, parts, share, prior, seed))
         tried.append(found)

@@ -14,7 +14,7 @@ from ambid.identify.networks.cloud import cloud_of
 from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.narx_choice import problem_at
 from ambid.identify.networks.narx_model import NeuralNarx
-from ambid.identify.networks.narx_spread import laplace
+from ambid.identify.networks.narx_spread import laplace, sandwiched
 from ambid.identify.networks.records import Scaled
 from ambid.identify.nonlinear.fit import NonlinearFit
 
@@ -58,13 +58,15 @@ def finished(
     elif used["uncertainty"] == "none":
         covariance = None
         warnings.append("no covariance was asked for, and so there are no standard deviations")
+    elif used["uncertainty"] == "sandwich" or (work.free and used["uncertainty"] == "auto"):
+        covariance, covariance_from = sandwiched(problem, theta), "sandwich"
     elif work.free:
         covariance = None
         warnings.append(
             "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
-            "Say uncertainty = bootstrap"
+            "Say uncertainty = sandwich or bootstrap"
         )
-    elif covariance is None:
+    if covariance is None and used["uncertainty"] != "none" and not (work.free and used["uncertainty"] == "laplace"):
         warnings.append("no standard deviations: data and prior do not determine the weights. Fewer neurons or lags")
     regressors = np.concatenate([shape.regressors(y, u) for y, u in data.parts])
     model = NeuralNarx(

@@ -36,8 +36,6 @@ class NarxProblem:
         Standard deviation of the hidden layer's weights before the data.
     free : bool
         Errors of the free run instead of the predictions.
-    counts : tuple of ndarray, shape (n_samples - lag,), or None
-        How often each sample counts (for the bootstrap).
     """
 
     shape: NarxShape
@@ -45,7 +43,6 @@ class NarxProblem:
     weight: Array
     prior: float
     free: bool = False
-    counts: tuple[Array, ...] | None = None
     _rows: list[tuple[Array, Array]] = field(default_factory=list)
 
     def rows(self) -> list[tuple[Array, Array]]:
@@ -89,9 +86,8 @@ class NarxProblem:
         """
         with np.errstate(over="ignore", invalid="ignore"):
             found = float(np.sum(self._prior(theta) ** 2))
-            for k, e in enumerate(self.errors(theta)):
-                squares = np.sum((e * self.weight) ** 2, axis=1)
-                found += float(np.sum(squares if self.counts is None else squares * self.counts[k]))
+            for e in self.errors(theta):
+                found += float(np.sum((e * self.weight) ** 2))
         return found if np.isfinite(found) else np.inf
 
     def triangle(self, theta: Array) -> Array:
@@ -106,12 +102,11 @@ class NarxProblem:
         ndarray, shape (n_theta + 1, n_theta + 1)
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            found = [triangle_of([block]) for block in self._blocks(theta)]
-        precision = self._precision()
-        found.append(np.hstack([np.diag(precision), self._prior(theta)[:, None]]))
+            found = [triangle_of([block]) for _, block in self._blocks(theta)]
+        found.append(self.prior_rows(theta))
         return triangle_of([np.concatenate(found)])
 
-    def _blocks(self, theta: Array) -> Iterator[Array]:
+    def _blocks(self, theta: Array) -> Iterator[tuple[int, Array]]:
         s = self.shape
         for k, (y, u) in enumerate(self.parts):
             if self.free:
@@ -124,12 +119,40 @@ class NarxProblem:
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
                 J = whole[part] if self.free else s.slopes(theta, rows[part])
-                w = np.broadcast_to(self.weight, left[part].shape)
-                if self.counts is not None:
-                    w = w * np.sqrt(self.counts[k][part, None])
-                yield np.hstack(
-                    [(J * w[:, :, None]).reshape(-1, s.n_theta), (left[part] * w).reshape(-1, 1)]
+                w = self.weight
+                yield k, np.hstack(
+                    [(J * w[:, None]).reshape(-1, s.n_theta), (left[part] * w).reshape(-1, 1)]
                 )  # fmt: skip
+
+    def sample_rows(self, theta: Array) -> list[Array]:
+        """Return slopes and errors of every sample, of unit variance.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        list of ndarray, shape (n_samples - lag, n_outputs, n_theta + 1)
+            Of each part.
+        """
+        found: list[list[Array]] = [[] for _ in self.parts]
+        for k, block in self._blocks(theta):
+            found[k].append(block.reshape(-1, self.shape.n_outputs, block.shape[1]))
+        return [np.concatenate(x) for x in found]
+
+    def prior_rows(self, theta: Array) -> Array:
+        """Return slopes and rows of the prior.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        ndarray, shape (n_theta, n_theta + 1)
+        """
+        return np.hstack([np.diag(self._precision()), self._prior(theta)[:, None]])
 
     def _precision(self) -> Array:
         """One over the prior's standard deviation of every weight."""

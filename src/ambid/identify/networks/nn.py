@@ -1,39 +1,33 @@
 """State-space network from records (thesis eqs 5.1-5.2, fig. 5.9): its weights are A and B, beside a network G(x, u).
 
-Subspace start -> the thesis's training beside Gauss-Newton (for the learning curves) -> multiple shooting (option) ->
-Levenberg-Marquardt on simulation errors -> hidden layer (option) -> predictor gain, where the errors are not white ->
-covariance. Errors of all outputs are weighted by their covariance, found on the way.
+Delay -> subspace start -> the thesis's training beside Gauss-Newton (for the learning curves) -> multiple shooting
+(option) -> Levenberg-Marquardt on simulation errors -> hidden layer (option) -> predictor gain, where errors are not
+white -> global search, where all that failed, and training again -> covariance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
+from ambid.identify.networks.delay import LARGEST, found_delay, guessed_delay, late
 from ambid.identify.networks.failed import failed_fit
+from ambid.identify.networks.global_start import FAR, global_start, misfit
+from ambid.identify.networks.magnitude import nn_of_magnitude
 from ambid.identify.networks.nn_result import finished
-from ambid.identify.networks.nn_train import (
-    Interrupted,
-    State,
-    added_gain,
-    added_network,
-    descended,
-    trained,
-    white,
-)
+from ambid.identify.networks.nn_stages import Work, identify, trained_start
+from ambid.identify.networks.nn_train import Interrupted, State, added_gain
 from ambid.identify.networks.records import Scaled, scaled_records
-from ambid.identify.networks.search import Tick
 from ambid.identify.networks.settings import checked
-from ambid.identify.networks.shooting import shooting
 from ambid.identify.networks.start import SHORT, Start, start_free, start_one_axis
-from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+from ambid.identify.nonlinear.fit import NonlinearFit, Settings
+from ambid.identify.nonlinear.progress import Tick, part_of, silent
 
 Array = NDArray[np.float64]
 
@@ -46,17 +40,19 @@ _RANGES: Mapping[str, tuple[float, float]] = {
     "shooting": (0, 1_000_000),
     "descent": (0, 10_000),
     "iterations": (1, 2000),
+    "evaluations": (0, 1_000_000),
 }
 _CHOICES: Mapping[str, tuple[str, ...]] = {
     "form": ("auto", "one-axis", "free"),
     "connections": ("thesis", "damped", "all"),
     "residual": ("anchored", "orthogonal"),
     "noise": ("auto", "output", "innovations"),
+    "output": ("signed", "magnitude"),
+    "uncertainty": ("auto", "laplace", "sandwich", "bootstrap", "none"),
 }
 _DEFAULTS: Mapping[str, object] = {
     "form": "auto",
     "connections": "thesis",
-    "delay": 0,
     "neurons": 0,
     "residual": "anchored",
     "prior": 3.0,
@@ -65,34 +61,16 @@ _DEFAULTS: Mapping[str, object] = {
     "shooting": 0,
     "descent": 10,
     "iterations": 50,
+    "evaluations": 2000,
+    "uncertainty": "auto",
 }
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
 _LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
 _NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
-_LARGEST = 5  # states beyond the outputs that are tried
-
-
-@dataclass(slots=True)
-class Work:
-    """What a fit has come to, so that an interruption loses nothing.
-
-    Attributes
-    ----------
-    state : State or None
-        The best network so far; None before the first.
-    status : {"converged", "stalled"}
-    curves : list of LearningCurve
-    warnings : list of str
-    timing_s : dict of str to float
-    details : dict
-    """
-
-    state: State | None = None
-    status: Literal["converged", "stalled"] = "converged"
-    curves: list[LearningCurve] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    timing_s: dict[str, float] = field(default_factory=dict)
-    details: dict[str, Any] = field(default_factory=dict)
+_BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
+_MORE = 2  # states beyond the outputs, for the delay
+_DELAY, _TRAINING, _RESCUE = (0.0, 0.15), (0.15, 0.85), (0.3, 0.85)  # shares of the time, parts of a fit
+_SPREAD = (0.85, 1.0)
 
 
 def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -108,9 +86,9 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     settings : Mapping
         Described in the register of structures.
     seed : int, optional
-        Of the hidden layer's starts.
+        Of the hidden layer's starts, the global search and the bootstrap.
     tick : callable, optional
-        Called with the stage; may raise KeyboardInterrupt.
+        Called with the stage and the share of the whole; may raise KeyboardInterrupt.
 
     Returns
     -------
@@ -121,33 +99,33 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     EstimationError
         If a setting is not known, records do not belong together, are too short, or a channel does not move.
     """
-    s = {**_DEFAULTS, **checked("nn", settings, _RANGES, _CHOICES)}
-    data = _late(scaled_records("nn", records, lag=40 + int(s["delay"])), int(s["delay"]))  # type: ignore[call-overload]
-    work = Work()
+    told = checked("nn", settings, _RANGES, _CHOICES, auto=("states", "delay", "neurons"))
+    if told.get("output") == "magnitude":
+        return nn_of_magnitude(records, told, seed, tick)
+    s = {**_DEFAULTS, **checked("nn", settings, _RANGES, _CHOICES, auto=("states", "delay"))}
+    whole = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))  # type: ignore[call-overload]
     s["form"] = _form(str(s["form"]), records[0])
+    work, reason = Work(), ""
     try:
-        reason = _first(s, data, records[0], work)
+        reason = _started(s, whole, records[0], work, tick)
         if not reason:
-            _identify(s, data, work, seed, tick)
+            identify(s, work.data, work, seed, part_of(tick, *_TRAINING))
+        reason = _rescued(s, whole, records[0], work, seed, tick, reason)
     except KeyboardInterrupt as stop:
         if isinstance(stop, Interrupted):
             work.state = stop.state
         work.status = "stalled"
         work.warnings.insert(0, "interrupted: the best model so far")
+        reason = reason or "interrupted before there was a network"
     except np.linalg.LinAlgError as error:
         reason = f"the training broke down: {error}"
         work.state = None
+    s["delay"] = work.delay
     if work.state is None:
-        used = {"states": 0, **s}
-        return failed_fit("nn", records, used, seed, reason, work.timing_s)
-    return finished(records, {**s, "states": work.state.layout.n}, data, work, seed=seed)
-
-
-def _late(data: Scaled, delay: int) -> Scaled:
-    """Put each output beside the input that acts at its time."""
-    if not delay:
-        return data
-    return replace(data, parts=tuple((y[delay:], u[:-delay]) for y, u in data.parts))
+        return failed_fit("nn", records, {"states": 0, **s}, seed, reason, work.timing_s)
+    return finished(
+        records, {**s, "states": work.state.layout.n}, work.data, work, seed=seed, tick=part_of(tick, *_SPREAD)
+    )
 
 
 def _form(asked: str, first: IOData) -> str:
@@ -166,119 +144,128 @@ def _form(asked: str, first: IOData) -> str:
     return "one-axis" if fits and asked != "free" else "free"
 
 
+def _heads(record: IOData) -> tuple[int, ...]:
+    return tuple(_UNITS[record.units[x]] for x in record.outputs)
+
+
+def _started(s: Mapping[str, Any], whole: Scaled, record: IOData, work: Work, tick: Tick | None) -> str:
+    """Find the delay, and put a first network into `work`; return the reason where there is none."""
+    began = perf_counter()
+    work.delay = int(s["delay"]) if "delay" in s else guessed_delay(whole)
+    work.data = late(whole, work.delay)
+    reason = _first(s, work.data, record, work)
+    work.timing_s["start"] = perf_counter() - began
+    if "delay" in s or work.state is None:
+        return reason
+    began = perf_counter()
+    begun: State | None = work.state
+    if s["form"] == "free" and "states" not in s:  # more than are needed: fewer would pass for a delay
+        found = start_free(work.data, record.dt, work.data.y_level.size + _MORE)
+        begun = trained_start(found, work.data) if isinstance(found, Start) else None
+    if begun is None:
+        return reason
+    before = work.delay
+    _delayed(s, begun, whole, work, part_of(tick, *_DELAY))
+    if work.delay != before:
+        work.state = None
+        reason = _first(s, work.data, record, work)
+    work.timing_s["delay"] = perf_counter() - began
+    return reason
+
+
+def _delayed(s: Mapping[str, Any], state: State, whole: Scaled, work: Work, tick: Tick | None) -> None:
+    """Find the delay by short trainings from a first network."""
+    rather_late = s["form"] == "free" and "states" not in s
+    work.delay, errors = found_delay(state, whole, work.delay, tick, rather_late=rather_late)
+    work.data = late(whole, work.delay)
+    work.details["tried_delays"] = [{"delay": k, "log_det_errors": v} for k, v in errors.items()]
+    if work.delay == LARGEST:
+        work.warnings.append(
+            f"the delay that fits best is the largest looked for, {LARGEST} samples: give delay if inputs act later"
+        )
+
+
+def _subspace(s: Mapping[str, Any], data: Scaled, record: IOData, past: int) -> Start | str:
+    if s["form"] == "one-axis":
+        return start_one_axis(data, record.dt, _heads(record), s["connections"], past)
+    return start_free(data, record.dt, s.get("states") or data.y_level.size, past)
+
+
 def _first(s: Mapping[str, Any], data: Scaled, record: IOData, work: Work) -> str:
     """Put a first network into `work`; return the reason where there is none."""
-    began = perf_counter()
-    found: Start | str
     reason = ""
     for past in (SHORT, *_LONG):
-        if s["form"] == "one-axis":
-            heads = tuple(_UNITS[record.units[x]] for x in record.outputs)
-            found = start_one_axis(data, record.dt, heads, s["connections"], past)
-        else:
-            found = start_free(data, record.dt, s.get("states") or data.y_level.size, past)
+        found = _subspace(s, data, record, past)
         state = trained_start(found, data) if isinstance(found, Start) else None
         if state is not None and (work.state is None or state.score < work.state.score):
             work.state = state
         if state is not None and state.without_gain().simulates(data):
             break
         reason = reason or (found if isinstance(found, str) else _NO_START)
-    work.timing_s["start"] = perf_counter() - began
     return "" if work.state is not None else reason
 
 
-def trained_start(start: Start, data: Scaled) -> State | None:
-    """Return the start with its gain, if it runs; else None.
-
-    Parameters
-    ----------
-    start : Start
-    data : Scaled
-
-    Returns
-    -------
-    State or None
-    """
-    return added_gain(State.of(start.layout, start.theta, data), data, start.K)
-
-
-def _identify(s: dict[str, Any], data: Scaled, work: Work, seed: int, tick: Tick | None) -> None:
-    if tick is not None:
-        tick("start")
-    began = perf_counter()
-    if s["form"] == "free" and "states" not in s:
-        _choose_states(data, work, tick)
-    assert work.state is not None
-    first = work.state
-    if s["descent"]:
-        curves, work.details["one_step_training"] = descended(first, data, int(s["descent"]))
-        work.curves.extend(curves)
-        work.timing_s["one-step training"] = perf_counter() - began
-        began = perf_counter()
-    options: dict[str, Any] = {"iterations": int(s["iterations"]), "tick": tick}
-    if s["shooting"]:
-        _take(work, shooting(first, data, int(s["shooting"]), **options), worse_ok=True)
-    elif s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
-        _take(work, trained(first.without_gain(), data, stage="simulation errors", **options), worse_ok=True)
-    if s["neurons"]:
-        anchored, base = s["residual"] == "anchored", work.state
-        for k in range(int(s["starts"])):
-            _take(
-                work,
-                added_network(base, data, int(s["neurons"]), float(s["prior"]), anchored, seed=[seed, k], **options),
-            )
-    _gain(s, data, work, first, options)
-    work.timing_s["training"] = perf_counter() - began
-
-
-def _gain(s: Mapping[str, Any], data: Scaled, work: Work, first: State, options: Mapping[str, Any]) -> None:
-    """Go on with a predictor gain where the simulation errors are not white (the simplest noise that does)."""
-    state = work.state
-    assert state is not None
-    if s["noise"] == "output" or (
-        s["noise"] == "auto" and not s["shooting"] and not state.layout.gain and white(state, data)
-    ):
-        return
-    if not state.layout.gain:
-        widened = added_gain(state, data, first.K)
-        if widened is None:
-            work.warnings.append("no predictor gain was found that keeps the predictor finite")
-            return
-        state = widened
-    _take(work, trained(state, data, stage="prediction errors", **options), worse_ok=True)
+def _rescued(
+    s: Mapping[str, Any], whole: Scaled, record: IOData, work: Work, seed: int, tick: Tick | None, reason: str
+) -> str:
+    """Search globally where ordinary starts failed, and train what was found; return what is left of the reason."""
+    before, why = work.state, reason
+    if before is not None:
+        unexplained = misfit(before, work.data)
+        if unexplained > FAR:
+            why = f"a linear regression on the past explains {100 * unexplained:.0f} % of the errors' variance"
+    if not why or s["form"] != "one-axis" or not s["evaluations"]:
+        return reason
+    began, second = perf_counter(), Work(data=work.data, delay=work.delay)
+    try:
+        second.state, found = global_start(
+            work.data, record.dt, _heads(record), s["connections"], seed=seed, evaluations=int(s["evaluations"]),
+            tick=part_of(tick, *_RESCUE) or silent,
+        )  # fmt: skip
+        if second.state is not None:
+            if "delay" not in s:
+                _delayed(s, second.state, whole, second, None)
+                if second.delay != work.delay:
+                    second.state = _carried(second.state, second.data)
+            identify({**s, "descent": 0}, second.data, second, seed, part_of(tick, _RESCUE[1], _SPREAD[0]))
+    except KeyboardInterrupt as stop:
+        after = stop.state if isinstance(stop, Interrupted) else second.state
+        work.state = after if _better(after, before) else before
+        raise KeyboardInterrupt from stop
+    work.timing_s["global search"] = perf_counter() - began
+    after = second.state
+    better = _better(after, before)
+    work.details["global_search"] = {
+        "why": why, "failed_starts": 1 + len(_LONG), "evaluations": found.evaluations, "seconds": found.seconds,
+        "log_det_errors_before": None if before is None else before.score,
+        "log_det_errors_after": None if after is None else after.score, "taken": better,
+    }  # fmt: skip
+    said = f"{1 + len(_LONG)} ordinary starts failed ({why}): differential evolution, {found.evaluations} evaluations, "
+    if not better or after is None:
+        work.warnings.append(said + "found nothing better. Check channels, their signs and units, and the delay")
+        return reason
+    if before is None:
+        work.warnings.append(said + f"found a network whose errors have {_size(after)} of the outputs' deviations")
+    else:
+        work.warnings.append(
+            said + f"improved the errors from {_size(before)} to {_size(after)} of the outputs' deviations"
+        )
+    work.state, work.base, work.status = after, second.base, second.status
+    work.data, work.delay = second.data, second.delay
+    work.curves += second.curves
+    return ""
 
 
-def _take(work: Work, found: tuple[State, LearningCurve, bool] | None, *, worse_ok: bool = False) -> None:
-    """Take over a better network, and its learning curve."""
-    if found is None:
-        return
-    state, curve, converged = found
-    assert work.state is not None
-    if worse_ok or state.layout.neurons != work.state.layout.neurons or state.score < work.state.score:
-        work.state = state
-        work.status = "converged" if converged else "stalled"
-    work.curves.append(curve)
+def _carried(state: State, data: Scaled) -> State:
+    """The same network on other data."""
+    bare = State.of(state.layout, state.theta, data)
+    return added_gain(bare, data, state.K) or state
 
 
-def _choose_states(data: Scaled, work: Work, tick: Tick | None) -> None:
-    """Try more and more states; keep the number that Bayes' criterion likes best."""
-    p, tried = data.y_level.size, {}
-    best, best_bic, first = work.state, np.inf, work.state
-    assert first is not None
-    for n in range(p, p + _LARGEST + 1):
-        if tick is not None:
-            tick("choice of states")
-        found = start_free(data, first.layout.dt, n)
-        state = trained_start(found, data) if isinstance(found, Start) else None
-        if state is None:
-            continue
-        after = trained(state, data, stage="choice of states", iterations=6, tick=tick)
-        if after is None:
-            continue
-        tried[n] = after[0].bic
-        if after[0].bic < best_bic:
-            best, best_bic = after[0], after[0].bic
-        elif n >= 2 + (best.layout.n if best else p):
-            break
-    work.state = best
-    work.details["tried_states"] = [{"states": n, "bic": b} for n, b in tried.items()]
+def _better(after: State | None, before: State | None) -> bool:
+    return after is not None and (before is None or after.score < before.score - _BETTER)
+
+
+def _size(state: State) -> str:
+    """Errors in deviations of the outputs, the geometric mean over outputs."""
+    return f"{np.exp(state.score / state.layout.p / 2.0):.3g}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,21 +12,28 @@ from numpy.typing import NDArray
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.cloud import cloud_of
 from ambid.identify.networks.failed import failed_fit, provenance
+from ambid.identify.networks.nn_spread import spread_of
 from ambid.identify.networks.nn_train import State
 from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import information_inverse
 from ambid.identify.networks.start import carried_to_continuous
 from ambid.identify.networks.state_model import StateNetwork
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.progress import Tick
 
 if TYPE_CHECKING:
-    from ambid.identify.networks.nn import Work
+    from ambid.identify.networks.nn_stages import Work
 
 Array = NDArray[np.float64]
 
 
 def finished(
-    records: Sequence[IOData], used: Mapping[str, Any], data: Scaled, work: Work, *, seed: int
+    records: Sequence[IOData],
+    used: Mapping[str, Any],
+    data: Scaled,
+    work: Work,
+    *,
+    seed: int,
+    tick: Tick | None = None,
 ) -> NonlinearFit:
     """Return the fit of a trained network.
 
@@ -38,6 +46,8 @@ def finished(
     work : Work
         With a network.
     seed : int
+    tick : callable, optional
+        Of the bootstrap.
 
     Returns
     -------
@@ -51,13 +61,11 @@ def finished(
     if state is None or model is None:
         reason = "the network does not stay finite on the records that it was trained on: check the columns"
         return failed_fit("nn", records, used, seed, reason, work.timing_s)
-    covariance, condition = _covariance(state, data)
-    warnings = [*work.warnings, *_cautions(records, state)]
-    if covariance is None:
-        warnings.append(
-            f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
-            "Fewer states or connections, or more excitation"
-        )
+    began = perf_counter()
+    spread = spread_of(state, data, str(used["uncertainty"]), seed, tick)
+    covariance, condition = spread.covariance, spread.condition
+    work.timing_s["standard deviations"] = perf_counter() - began
+    warnings = [*work.warnings, *_cautions(records, state), *spread.warnings]
     work.timing_s["all"] = sum(work.timing_s.values())
     freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
     noise = state.noise * state.n_rows / freedom
@@ -66,7 +74,7 @@ def finished(
         settings=dict(used),
         model=model,
         covariance=covariance,
-        covariance_from="" if covariance is None else "laplace" if state.layout.neurons else "information",
+        covariance_from=spread.origin,
         n_estimated=int(state.theta.size),
         noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
         seed=seed,
@@ -101,16 +109,6 @@ def _model(records: Sequence[IOData], data: Scaled, state: State, delay: int) ->
         cloud=cloud_of(z),
         delay=delay,
     )
-
-
-def _covariance(state: State, data: Scaled) -> tuple[Array | None, float]:
-    """Inverse information of the weights, the first states taken into account; SI as the weights are."""
-    R = state.problem(data).triangle(state.vector)[:, :-1]
-    P, condition = information_inverse(R)
-    if P is None:
-        return None, condition
-    unit, k = state.layout.unit, state.theta.size
-    return P[:k, :k] * unit[:, None] * unit, condition
 
 
 def _cautions(records: Sequence[IOData], state: State) -> list[str]:

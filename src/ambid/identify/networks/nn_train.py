@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 from ambid.identify.networks.layout import Layout
 from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import Orthogonal, Ridge, orthogonal_to_physics
-from ambid.identify.networks.search import Tick, search
+from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import Penalty, StateProblem, largest_pole, shots
 from ambid.identify.networks.start import carried_to_continuous, widened
 from ambid.identify.networks.thesis_training import trained_one_step
 from ambid.identify.nonlinear.fit import LearningCurve
+from ambid.identify.nonlinear.progress import Tick, part_of
 
 Array = NDArray[np.float64]
 Trained = tuple["State", LearningCurve, bool] | None
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
+_SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
 _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
 _LAGS = 20  # of the test for whiteness
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
@@ -242,7 +244,7 @@ def trained(state: State, data: Scaled, *, stage: str, iterations: int, tick: Ti
         try:
             found = search(
                 problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
-                damping=damping, tick=tick, keep=best.append,
+                damping=damping, tick=part_of(tick, *_SHARES[k : k + 2]), keep=best.append,
             )  # fmt: skip
         except KeyboardInterrupt as stop:
             raise Interrupted(at.moved(problem, best[-1]) or at) from stop

@@ -14,9 +14,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Tick = Callable[[str], object]
+from ambid.identify.nonlinear.progress import Tick, guessed
 
+Array = NDArray[np.float64]
+_USUAL = 10.0  # iterations, roughly, of a search
 _BLOCK = 4096  # rows that are reduced at once: they stay in the cache
 BLIND = 1e-11  # singular values of the scaled Jacobian below this part of the largest are directions nobody sees
 
@@ -134,7 +135,7 @@ def search(
     slack : float, optional
         Part by which the held-out error at the end may exceed its least before the weights of the least are taken.
     tick : callable, optional
-        Called before each iteration.
+        Called before each iteration, with the share of this search that is over.
     keep : callable, optional
         Given each better vector, shape (n_theta,).
 
@@ -147,9 +148,9 @@ def search(
     seconds, costs = [0.0], [cost]
     held = [held_out(theta)] if held_out is not None else []
     best_held, best_theta, worse = (held[0] if held else np.inf), theta, 0
-    for _ in range(most):
+    for k in range(most):
         if tick is not None:
-            tick(stage)
+            tick(stage, max(k / most, guessed(k, _USUAL)))
         if not np.isfinite(cost):
             break
         trial, trial_cost, damping, over = _step(problem, theta, cost, damping)

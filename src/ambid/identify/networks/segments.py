@@ -282,6 +282,31 @@ class StateProblem:
         whole[:, list(self.held)] = 0.0
         return triangle_of([whole])
 
+    def sample_rows(self, v: Array) -> list[Array]:
+        """Return slopes and errors of every sample, joined to ones of unit variance.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n_theta + n_shots n,)
+
+        Returns
+        -------
+        list of ndarray, shape (n_samples, n_outputs, n_theta + n_shots n + 1)
+            Of each shot.
+        """
+        theta, x0 = self.split(v)
+        layout, n, P = self.layout, self.layout.n, self.layout.n_theta
+        m, out = layout.matrices(theta), []
+        for k, shot in enumerate(self.shots):
+            X, E = run(layout, m, shot, x0[k])
+            J = slopes(layout, m, shot, X, E, np.hstack([np.zeros((n, P)), np.eye(n)]))
+            both = np.moveaxis(self._weighted(J, E).reshape(layout.p, E.shape[0], -1), 0, 1)
+            wide = np.zeros((*both.shape[:2], v.size + 1))
+            wide[:, :, :P], wide[:, :, P + k * n : P + (k + 1) * n] = both[:, :, :P], both[:, :, P:-1]
+            wide[:, :, -1] = both[:, :, -1]
+            out.append(wide)
+        return out
+
     def _weighted(self, J: Array, E: Array) -> Array:
         """Slopes and errors of all outputs, joined to ones of unit variance."""
         out = np.empty((self.layout.p, J.shape[0], J.shape[2] + 1))

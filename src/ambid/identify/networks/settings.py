@@ -12,6 +12,7 @@ def checked(
     given: Mapping[str, object],
     ranges: Mapping[str, tuple[float, float]],
     choices: Mapping[str, tuple[str, ...]],
+    auto: tuple[str, ...] = (),
 ) -> dict[str, object]:
     """Check settings by name.
 
@@ -23,11 +24,13 @@ def checked(
     ranges : Mapping[str, (low, high)]
         Numbers; whole ones where both bounds are of type int.
     choices : Mapping[str, tuple of str]
+    auto : tuple of str, optional
+        Numbers that may be ``auto``, which is as good as leaving them out.
 
     Returns
     -------
     dict
-        What was given.
+        What was given, less what is ``auto``.
 
     Raises
     ------
@@ -35,6 +38,8 @@ def checked(
         If one is not known or has no such value.
     """
     for name, value in given.items():
+        if name in auto and value == "auto":
+            continue
         if name in choices:
             if value not in choices[name]:
                 near = nearest(str(value), list(choices[name]))
@@ -53,4 +58,4 @@ def checked(
             raise EstimationError(
                 f"{structure}: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, known)}"
             )
-    return dict(given)
+    return {k: v for k, v in given.items() if not (k in auto and v == "auto")}

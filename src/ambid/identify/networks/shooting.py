@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_train import State, Trained, added_gain, relative_error
 from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import Tick, search
+from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import StateProblem
 from ambid.identify.nonlinear.fit import LearningCurve
+from ambid.identify.nonlinear.progress import Tick, part_of
 
 Array = NDArray[np.float64]
 
@@ -46,9 +47,10 @@ def shooting(state: State, data: Scaled, length: int, *, iterations: int, tick: 
     at = np.cumsum([0, *(s.y.shape[0] for s in short.shots)])[:-1]
     v = np.concatenate([plain.theta, X[at].ravel()])
     seconds, errors, offset, jump, converged = [], [], 0.0, np.full(plain.layout.n, 10.0), False
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
         short = plain.problem(data, length, jump)
-        found = search(short, v, stage="multiple shooting", most=iterations, tolerance=1e-6, tick=tick)
+        own = part_of(tick, k / _ROUNDS, (k + 1) / _ROUNDS)
+        found = search(short, v, stage="multiple shooting", most=iterations, tolerance=1e-6, tick=own)
         v, converged = found.theta, found.converged
         seconds += [offset + t for t in found.seconds]
         errors += [relative_error(c, plain) for c in found.costs]

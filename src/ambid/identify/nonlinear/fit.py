@@ -54,7 +54,8 @@ class NonlinearFit:
     covariance : ndarray, shape (n_theta, n_theta) or None
         Of ``model.theta``; zeros where a parameter was not estimated. None where the method has none to give.
     covariance_from : str
-        How it came about: ``"information"``, ``"laplace"``, ``"bootstrap"``; empty without.
+        How it came about: ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white),
+        ``"bootstrap"``; empty without.
     n_estimated : int
         Numbers that were estimated.
     noise_covariance : ndarray, shape (n_outputs, n_outputs), SI
