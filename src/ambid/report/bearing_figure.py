@@ -258,20 +258,23 @@ def _records(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
         grid(*[a for a in row if a.axison])
         for a in row:
             a.tick_params(labelsize=7)
+            a.set_axisbelow(True)
+            a.locator_params(axis="x", nbins=5)
     for a, title in zip(
         axes[0], ("position", "current", "errors of position / sd", "errors of current / sd"), strict=True
     ):
         a.set_title(title, fontsize=9, loc="right" if a is axes[0][0] else "center")
     for a in axes[-1]:
         a.set_xlabel("time [s]", fontsize=8)
-    axes[0][1].legend(loc="upper right", fontsize=7, framealpha=0.85)
-    figure.suptitle("measured, predicted one step ahead, and what the predictor missed (99 % bounds)", fontsize=10)
+    figure.suptitle(
+        "measured (grey), predicted one step ahead (blue), and what the predictor missed (99 % bounds)", fontsize=10
+    )
 
 
 def _outputs(axes: Axes, t: BearingTrace, c: int, unit: str) -> None:
     scale, shown = prefixed(float(np.max(np.abs(t.measured[:, c]))), unit)
-    curve(axes, t.time_s, t.measured[:, c] / scale, MEASURED, "measured")
-    curve(axes, t.time_s, t.predicted[:, c] / scale, PREDICTED, "predicted")
+    curve(axes, t.time_s, t.measured[:, c] / scale, MEASURED, None)
+    curve(axes, t.time_s, t.predicted[:, c] / scale, PREDICTED, None)
     axes.set_ylabel(f"[{shown}]", fontsize=8)
 
 

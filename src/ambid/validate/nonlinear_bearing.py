@@ -238,6 +238,6 @@ def _carries(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[
     if estimate.law.pair or weight == 0.0:
         return {}
     at = estimate.curves(record.y[:, 0], record.y[:, 1])
-    off = float(np.mean(at.force.value)) / weight + 1.0
-    detail = f"the magnet's mean force differs from the weight by {off:.1%} on this record"
+    off = -float(np.mean(at.force.value)) / weight - 1.0
+    detail = f"the magnet's mean force is {abs(off):.1%} {'above' if off > 0 else 'below'} the weight on this record"
     return {"carries_its_weight": Check(passed=abs(off) < _WEIGHT, detail=detail, values={"relative": off})}

@@ -256,6 +256,8 @@ def _interval(x: Sequence[float]) -> tuple[float, float]:
 
 def _consistent(e: NonlinearBearingEstimate) -> None:
     """Raise ValueError where the parts do not belong together: an edited file, or one of another program."""
+    if e.law.gap not in ("hyperbolic", "exponential"):
+        raise ValueError(f"{e.law.gap!r} is no gap law")
     acting = {*e.law.names, *BODY}
     for p in e.parameters:
         if p.name not in acting or p.unit != UNITS[p.name] or not math.isfinite(p.value):
