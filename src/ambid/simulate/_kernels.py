@@ -56,6 +56,16 @@ def runge_kutta(
 
 
 @njit(cache=True, nogil=True)
+def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, body: Array) -> tuple[float, float]:
+    """Return current and lagging force a step later of a rotor that lies on a stop: without speed no voltage by it."""
+    _, c1, p1 = rate_of_change(x, 0.0, i, p, voltage, 0.0, magnet, body)
+    _, c2, p2 = rate_of_change(x, 0.0, i + 0.5 * h * c1, p + 0.5 * h * p1, voltage, 0.0, magnet, body)
+    _, c3, p3 = rate_of_change(x, 0.0, i + 0.5 * h * c2, p + 0.5 * h * p2, voltage, 0.0, magnet, body)
+    _, c4, p4 = rate_of_change(x, 0.0, i + h * c3, p + h * p3, voltage, 0.0, magnet, body)
+    return i + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), p + h / 6.0 * (p1 + 2.0 * (p2 + p3) + p4)
+
+
+@njit(cache=True, nogil=True)
 def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, bool]:
     """Stop the rotor at the ends of its range, without rebound; the flag says that it touched."""
     if x >= high:
@@ -96,6 +106,12 @@ def advance_nonlinear(
         voltage = min(max(late if part == 0 else now, body[7]), body[8]) + disturbance[1]
         h = length / substeps
         for _ in range(substeps):
+            if v == 0.0 and (p >= high or p <= low):
+                push, _, _ = rate_of_change(p, v, i, lagging, voltage, disturbance[0], magnet, body)
+                if (p >= high and push >= 0.0) or (p <= low and push <= 0.0):
+                    i, lagging = lie(p, i, lagging, voltage, h, magnet, body)
+                    touched = True
+                    continue
             p, v, i, lagging = runge_kutta(p, v, i, lagging, voltage, disturbance[0], h, magnet, body)
             p, v, hit = stop(p, v, low, high)
             touched = touched or hit

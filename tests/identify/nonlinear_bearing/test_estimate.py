@@ -93,13 +93,15 @@ def test_an_interruption_keeps_the_best_so_far(bearing):
     problem = problem_of([as_seen(done[0])], wrong, PAIR, {"k", "m"}, [1e-7, 2e-3, 2.0, 0.1, 0.02], 1.0)
     calls = []
 
-    def tick():
-        calls.append(1)
+    def tick(stage, done=None):
+        assert stage == "identify"
+        calls.append(done)
         if len(calls) == 3:
             raise KeyboardInterrupt
 
     fit = search(problem, problem.start(), tick=tick)
     assert fit.status == "stalled"
+    assert 0.0 <= calls[0] <= calls[1] <= calls[2] < 1.0
     assert fit.at is not None
     assert fit.criterion < criterion(problem, problem.start()) - 100
 

@@ -163,16 +163,56 @@ def _bend(
 
 
 @njit(cache=True, nogil=True)
+def _double(F: Array, dF: Array, E: Array, dE: Array, slopes: bool, T: Array, T2: Array, dT: Array) -> None:
+    """Make F and E of a step those of two, in place: E <- E + F E, F <- F F, with their derivatives."""
+    n = F.shape[0]
+    if slopes:
+        for a in range(n):
+            for d in range(2):
+                for j in range(dE.shape[2]):
+                    s = dE[a, d, j]
+                    for c in range(n):
+                        s += dF[a, c, j] * E[c, d] + F[a, c] * dE[c, d, j]
+                    dT[a, d, j] = s
+        for a in range(n):
+            for d in range(2):
+                for j in range(dE.shape[2]):
+                    dE[a, d, j] = dT[a, d, j]
+        _sum(dT, -1.0, dT, dT)
+        _right(dF, F, 1.0, dT)
+        _left(F, dF, 1.0, dT)
+        _sum(dT, 0.0, dF, dF)
+    for a in range(n):
+        for d in range(2):
+            s = E[a, d]
+            for c in range(n):
+                s += F[a, c] * E[c, d]
+            T2[a, d] = s
+        for b in range(n):
+            s = 0.0
+            for c in range(n):
+                s += F[a, c] * F[c, b]
+            T[a, b] = s
+    for a in range(n):
+        for d in range(2):
+            E[a, d] = T2[a, d]
+        for b in range(n):
+            F[a, b] = T[a, b]
+
+
+@njit(cache=True, nogil=True)
 def _spread(
     z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags,
-    level2: Array, q2: Array, volts: Array, h: float, slopes: bool, w: Array, dw: Array, g: Array, A: Array, G: Array,
-    dA: Array, F: Array, dF: Array, T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
+    level2: Array, q2: Array, volts: Array, h: float, steps: int, slopes: bool, w: Array, dw: Array, g: Array,
+    A: Array, G: Array, dA: Array, F: Array, dF: Array, T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
 ) -> None:  # fmt: skip
     """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the linearised plant.
 
     `q2` is `level2`, force, voltage and drift, with what is not known of force and voltage of this sample. A is the
-    Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B.
+    Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B of a
+    step, put together over `steps` of them, a power of two.
     """
+    h /= steps
     n, p, n_a = z.size, S.shape[2], active.size
     volt = np.empty(2)
     volt[0], volt[1] = volts[0], volts[2]
@@ -190,6 +230,19 @@ def _spread(
         E[a, 1] = 0.5 * h * h * A[a, 2] / ell
     E[1, 0] += h * bf
     E[2, 1] += h / ell
+    if slopes:
+        _bend(z, S, th, active, chain, flags, volt, h, w, dw, g, A, dA, dE)
+        _sum(dF, -1.0, dF, dF)
+        for a in range(n):
+            for b in range(n):
+                H[a, b] = 0.5 * h * h * A[a, b]
+            H[a, a] += 0.5 * h  # dF = H dA + dA H
+        _left(H, dA, 1.0, dF)
+        _right(dA, H, 1.0, dF)
+    done = 1
+    while done < steps:
+        _double(F, dF, E, dE, slopes, T, T2, dT)
+        done *= 2
     for a in range(n):
         for b in range(n):
             s = 0.0
@@ -197,16 +250,10 @@ def _spread(
                 s += P[a, c] * F[b, c]
             T[a, b] = s  # P F'
     if slopes:
-        _bend(z, S, th, active, chain, flags, volt, h, w, dw, g, A, dA, dE)
-        _sum(dF, -1.0, dF, dF)
         _sum(dT, -1.0, dT, dT)
         for a in range(n):
             for b in range(n):
                 T2[a, b] = F[b, a]
-                H[a, b] = 0.5 * h * h * A[a, b]
-            H[a, a] += 0.5 * h  # dF = H dA + dA H
-        _left(H, dA, 1.0, dF)
-        _right(dA, H, 1.0, dF)
         _left(F, dP, 0.5, dT)  # dT = F dP/2 + dF P, so that dP+ = dT F' + F dT' + noise
         _right(dF, P, 1.0, dT)
         _sum(dP, -1.0, dP, dP)
@@ -289,11 +336,11 @@ def predict(
 ) -> bool:  # fmt: skip
     """Run the predictor over one record; False where a gap closes or numbers cease to be finite.
 
-    `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n,) of what is not known of the force, `y`
-    (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,) and `P` hold the state
-    before sample `first`, and move along. `noise2` holds the squares of the levels of position, current, force,
-    voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows` (4 n, p + 1) the
-    rows of the likelihood, where `slopes` wants them.
+    `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what is not known of the force, and of
+    the motional voltage; `y` (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,)
+    and `P` hold the state before sample `first`, and move along. `noise2` holds the squares of the levels of position,
+    current, force, voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows`
+    (4 n, p + 1) the rows of the likelihood, where `slopes` wants them.
     """
     n, n_a = z.size, active.size
     p = n_a + 5
@@ -326,11 +373,11 @@ def predict(
         volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
         for d in range(3):
             q2[d] = noise2[2 + d]
-        q2[0] += knock[k]
-        q2[1] += max(loose[k - whole - 1], loose[k - whole])
+        q2[0] += knock[k, 0]
+        q2[1] += max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
         _spread(
-            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, volts, h, slopes, w, dw, g, A, G, dA, F, dF, T, dT,
-            E, dE, T2, H,
+            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, volts, h, steps, slopes, w, dw, g, A, G, dA, F, dF,
+            T, dT, E, dE, T2, H,
         )  # fmt: skip
         _advance(z, S, th, active, chain, flags, volts, h, steps, slopes, w, dw, g, A, G, room)
         low, high = z[0] + th[1], th[1] - z[0]

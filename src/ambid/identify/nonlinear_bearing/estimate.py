@@ -8,12 +8,13 @@ four levels per record; a constant gain would be wrong by the change of k_x over
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ambid.errors import EstimationError
+from ambid.identify.nonlinear.progress import Tick, portions
 from ambid.identify.nonlinear_bearing.likelihood import BearingFit, criterion, linearise, promise, search
 from ambid.identify.nonlinear_bearing.problem import LEVELS, BearingProblem, BearingRecord, Number
 from ambid.identify.nonlinear_bearing.start import LinearStart, linear_start, start_numbers, with_noise
@@ -36,7 +37,7 @@ def estimate_bearing(
     extend: bool = True,
     eddy: bool = False,
     drift: bool = False,
-    tick: Callable[[], None] | None = None,
+    tick: Tick | None = None,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several records at once.
 
@@ -51,13 +52,14 @@ def estimate_bearing(
     delay : float or None
         Of the voltage in samples of the first record; None: found.
     extend : bool
-        Whether rising leakage is tried beyond the laws given (BIC decides). Saturation is not: with one magnet, a lag
-        in a sensor or a wandering force looks like it; it has to be asked for.
+        Whether rising leakage, and magnets of a pair that differ, are tried beyond the laws given (BIC decides).
+        Saturation is not: with one magnet, a lag in a sensor or a wandering force looks like it; it has to be asked
+        for.
     eddy : bool
         Force behind a pole a/(s + a).
     drift : bool
         A force that walks slowly: what the law leaves over.
-    tick : callable, optional
+    tick : Tick, optional
         Called after each evaluation; KeyboardInterrupt ends in the best so far.
 
     Returns
@@ -72,33 +74,49 @@ def estimate_bearing(
     free = [r for r in records if not r.held]
     if not free:
         raise EstimationError("every record holds the rotor; masses and forces want one in which it moves")
-    tick = _remembered(tick)
+    laws = [_widened(law, known) for law in laws]
+    short = [_short(r) for r in records]
+    few, many = (float(sum(r.u.size for r in x)) for x in (short, records))
+    rich = extend and any(not law.rise or (law.pair and not law.asymmetric) for law in laws)
+    ticks = portions(_remembered(tick), [*[few] * len(laws), 2.0 * few * rich, many, many * (delay is None)])
     with one_thread():
         linear = linear_start(free[0], known, delay, laws[0])
-        short = [_short(r) for r in records]
-        fits = [_first(short, known, law, linear, delay, eddy=eddy, drift=drift, tick=tick) for law in laws]
+        fits = [
+            _first(short, known, law, linear, delay, eddy=eddy, drift=drift, tick=t)
+            for law, t in zip(laws, ticks, strict=False)
+        ]
         fits = [f for f in fits if f.status != "failed"]
         if not fits:
             raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
         fit = min(fits, key=lambda f: f.criterion)
-        if extend and not fit.problem.law.rise:
-            fit = _extended(fit, replace(fit.problem.law, rise=True), known, short, linear, tick)
+        if extend:
+            for name in ("rise", "asymmetric") if fit.problem.law.pair else ("rise",):
+                law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
+                              asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
+                if law != fit.problem.law:
+                    fit = _extended(fit, law, known, short, linear, ticks[-3])
         whole = replace(fit.problem, records=tuple(records))
-        fit = search(whole, fit.vector, tick=tick)
-        return fit if delay is not None or fit.status == "failed" else _with_fraction(fit, tick)
+        fit = search(whole, fit.vector, tick=ticks[-2])
+        return fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1])
 
 
-def _remembered(tick: Callable[[], None] | None) -> Callable[[], None]:
+def _widened(law: MagnetLaw, known: Mapping[str, Parameter]) -> MagnetLaw:
+    """The law with what the user says of a difference between the magnets of a pair."""
+    said = [known[n] for n in ("k_asym", "i0_asym") if n in known]
+    return replace(law, asymmetric=law.pair and (law.asymmetric or any(p.role != "fixed" or p.value for p in said)))
+
+
+def _remembered(tick: Tick | None) -> Tick:
     """An interruption ends every search that comes after it, too."""
     interrupted = False
 
-    def again() -> None:
+    def again(stage: str, done: float | None = None, /) -> None:
         nonlocal interrupted
         if interrupted:
             raise KeyboardInterrupt
         try:
             if tick is not None:
-                tick()
+                tick(stage, done)
         except KeyboardInterrupt:
             interrupted = True
             raise
@@ -114,7 +132,7 @@ def _short(record: BearingRecord) -> BearingRecord:
 
 def _first(
     records: Sequence[BearingRecord], known: Mapping[str, Parameter], law: MagnetLaw, linear: LinearStart,
-    delay: float | None, *, eddy: bool, drift: bool, tick: Callable[[], None] | None,
+    delay: float | None, *, eddy: bool, drift: bool, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
     """Start values of one law, and a search from there."""
     rate = next(r.rate_hz for r in records if not r.held)
@@ -143,7 +161,7 @@ def _with_eddy(numbers: tuple[Number, ...], known: Mapping[str, Parameter], *, o
 
 def _extended(
     fit: BearingFit, law: MagnetLaw, known: Mapping[str, Parameter], records: Sequence[BearingRecord],
-    linear: LinearStart, tick: Callable[[], None] | None,
+    linear: LinearStart, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
     """The fit with a richer law where it pays (BIC)."""
     values, old = fit.problem.values(fit.vector), {n.name: n for n in fit.problem.numbers}
@@ -185,7 +203,7 @@ def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
     return vector
 
 
-def _with_fraction(fit: BearingFit, tick: Callable[[], None] | None) -> BearingFit:
+def _with_fraction(fit: BearingFit, tick: Tick | None) -> BearingFit:
     """Free a delay that was whole where the score test says so; put one back that came out whole."""
     price = float(np.log(fit.problem.n_used))
     for rate, delay in fit.problem.delays.items():
@@ -210,7 +228,7 @@ def _with_fraction(fit: BearingFit, tick: Callable[[], None] | None) -> BearingF
 
 
 def _whole(
-    fit: BearingFit, rate: float, total: float, price: float, tick: Callable[[], None] | None
+    fit: BearingFit, rate: float, total: float, price: float, tick: Tick | None
 ) -> BearingFit:  # fmt: skip
     exact = replace(
         fit.problem, delays={**fit.problem.delays, rate: total}, free_delay=fit.problem.free_delay - {rate}

@@ -7,14 +7,14 @@ Astrom 1980), exact in state and covariance. Its gradient and Fisher information
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.nonlinear_bearing.problem import NOISE_PRIOR_SD, BearingProblem
+from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear_bearing.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem
 
 Array = NDArray[np.float64]
 Status = Literal["converged", "stalled", "failed"]
@@ -22,6 +22,7 @@ Status = Literal["converged", "stalled", "failed"]
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
 _SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
+_SEARCHING = "identify"
 _LONGEST = 1.0  # step of a logarithm at once
 
 
@@ -129,17 +130,34 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
     n = record.u.size
     e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
     rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
-    steps = problem.substeps * max(1, round(0.25 * max(problem.delays) / record.rate_hz))
-    begun = next(x.value for x in problem.numbers if x.name == "m")
-    knock = np.zeros(n) if record.knock is None else (begun * record.knock) ** 2
+    steps = _steps(problem, r)
     done = predict(
-        record.u, record.loose**2, knock, record.y, record.valid & np.array([not record.held, True]), problem.skip,
-        whole, theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P,
-        slopes, e, s, rows,
+        record.u, record.loose**2, _knocks(problem, r), record.y, record.valid & np.array([not record.held, True]),
+        problem.skip, whole, theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz,
+        steps, z, P, slopes, e, s, rows,
     )  # fmt: skip
     if not done:
         return None
     return Innovations(e=e, s=s, rows=rows if slopes else np.zeros((0, 0)), columns=np.array(columns))
+
+
+def _knocks(problem: BearingProblem, r: int) -> Array:
+    """Variances (n, 2) of force and motional voltage while the rotor is knocked; they do not hang on the vector."""
+    record = problem.records[r]
+    if record.knock is None or not record.knock.any():
+        return np.zeros((record.u.size, 2))
+    begun, at = {n.name: n.value for n in problem.numbers}, record.knock > 0.0
+    x = np.array([record.y[at, 0].min(), record.y[at, 0].max()]) - begun["x_offset"]
+    i = np.full(2, np.sqrt(np.mean(record.y[:, 1] ** 2)))
+    k_i = float(np.max(np.abs(problem.law.table(x, i, begun)[0][:, 2])))
+    return np.column_stack([begun["m"] * record.knock, k_i * record.knock / record.rate_hz]) ** 2
+
+
+def _steps(problem: BearingProblem, r: int) -> int:
+    """Steps in a sample, a power of two: more where a slow record joins a fast one, and for an eddy pole."""
+    slow = 0.25 * max(problem.delays) / problem.records[r].rate_hz
+    wanted = problem.substeps * max(slow, EDDY_STEPS if problem.flags(r)[2] else 1.0, 1.0)
+    return int(2 ** round(np.log2(wanted)))
 
 
 def _initial(problem: BearingProblem, r: int) -> tuple[Array, Array]:
@@ -258,26 +276,29 @@ def _triangle(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def promise(at: Linear) -> float:
+def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
     """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
 
     Parameters
     ----------
     at : Linear
+    loose : ndarray, shape (size,), bool, optional
+        Which numbers may move; None: all.
 
     Returns
     -------
     float
     """
-    norm = np.linalg.norm(at.J, axis=0)
+    J = at.J if loose is None else at.J[:, loose]
+    norm = np.linalg.norm(J, axis=0)
     norm[norm == 0] = 1.0
-    u, s, _ = np.linalg.svd(at.J / norm, full_matrices=False)
+    u, s, _ = np.linalg.svd(J / norm, full_matrices=False)
     inside = u[:, s > 1e-10 * s[0]].T @ at.r
     return float(inside @ inside)
 
 
 def search(
-    problem: BearingProblem, start: Array, *, iterations: int = _ITERATIONS, tick: Callable[[], None] | None = None
+    problem: BearingProblem, start: Array, *, iterations: int = _ITERATIONS, tick: Tick | None = None
 ) -> BearingFit:
     """Minimise the criterion from `start`.
 
@@ -287,38 +308,45 @@ def search(
     start : ndarray, shape (size,)
     iterations : int
         Bound on linearisations.
-    tick : callable, optional
-        Called after each evaluation; may raise KeyboardInterrupt, upon which the best so far comes back as stalled.
+    tick : Tick, optional
+        Called after each evaluation. What is over is the share of the iterations allowed, or that of the way, in powers
+        of ten, to where a search ends, if that is more. May raise KeyboardInterrupt, upon which the best so far comes
+        back as stalled.
 
     Returns
     -------
     BearingFit
         With status ``"failed"`` where there is no predictor at `start`.
     """
-    at = linearise(problem, start)
-    vector, damping, count, status = start.copy(), 1e-3, 1, "stalled"
+    upper = problem.upper()
+    vector, damping, count, status = np.minimum(start, upper), 1e-3, 1, "stalled"
+    at = linearise(problem, vector)
     if at is None:
         return BearingFit(problem=problem, vector=vector, at=None, criterion=np.inf, status="failed", evaluations=1)
     try:
-        for _ in range(iterations):
-            if promise(at) < _SETTLED:
+        begun, share = promise(at), 0.0
+        for n in range(iterations):
+            loose = ~((vector >= upper) & (at.J.T @ at.r < 0.0))  # what stands at its bound, and would go beyond, rests
+            left = promise(at, loose)
+            if left < _SETTLED:
                 status = "converged"
                 break
+            share = max(share, n / iterations, _approach(begun, left))
             moved, first = None, True
             while damping < 1e8:
-                trial = vector + _step(at, damping)
+                trial = np.minimum(vector + _step(at, damping, loose), upper)
                 # the first step is mostly right, and wants its slopes anyway; after a refusal the criterion alone asks
                 if first or criterion(problem, trial) < at.criterion:
                     moved = linearise(problem, trial)
                 count, first = count + 1, False
                 if tick is not None:
-                    tick()
+                    tick(_SEARCHING, share)
                 if moved is not None and moved.criterion < at.criterion:
                     break
                 moved, damping = None, max(10.0 * damping, 1e-6)
             if moved is None:
                 # no way down from here: converged where what a step promises is below what rounding leaves
-                status = "converged" if promise(at) < 1.0 else "stalled"
+                status = "converged" if promise(at, loose) < 1.0 else "stalled"
                 break
             vector, at, damping = trial, moved, damping / 10.0
     except KeyboardInterrupt:
@@ -327,10 +355,17 @@ def search(
     return BearingFit(problem=problem, vector=vector, at=at, criterion=at.criterion, status=final, evaluations=count)
 
 
-def _step(at: Linear, damping: float) -> Array:
+def _approach(begun: float, left: float) -> float:
+    """Guess how much of a search is over from how far its promise has fallen, in powers of ten."""
+    if not begun > _SETTLED:
+        return 0.0
+    return float(np.clip(np.log(begun / max(left, _SETTLED)) / np.log(begun / _SETTLED), 0.0, 1.0))
+
+
+def _step(at: Linear, damping: float, loose: NDArray[np.bool_]) -> Array:
     norm = np.linalg.norm(at.J, axis=0)
     norm[norm == 0] = 1.0
-    u, s, vt = np.linalg.svd(at.J / norm, full_matrices=False)
+    u, s, vt = np.linalg.svd(at.J / norm * loose, full_matrices=False)
     step = np.asarray(-(vt.T @ (s / (s**2 + damping) * (u.T @ at.r))) / norm)
     longest = float(np.max(np.abs(step)))
     return step if longest <= _LONGEST else step * (_LONGEST / longest)

@@ -33,6 +33,9 @@ UNITS: Mapping[str, str] = {
 LEVELS = ("position", "current", "force", "voltage", "drift")
 """Noise levels in the order of the kernels: rms of one sample, the last three held over it."""
 
+EDDY_STEPS = 8
+"""Steps in a sample where there is an eddy pole; it may be as fast as one of them."""
+
 NOISE_PRIOR_SD = 5.0
 """Of a log noise level: keeps a level that the data do not see from running to minus infinity."""
 
@@ -118,7 +121,7 @@ class BearingProblem:
     skip : int
         Samples left out at the start of each record.
     substeps : int
-        Runge-Kutta steps in a sample.
+        Runge-Kutta steps in a sample, at least; a power of two.
     """
 
     law: MagnetLaw
@@ -177,6 +180,14 @@ class BearingProblem:
         for r, place in enumerate(self.noise_slices):
             vector[place] = self.noise_center[r, list(self.levels(r))]
         return vector
+
+    def upper(self) -> Array:
+        """Return the largest values of the vector, in shape (size,): an eddy pole faster than a step cannot be seen."""
+        found = np.full(self.size, np.inf)
+        if self.eddy:
+            rate = min(r.rate_hz for r in self.records if not r.held)
+            found[[j for j, n in enumerate(self.estimated) if n.name == "a"]] = np.log(EDDY_STEPS * rate)
+        return found
 
     def values(self, vector: Array) -> dict[str, float]:
         """Return all numbers at a vector, SI.

@@ -197,6 +197,8 @@ def start_numbers(
         "v_drop": 0.1 * float(np.std(free[0].u)),
     }
     magnitude["v_offset"] = 0.1 * float(np.std(free[0].u))
+    if "i_drop" not in known and "v_drop" in known and known["v_drop"].role != "fixed":
+        known = {**known, "i_drop": Parameter(name="i_drop", unit="A")}  # a width that is wrong makes the drop wrong
     return tuple(
         _number(name, known.get(name), guess[name], law, magnitude.get(name, 1.0)) for name in (*law.names, *BODY)
     )

@@ -75,6 +75,9 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
     sandwich = half @ half.T
     unit = np.outer(chain, chain)
     information, wide = whole[:n, :n] * unit, sandwich[:n, :n] * unit
+    for j in np.flatnonzero(fit.vector[:n] >= problem.upper()[:n]).tolist():
+        # at its bound: the records do not tell it from anything beyond
+        information[j, j], wide[j, j] = (max(c[j, j], chain[j] ** 2) for c in (information, wide))
     ratio = np.sqrt(np.diag(wide) / np.maximum(np.diag(information), 1e-300))
     extra = [float(np.sqrt(whole[n + j, n + j])) for j in range(len(problem.rates))]
     return BearingUncertainty(
