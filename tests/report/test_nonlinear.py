@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ambid.identify.narmax.estimate import narmax
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.report.nonlinear_figure import nonlinear_overview, traces_of
 from ambid.report.nonlinear_panels import bars_of, columns_of
-from ambid.report.nonlinear_text import curve_line, nonlinear_text, setting_text, term_lines
+from ambid.report.nonlinear_parameters import named_lines, schedule_lines, term_lines
+from ambid.report.nonlinear_text import curve_line, curve_lines, nonlinear_text, setting_text
 from ambid.validate.nonlinear import judged
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
+
+
+@dataclass(frozen=True)
+class Renamed:
+    """Numbers under other names, all that a table wants of a model."""
+
+    names: tuple[str, ...]
+    theta: NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +44,58 @@ def test_the_first_twenty_terms_with_ratio_and_spread(fit: NonlinearFit) -> None
     assert fit.sd is not None
     assert abs(float(row.split()[1]) - fit.model.theta[k]) < 0.5 * fit.sd[k]
     assert "±" not in "".join(term_lines(replace(fit, covariance=None)))
+
+
+def test_weights_beside_terms_are_counted_and_ratios_shown_where_there_are_any(fit: NonlinearFit) -> None:
+    assert fit.model is not None
+    names = [f"unit 1: {x}" if k > 3 else x for k, x in enumerate(fit.model.names)]
+    hybrid = replace(
+        fit,
+        model=Renamed(names=tuple(names), theta=fit.model.theta),
+        details={"terms": {"y": [{"term": x} for x in names[:4]]}},
+    )
+    lines = term_lines(hybrid)
+    assert lines[0].split() == ["term", "coefficient", "±", "sd"]
+    assert [x.split()[0] for x in lines[1:5]] == names[:4]
+    assert lines[5:] == [f"beside them a network of {len(names) - 4} weights; --json has them"]
+
+
+def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit) -> None:
+    few = replace(
+        fit, model=Renamed(names=("a21", "b3"), theta=np.array([1939.0, 8.5])), covariance=np.diag([121.0, 0])
+    )
+    assert [x.split() for x in named_lines(few)] == [
+        ["parameter", "coefficient", "±", "sd"],
+        ["a21", "1939", "±", "11"],
+    ]
+    assert named_lines(replace(few, model=Renamed(names=("a21", "unit 1: u"), theta=np.ones(2)))) == []
+    assert named_lines(replace(fit, details={})) == []
+
+
+def test_a_schedule_is_shown_at_its_ends_and_in_the_middle(fit: NonlinearFit) -> None:
+    table = [
+        {
+            "p": p,
+            "poles_rad_s": [[-3.0, 4.0, 0.1, 0.2], [-3.0, -4.0, 0.1, 0.2], [-20.0, 0.0, 1.0, 0.0]],
+            "dc_gain": {"u": [g, s]},
+        }
+        for p, g, s in ((1.0, 2.0, 0.1), (1.5, 2.5, 0.1), (2.0, 3.0, None))
+    ]
+    schedule = {"signal": "level", "low": 1.0, "high": 2.0, "time_constant_s": 0.5, "unit": "m"}
+    lines = schedule_lines(replace(fit, details={"schedule": schedule, "frozen": table}))
+    assert lines[0] == "schedule: the output, low-passed (0.5 s), 1 to 2 m in training"
+    assert [x.split()[0] for x in lines[2:]] == ["1", "1.5", "2"]
+    assert "-3.00 ± 0.10 ± j 4.00 ± 0.20, -20.0 ± 1.0" in lines[2]
+    assert lines[2].endswith("2.00 ± 0.10")
+    assert lines[4].endswith(" 3")
+
+
+def test_of_many_trainings_the_first_and_the_last_are_shown() -> None:
+    curves = [LearningCurve(method=f"m{k}", seconds=np.array([0.1]), training=np.array([1.0])) for k in range(9)]
+    lines = curve_lines(curves)
+    assert [x.split(":")[0] for x in (*lines[:3], *lines[4:])] == ["m0", "m1", "m2", "m6", "m7", "m8"]
+    assert lines[3].startswith("… 3 more trainings")
+    assert curve_lines(curves[:6]) == [curve_line(c) for c in curves[:6]]
 
 
 def test_the_table_fits_a_terminal_and_holds_every_part(fit: NonlinearFit) -> None:

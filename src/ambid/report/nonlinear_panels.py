@@ -24,7 +24,7 @@ from ambid.report._drawing import (
     worst_stretch,
 )
 from ambid.report._panels import Traces
-from ambid.report.nonlinear_text import coefficient_text
+from ambid.report.nonlinear_parameters import coefficient_text
 from ambid.report.numbers import prefixed
 from ambid.validate.nonlinear.runs import model_of
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,10 +11,11 @@ import numpy as np
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.identify.nonlinear.structures import nonlinear_structure
 from ambid.report.fit_text import validation_lines
-from ambid.report.numbers import quantity, sized
+from ambid.report.nonlinear_parameters import parameter_table
+from ambid.report.numbers import sized
 from ambid.report.text import WIDTH, Paint, check_lines, columns, plain, timing_line, warning_lines
 
-_SHOWN = 20  # terms that a terminal shows; the file has all
+_CURVES = 6  # learning curves that a terminal shows
 
 
 def nonlinear_text(fit: NonlinearFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
@@ -42,7 +42,7 @@ def nonlinear_text(fit: NonlinearFit, *, width: int = WIDTH, paint: Paint = plai
         columns(_fit_rows(fit)) if fit.fit else [],
         [] if fit.validation is None else _validation(fit.validation, paint),
         _criteria_lines(fit, width),
-        [x for c in fit.curves for x in textwrap.wrap(curve_line(c), width, subsequent_indent="  ")],
+        [x for line in curve_lines(fit.curves) for x in textwrap.wrap(line, width, subsequent_indent="  ")],
         check_lines(fit.checks, width=width, paint=paint),
         warning_lines(fit.warnings, width=width, paint=paint),
         [paint(x, "dim") for x in textwrap.wrap(timing_line(fit.timing_s), width)] if fit.timing_s else [],
@@ -85,101 +85,6 @@ def setting_text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def parameter_table(fit: NonlinearFit) -> list[str]:
-    """Write the terms of a polynomial model with their error reduction ratios, or how large a network is.
-
-    Parameters
-    ----------
-    fit : NonlinearFit
-
-    Returns
-    -------
-    list of str
-        Empty for a failed fit.
-    """
-    if fit.model is None:
-        return []
-    if isinstance(fit.details.get("terms"), Mapping):
-        return term_lines(fit)
-    sd = fit.sd
-    known = "no standard deviations" if sd is None else f"standard deviations from {_SOURCES[fit.covariance_from]}"
-    said = [f"{fit.model.theta.size} parameters, {fit.n_estimated} estimated, {known}; --json has them all"]
-    effective = fit.details.get("effective_parameters")
-    if isinstance(effective, (int, float)) and math.isfinite(effective):
-        said.append(f"as many as {effective:.3g} parameters would be without the prior")
-    return said
-
-
-_SOURCES = {
-    "information": "the information matrix",
-    "laplace": "Laplace's approximation",
-    "sandwich": "the sandwich formula, for coloured errors",
-    "bootstrap": "bootstrap",
-}
-
-
-def term_lines(fit: NonlinearFit) -> list[str]:
-    """Write the first terms with coefficient, standard deviation and error reduction ratio.
-
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With ``terms`` in its details.
-
-    Returns
-    -------
-    list of str
-        A header and a line for each term, in the order of choice; ratios in percent of the output's energy.
-    """
-    assert fit.model is not None
-    several, terms = len(fit.outputs) > 1, fit.details["terms"]
-    assert isinstance(terms, Mapping)
-    ratio = {
-        (f"y{o + 1}: " if several else "") + str(t["term"]): t.get("err")
-        for o, output in enumerate(fit.outputs)
-        for t in terms[output]
-    }
-    theta, sd = fit.model.theta, fit.sd
-    rows = []
-    for k, name in enumerate(fit.model.names[:_SHOWN]):
-        err = ratio.get(name)
-        rows.append((name, coefficient_text(float(theta[k]), None if sd is None else float(sd[k])), _percent(err)))
-    rest = theta.size - len(rows)
-    more = [f"… and {rest} more; --json has them all"] if rest else []
-    head = ("term", "coefficient" if sd is None else "coefficient ± sd", "ERR")
-    return [*columns([head, *rows], right=(2,)), *more]
-
-
-def _percent(err: object) -> str:
-    """In percent; small ratios, which fast sampling makes of all but the last output, in a power of ten."""
-    if not isinstance(err, (int, float)):
-        return ""
-    return f"{100 * err:.3f} %" if err >= 1e-4 or err == 0 else f"{100 * err:.1e} %"
-
-
-def coefficient_text(value: float, sd: float | None) -> str:
-    """Write value ± sd; in a power of ten where decimals would be too many to read.
-
-    Parameters
-    ----------
-    value : float
-    sd : float or None
-        Standard deviation, or another spread.
-
-    Returns
-    -------
-    str
-    """
-    largest = max(abs(value), sd or 0.0)
-    exponent = int(np.floor(np.log10(largest))) if largest else 0
-    if sd is None:
-        return f"{value:.5g}"
-    if -4 <= exponent < 7:
-        return quantity(value, sd, "1").text.removesuffix(" 1")
-    scale = 10.0**exponent
-    return f"({quantity(value / scale, sd / scale, '1').text.removesuffix(' 1')})e{exponent}"
-
-
 def _fit_rows(fit: NonlinearFit) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("fit", "one step", "simulation", "innovations")]
     for output, f in fit.fit.items():
@@ -214,6 +119,25 @@ def _criteria_lines(fit: NonlinearFit, width: int) -> list[str]:
         return []
     text = ", ".join(f"{name} {value:.6g}" for name, value in fit.criteria.items())
     return textwrap.wrap(f"criteria: {text}; {fit.n_estimated} numbers estimated", width)
+
+
+def curve_lines(curves: Sequence[LearningCurve]) -> list[str]:
+    """Say in a line each how the trainings went.
+
+    Parameters
+    ----------
+    curves : sequence of LearningCurve
+
+    Returns
+    -------
+    list of str
+        Of many the first and the last ones, and how many stand between.
+    """
+    said = [curve_line(c) for c in curves]
+    between = len(said) - _CURVES
+    if between <= 0:
+        return said
+    return [*said[: _CURVES // 2], f"… {between} more trainings; --json has them", *said[-(_CURVES // 2) :]]
 
 
 def curve_line(curve: LearningCurve) -> str:
