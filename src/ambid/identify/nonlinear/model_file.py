@@ -16,6 +16,7 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "hybrid": "ambid.identify.hybrid.model:HybridNarmax",
         "rbf": "ambid.identify.rbf.model:RbfNetwork",
         "nn": "ambid.identify.networks.state_model:StateNetwork",
+        "nn-magnitude": "ambid.identify.networks.magnitude_model:MagnitudeNetwork",
         "narx": "ambid.identify.networks.narx_model:NeuralNarx",
         "lpv": "ambid.identify.lpv.model:LpvModel",
     }
