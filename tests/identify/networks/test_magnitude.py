@@ -31,14 +31,14 @@ def io(u: np.ndarray, y: np.ndarray) -> IOData:
     )
 
 
-def rubbing(n: int = 400, *, noise: float = 0.0, friction: float = 0.15, seed: int = 0) -> tuple[IOData, np.ndarray]:
+def rubbing(n: int = 400, *, noise: float = 0.0, friction: float = 0.05, seed: int = 0) -> tuple[IOData, np.ndarray]:
     """A drive with dry friction before a resonance, from rest; of the speed only the magnitude is seen."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.choice([-1.0, 1.0], n // 8 + 1), 8)[:n]
+    u = np.repeat(rng.choice([-1.0, 1.0], n // 12 + 1), 12)[:n]
     speed, drive, y, z = np.zeros(n + 2), 0.0, np.zeros(n), 0.0
     for t in range(n):
         y[t] = z
-        drive_next = 0.9 * drive + 0.12 * u[t] - friction * np.tanh(drive / 0.05) * 0.5
+        drive_next = 0.9 * drive + 0.12 * u[t] - friction * np.tanh(drive / 0.1)
         speed[t + 2] = 1.72 * speed[t + 1] - 0.86 * speed[t] + 0.14 * drive_next
         drive = drive_next
         p, c = speed[t + 1], speed[t + 2]
@@ -98,10 +98,11 @@ def test_a_plant_with_friction_is_found_and_goes_on_unseen() -> None:
     assert float(np.sqrt(found.noise_covariance[0, 0])) == pytest.approx(0.005, rel=0.2)
 
 
-def test_the_number_of_states_and_units_is_chosen() -> None:
-    data, _ = rubbing(300, noise=0.005)
-    found = nn([data], {"output": "magnitude", "starts": 2, "iterations": 25})
-    assert (found.settings["states"], found.settings["neurons"]) == (3, 1)
+@pytest.mark.parametrize(("friction", "units"), [(0.0, 0), (0.05, 1)])
+def test_the_number_of_states_and_units_is_chosen(friction: float, units: int) -> None:
+    data, _ = rubbing(300, noise=0.005, friction=friction, seed=1)
+    found = nn([data], {"output": "magnitude", "starts": 4}, seed=1)
+    assert (found.settings["states"], found.settings["neurons"]) == (3, units)
     assert [x["neurons"] for x in found.details["held_out"]] == [0, 1, 2, 3]  # type: ignore[attr-defined]
 
 
