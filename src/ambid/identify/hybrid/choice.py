@@ -12,15 +12,18 @@ from ambid.identify.hybrid.settings import MOST_NOISE
 from ambid.identify.hybrid.train import HybridProblem, Parts, problem_at, random_start
 from ambid.identify.narmax.selection import information
 from ambid.identify.networks.search import Found, search
+from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
 
 Array = NDArray[np.float64]
 Counted = tuple[NDArray[np.bool_], ...]
 
 NEURONS = (0, 1, 2, 4, 8)
+_STARTED_ON = 12000  # rows from which starts are trained
 _MOST_ROWS = 6000  # that a comparison looks at, all stretches together
 _BATCHES = 20  # of held-out data, over which squared errors are compared
 _SURE = 2.0  # standard errors by which a larger network has to be better
+ROUGH = 0.01  # gain of the cost, errors of unit variance, that no choice hangs on
 _FIRST = 12  # iterations of every start, with the network alone and then with all numbers
 
 
@@ -94,11 +97,11 @@ def trained(
     seed: int,
     tick: Tick | None,
     counted: Counted | None = None,
-) -> tuple[Array, Found]:
+) -> tuple[Array, LearningCurve]:
     """Train a network on what polynomial and C leave, then all numbers for a while, from several random starts.
 
-    Every other start takes C as 1 and the polynomial as free: what this could not do alone has coloured the errors, and
-    gone into the first C.
+    Only the begin of a long record is looked at. Every other start takes C as 1 and the polynomial as free: what this
+    could not do alone has coloured the errors, and gone into the first C.
 
     Parameters
     ----------
@@ -117,9 +120,12 @@ def trained(
     -------
     theta : ndarray, shape (n_theta,)
         Of the best start.
-    found : Found
-        Its search with the network alone.
+    curve : LearningCurve
+        Of its search with the network alone.
     """
+    most = max(_STARTED_ON // len(parts), 10 * shape.lag + 60)
+    parts = tuple((y[:most], u[:most]) for y, u in parts)
+    counted = None if counted is None else tuple(x[:most] for x in counted)
     rng, best, best_cost, curve = np.random.default_rng(seed), None, np.inf, None
     place = np.arange(shape.n_theta)
     level = np.concatenate([linear, np.zeros(shape.n_theta - linear.size)])
@@ -134,16 +140,47 @@ def trained(
         if share is not None:
             share("network on the residual", 0.0)
         found = search(
-            alone, start[alone.live], stage="network on the residual", most=_FIRST, tick=part_of(share, 0.0, 0.5)
+            alone,
+            start[alone.live],
+            stage="network on the residual",
+            most=_FIRST,
+            enough=ROUGH,
+            tick=part_of(share, 0.0, 0.5),
         )
         both = search(
-            every, alone.whole(found.theta), stage="starts of all together", most=_FIRST, tick=part_of(share, 0.5, 1.0)
+            every,
+            alone.whole(found.theta),
+            stage="starts of all together",
+            most=_FIRST,
+            enough=ROUGH,
+            tick=part_of(share, 0.5, 1.0),
         )
         if best is None or both.cost < best_cost:
-            best, best_cost, curve = both.theta, both.cost, found
+            best, best_cost, curve = both.theta, both.cost, learning(found, alone, "network on the residual")
     assert best is not None
     assert curve is not None
     return best, curve
+
+
+def learning(found: Found, problem: HybridProblem, stage: str) -> LearningCurve:
+    """Return how a search went.
+
+    Parameters
+    ----------
+    found : Found
+    problem : HybridProblem
+    stage : str
+
+    Returns
+    -------
+    LearningCurve
+    """
+    size = float(np.sqrt(np.mean(problem.weight**2))) if np.isfinite(found.cost) else 1.0
+    return LearningCurve(
+        method=f"{stage}: Levenberg-Marquardt, prediction errors",
+        seconds=np.array(found.seconds),
+        training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) / size,
+    )
 
 
 def chosen_neurons(
@@ -212,7 +249,9 @@ def _held_out(
     if shape.neurons:
         theta, _ = trained(shape, linear, parts, prior, 2, seed, part_of(tick, 0.0, 0.8), training)
     problem = problem_at(shape, parts, theta, prior, counted=training)
-    theta = search(problem, theta, stage="choice of neurons", most=_FIRST, tick=part_of(tick, 0.8, 1.0)).theta
+    theta = search(
+        problem, theta, stage="choice of neurons", most=_FIRST, enough=ROUGH, tick=part_of(tick, 0.8, 1.0)
+    ).theta
     errors = np.concatenate(replace(problem, counted=held).errors(theta))
     out = np.sum(errors**2, axis=1)
     return np.where(np.isfinite(out), out, np.inf)
@@ -251,7 +290,7 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
     def searched(shape: HybridShape, start: Array, share: Tick | None) -> tuple[float, Array]:
         at = problem_at(shape, problem.parts, start, problem.prior, counted=counted)
         at = replace(at, weight=problem.weight)
-        found = search(at, start, stage="order of the noise model", most=_FIRST, tick=share)
+        found = search(at, start, stage="order of the noise model", most=_FIRST, enough=ROUGH, tick=share)
         n = max(at.n_errors // shape.n_outputs, 2)
         k = shape.n_linear
         return information(criterion, found.cost / at.n_errors, k, n, max(k, 1)), found.theta

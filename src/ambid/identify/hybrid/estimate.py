@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, moved, trained
+from ambid.identify.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, learning, moved, trained
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.result import finished
 from ambid.identify.hybrid.revision import Candidates, revised
@@ -28,13 +28,13 @@ from ambid.identify.narmax.scaled import Scaled, scaled_records
 from ambid.identify.narmax.terms import Term, lagged, products
 from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.narx_function import NarxShape
-from ambid.identify.networks.search import Found, search
+from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, portions
 
 Array = NDArray[np.float64]
 
-_ENOUGH = 1e-7  # gain of the cost, errors of unit variance, below which a search is over
+_ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
 
 
 @dataclass(slots=True)
@@ -179,9 +179,9 @@ def _identify(s: HybridSettings, data: Scaled, work: Work, seed: int, ticks: lis
     began = perf_counter()
     if neurons:
         shape = full.with_sizes(neurons=neurons)
-        theta, found = trained(shape, start, data.parts, s.prior, s.starts, seed, ticks[2])
+        theta, curve = trained(shape, start, data.parts, s.prior, s.starts, seed, ticks[2])
         work.keep(shape, theta)
-        _note(work, found, problem_at(shape, data.parts, theta, s.prior), "network on the residual")
+        work.curves.append(curve)
         problem = _searched(s, data, work, "all together", ticks[3])
         if s.pruning == "prediction":
             found_terms = Candidates(terms=_candidates(s, full), criterion=s.criterion)
@@ -235,24 +235,13 @@ def _searched(s: HybridSettings, data: Scaled, work: Work, stage: str, tick: Tic
         work.theta,
         stage=stage,
         most=s.iterations,
-        tolerance=1e-10,
-        enough=_ENOUGH,
+        tolerance=1e-8 if shape.neurons else 1e-10,
+        enough=_ENOUGH if shape.neurons else 0.0,
         damping=1e-4,
         tick=tick,
         keep=lambda theta: work.keep(shape, theta),
     )
     work.keep(shape, found.theta)
-    _note(work, found, problem, stage)
+    work.curves.append(learning(found, problem, stage))
     work.status = "converged" if found.converged else "stalled"
     return problem
-
-
-def _note(work: Work, found: Found, problem: HybridProblem, stage: str) -> None:
-    size = float(np.sqrt(np.mean(problem.weight**2))) if np.isfinite(found.cost) else 1.0
-    work.curves.append(
-        LearningCurve(
-            method=f"{stage}: Levenberg-Marquardt, prediction errors",
-            seconds=np.array(found.seconds),
-            training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) / size,
-        )
-    )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.hybrid.choice import moved
+from ambid.identify.hybrid.choice import ROUGH, moved
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax.selection import penalty
@@ -170,5 +170,5 @@ def _other(problem: HybridProblem, theta: Array, shape: HybridShape) -> HybridPr
 
 def _searched(problem: HybridProblem, theta: Array, shape: HybridShape) -> tuple[HybridProblem, Array, float]:
     at = _other(problem, theta, shape)
-    found = search(at, at.base, stage="", most=_ITERATIONS, damping=1e-4)
+    found = search(at, at.base, stage="", most=_ITERATIONS, enough=ROUGH, damping=1e-4)
     return at, found.theta, found.cost

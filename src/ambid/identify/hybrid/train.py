@@ -25,8 +25,8 @@ Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
 
 _BLOCK = 4096
-_DRAWS = 12  # of a random hidden layer
-_DRAWN_ON = 2000  # rows by which they are compared
+_DRAWS = 40  # of a random hidden layer
+_DRAWN_ON = 1000  # rows by which they are compared
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -269,8 +269,7 @@ def random_start(problem: HybridProblem, rng: np.random.Generator) -> Array:
     prior = np.diag(problem.precision[columns])
     best, least = np.empty(0), np.inf
     for _ in range(_DRAWS):
-        hidden = rng.standard_normal(n_1) / np.sqrt(max(n_1 // max(n_b, 1), 1))
-        theta = np.concatenate([problem.base[: n_p + n_c], np.zeros(n_2), hidden, rng.standard_normal(n_b)])
+        theta = np.concatenate([problem.base[: n_p + n_c], np.zeros(n_2), _hidden_layer(n_b, n_1 // n_b, rng)])
         A, r = _linear_rows(problem, theta, columns)
         A, r = np.vstack([A, prior]), np.append(r, np.zeros(columns.size))
         step = np.linalg.lstsq(A, r, rcond=1e-12)[0]
@@ -279,6 +278,15 @@ def random_start(problem: HybridProblem, rng: np.random.Generator) -> Array:
         if not best.size or left < least:
             best, least = theta, left
     return best
+
+
+def _hidden_layer(h: int, d: int, rng: np.random.Generator) -> Array:
+    """Weights and offsets of units that look at some regressors each and bend gently or hard."""
+    W1 = rng.standard_normal((h, d)) * (rng.random((h, d)) < rng.uniform(0.2, 1.0, (h, 1)))
+    empty = np.flatnonzero(~np.any(W1, axis=1))
+    W1[empty, rng.integers(0, d, empty.size)] = 1.0
+    W1 *= rng.uniform(0.7, 3.0, (h, 1)) / np.linalg.norm(W1, axis=1, keepdims=True)
+    return np.concatenate([W1.ravel(), rng.standard_normal(h)])
 
 
 def _linear_rows(problem: HybridProblem, theta: Array, columns: NDArray[np.intp]) -> tuple[Array, Array]:
