@@ -36,6 +36,7 @@ def command() -> None:
             for p in of.parameters
         ]
         typer.echo("\n".join(columns(rows)) + "\n")
+    _magnet()
     typer.echo(f"{paint('structures', 'strong')}  black-box models for 'ambid fit'; * is biased under feedback")
     left = columns([(f"  {x.name}{'*' * (x.feedback == 'biased')}", " ".join(x.orders)) for x in STRUCTURES.values()])
     wide = max(map(len, left)) + 2
@@ -54,6 +55,21 @@ def command() -> None:
              {name: scenario(name).summary for name in scenario_names()})  # fmt: skip
     typer.echo()
     _listing("presets", "benches for 'ambid simulate'", {name: preset(name).summary for name in preset_names()})
+
+
+def _magnet() -> None:
+    """The numbers of the nonlinear magnet."""
+    from ambid.cli.terminal import painter
+    from ambid.physics.bearing_numbers import BEARING_NUMBERS
+    from ambid.report.text import columns
+
+    use = "  one-axis with 'ambid identify --nonlinear', beside m, R and c; what is known stands in [magnet.parameters]"
+    typer.echo(textwrap.fill(f"{painter()('nonlinear magnet', 'strong')}{use}", 80, subsequent_indent="  "))
+    left = columns([(f"  {p.name}", f"[{p.unit}]") for p in BEARING_NUMBERS])
+    wide = max(map(len, left)) + 2
+    for start, p in zip(left, BEARING_NUMBERS, strict=True):
+        typer.echo(textwrap.fill(p.meaning, 80, initial_indent=start.ljust(wide), subsequent_indent=" " * wide))
+    typer.echo()
 
 
 def _nonlinear(of: NonlinearStructure) -> None:

@@ -61,7 +61,7 @@ def judged(
     }
     points = np.concatenate([r.y for r in problem.records])
     moving = np.concatenate([r.y for r in problem.records if not r.held])
-    changed = tuple(t.warning for t in taken if t.warning)
+    changed = tuple(w for t in taken for w in t.warnings)
     return NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
         law=problem.law,

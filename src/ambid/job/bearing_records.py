@@ -33,15 +33,15 @@ class TakenRecord:
         What the predictor runs over.
     remembered : Mapping[str, object]
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` and ``history``, for the estimate.
-    warning : str
-        What was changed in it; empty if nothing.
+    warnings : tuple of str
+        What was changed in it.
     start_s : float
         Time of its first sample in s.
     """
 
     record: BearingRecord
     remembered: Mapping[str, object]
-    warning: str
+    warnings: tuple[str, ...]
     start_s: float
 
 
@@ -216,6 +216,7 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
     """
     import numpy as np
 
+    from ambid.identify.nonlinear_bearing.contact import touching
     from ambid.identify.nonlinear_bearing.problem import BearingRecord
     from ambid.job.physical import load
 
@@ -226,13 +227,13 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
         )
     bench = load(record, rig, from_s=how.from_s, to_s=how.to_s, rate_hz=how.rate_hz, gaps=how.gaps)
     u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
-    warning, off = "", None if rig.magnet is None else rig.magnet.off_below
+    told, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
     if rig.limits is not None:
         low, high = rig.limits.voltage
         beyond = int(np.count_nonzero((u < low) | (u > high)))
         if beyond:
             u = np.clip(u, low, high)
-            warning = f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
+            told.append(f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken")
     y = np.column_stack([bench["position"], bench["current"]])
     taken = BearingRecord(
         name=name,
@@ -244,11 +245,19 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
         held=held,
     )
     _check_moves(taken)
+    if rig.limits is not None:
+        taken = touching(taken, rig.limits.position)
+        if taken.knock is not None:
+            at = int(np.count_nonzero(taken.knock))
+            told.append(
+                f"{name}: the rotor is at a stop (loop.limits.position) for {at} samples; the force there counts "
+                "as unknown"
+            )
     remembered = {
         "samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
         "file": bench.provenance.get("file"), "held": held, "history": [str(step) for step in bench.history],
     }  # fmt: skip
-    return TakenRecord(record=taken, remembered=remembered, warning=warning, start_s=bench.start_s)
+    return TakenRecord(record=taken, remembered=remembered, warnings=tuple(told), start_s=bench.start_s)
 
 
 _LEAST = 100  # samples

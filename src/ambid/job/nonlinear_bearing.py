@@ -162,7 +162,7 @@ def read_records(
     AmbidError
         As `identify_nonlinear`.
     EstimationError
-        If there is no record of a rotor that moves.
+        If there is no record of a rotor that moves, or the further one is of a rate that none of them has.
     """
     say, begun = tick or silent, time.perf_counter()
     bench = bearing_rig(rig, magnet=magnet, parameters=parameters, eddy=eddy, drift=drift, off_below=off_below)
@@ -173,6 +173,13 @@ def read_records(
         say("read")
         taken.append(taken_record(source, bench, how, held=is_held))
     second = None if validate is None else taken_record(validate, bench, how)
+    rates = {t.record.rate_hz for t in taken if not t.record.held}
+    if second is not None and second.record.rate_hz not in rates:  # the predictor could not judge it: say so now
+        known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
+        raise EstimationError(
+            f"{second.record.name}, to judge on, is sampled at {second.record.rate_hz:g} Hz, the records at {known}; "
+            "they have to agree. Resample it, or leave --validate out"
+        )
     return BearingJob(rig=bench, taken=tuple(taken), second=second, read_s=time.perf_counter() - begun)
 
 
@@ -201,14 +208,10 @@ def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBea
     assert bench.magnet is not None
     laws, extend = laws_of(bench.magnet, [t.record for t in job.taken if not t.record.held])
     wanted = bench.channel("voltage").delay
-
-    def of_search(stage: str = "identify", done: float | None = None, /) -> None:
-        say(stage, done)
-
     fit = estimate_bearing(
         [t.record for t in job.taken], known_numbers(bench), laws=laws,
         delay=None if wanted == "auto" else float(wanted), extend=extend, eddy=bench.magnet.eddy,
-        drift=bench.magnet.drift, tick=of_search,
+        drift=bench.magnet.drift, tick=say,
     )  # fmt: skip
     fitted = time.perf_counter()
     say("check")

@@ -127,7 +127,7 @@ def curve_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH) -> li
     for block in rows:
         lines += ["", *columns(block)] if lines else columns(block)
     if any("*" in cell for block in rows for row in block for cell in row):
-        lines += ["* no record came there: the law extrapolates, and its standard deviation does not know it"]
+        lines += ["* no record came there: the law extrapolates, which its deviation does not know"]
     return lines
 
 
