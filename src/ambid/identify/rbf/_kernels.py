@@ -149,12 +149,12 @@ def _predicted(
 @njit(cache=True, nogil=True, error_model="numpy")
 def recursive_pass(
     Z: Array, X: Array, Y: Array, weight: Array, gain: Array, bounded: int, unit: int, linear: int, h: int,
-    mean: Array, precision: Array, theta: Array, S: Array,
+    mean: Array, precision: Array, turn: int, theta: Array, S: Array,
 ) -> int:  # fmt: skip
     """One run of recursive Gauss-Newton over the samples; theta and S (P, P), S'S = R, are changed in place.
 
-    Every sample comes with one row of the prior, precision (mean - theta), in turn; there are none where `precision`
-    is empty. Returns the sample at which it diverged, or -1.
+    Every sample comes with one row of the prior, precision (mean - theta), in turn from `turn` on; there are none where
+    `precision` is empty. Returns the sample at which it diverged, or -1.
     """
     N, p, D, Q, P = Z.shape[0], Y.shape[1], Z.shape[1], X.shape[1], S.shape[0]
     a = (p * D if linear == 1 else 0) + p
@@ -162,37 +162,38 @@ def recursive_pass(
     s = theta[a + p * h + h * Q :]
     phi, by_q, q, g, row, b = np.zeros(h), np.zeros(h), np.zeros(h), np.zeros(P), np.zeros(P), np.zeros(P)
     for t in range(N):
-        mu = gain[t]
+        mu, root = gain[t], np.sqrt(gain[t])
         if bounded == 1:
             _shrink(S, np.sqrt(1.0 - mu))
         for o in range(p):
             e = weight[o] * (Y[t, o] - _predicted(o, Z[t], X[t], theta, W, C, s, unit, linear, p, phi, by_q, q))
             _gradient(o, Z[t], X[t], W, C, s, phi, by_q, q, p, linear, g)
             for i in range(P):
-                g[i] *= weight[o]
-                row[i] = np.sqrt(mu) * g[i]
+                row[i] = root * weight[o] * g[i]
             if bounded == 1:
-                _add_row(S, row)
-            _solve(S, g, b)
+                _rotate(S, row, root * e, b)
+            else:
+                for i in range(P):
+                    b[i] = root * e * row[i]
+                _forward(S, b)
+            _back(S, b)
             for i in range(P):
-                theta[i] += mu * b[i] * e
+                theta[i] += b[i]
                 if not abs(theta[i]) < 1e12:
                     return t
             if bounded == 0:
                 if o == 0:
                     _shrink(S, np.sqrt(1.0 - mu))
-                _add_row(S, row)
+                _rotate(S, row, 0.0, b)
         if precision.size > 0:
-            k = t % P
-            w = precision[k]
+            k = (turn + t) % P
             for i in range(P):
-                row[i], g[i] = 0.0, 0.0
-            row[k], g[k] = np.sqrt(mu) * w, w
-            _add_row(S, row)
-            _solve(S, g, b)
-            e = w * (mean[k] - theta[k])
+                row[i] = 0.0
+            row[k] = root * precision[k]
+            _rotate(S, row, root * precision[k] * (mean[k] - theta[k]), b)
+            _back(S, b)
             for i in range(P):
-                theta[i] += mu * b[i] * e
+                theta[i] += b[i]
     return -1
 
 
@@ -204,10 +205,11 @@ def _shrink(S: Array, by: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_row(S: Array, row: Array) -> None:
-    """Rotate a row into the triangle S (Givens); the row is spent."""
+def _rotate(S: Array, row: Array, right: float, b: Array) -> None:
+    """Rotate [row | right] into the triangle [S | 0] (Givens), which leaves [S | b]; the row is spent."""
     P = S.shape[0]
     for i in range(P):
+        b[i] = 0.0
         if row[i] != 0.0:
             r = np.hypot(S[i, i], row[i])
             c, d = S[i, i] / r, row[i] / r
@@ -216,19 +218,24 @@ def _add_row(S: Array, row: Array) -> None:
                 w = S[i, j]
                 S[i, j] = c * w + d * row[j]
                 row[j] = c * row[j] - d * w
+            b[i] = d * right
+            right *= c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(S: Array, g: Array, b: Array) -> None:
-    """Write b = (S'S)^-1 g by two triangles."""
-    P = S.shape[0]
-    for i in range(P):
-        b[i] = g[i]
-    for i in range(P):
+def _forward(S: Array, b: Array) -> None:
+    """Write S'^-1 b over b."""
+    for i in range(S.shape[0]):
         b[i] /= S[i, i]
         if b[i] != 0.0:
-            for j in range(i + 1, P):
+            for j in range(i + 1, S.shape[0]):
                 b[j] -= S[i, j] * b[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _back(S: Array, b: Array) -> None:
+    """Write S^-1 b over b."""
+    P = S.shape[0]
     for i in range(P - 1, -1, -1):
         w = b[i]
         for j in range(i + 1, P):

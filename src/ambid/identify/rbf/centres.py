@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.identify.networks.search import triangle_of
+
 Array = NDArray[np.float64]
 
 _DEPENDENT = 1e-10  # squared length left of a candidate that the chosen ones hold already
@@ -100,10 +102,13 @@ def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDA
     err : ndarray, of the same shape
         Error reduction ratio: part of what the known regressors leave of the outputs' energy.
     """
-    U, s, _ = np.linalg.svd(known, full_matrices=False)
+    free = y.shape[0] - known.shape[1] - 1
+    m, d = candidates.shape[1], known.shape[1]
+    R = triangle_of([np.hstack([known, candidates, y])])  # the same lengths and angles in fewer rows
+    P, rest = R[:, d : d + m].copy(), R[:, d + m :].copy()
+    U, s, _ = np.linalg.svd(R[:, :d], full_matrices=False)
     U = U[:, s > 1e-12 * max(float(s[0]), 1e-300)]
-    length = np.sum(candidates**2, axis=0)
-    P, rest = candidates.copy(), y.copy()
+    length = np.sum(P**2, axis=0)
     for _ in range(2):  # twice is enough
         P -= U @ (U.T @ P)
         rest -= U @ (U.T @ rest)
@@ -111,7 +116,7 @@ def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDA
     order: list[int] = []
     err: list[float] = []
     alive = np.ones(P.shape[1], dtype=bool)
-    while len(order) < min(most, y.shape[0] - known.shape[1] - 1):
+    while len(order) < min(most, free):
         left = np.sum(P**2, axis=0)
         alive &= left > _DEPENDENT * length
         if not np.any(alive):

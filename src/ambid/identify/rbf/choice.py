@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 _LAGS = (1, 2, 3, 4, 6)
 _FIRST = 12  # units with which lags are compared
 _WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
-_AS_GOOD = 1.02
+_AS_GOOD = 1.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,7 +154,7 @@ def chosen(told: Told, parts: Parts, seed: int, tick: Tick | None) -> Chosen:
         one = _least(sorted(found, key=lambda t: t.neurons), told)
         neurons, width, seen = (one.neurons if neurons is None else neurons), one.width, one.seen
     told = replace(told, seen=seen)
-    placing = Placing(told, shape_of(told, parts, ny, nu, neurons), parts, seed)
+    placing = Placing(told, shape_of(told, parts, ny, nu, neurons), parts, seed, most=neurons)
     shape, theta = placing.theta(neurons, width)
     return Chosen(shape=shape, theta=theta, width=width, seen=seen, tried=tuple(tried))
 
@@ -184,7 +184,7 @@ def _scores(told: Told, parts: Parts, ny: int, nu: int, counts: Sequence[int], w
     by_criterion = told.choice != "held_out"
     shape = shape_of(told, parts, ny, nu, 0)
     training, held = (parts, ()) if by_criterion else split(parts, told.share or 0.2, shape.lags.lag)
-    placing = Placing(told, shape, training, seed)
+    placing = Placing(told, shape, training, seed, most=max(counts))
     out: list[Tried] = []
     for count in counts:
         at, found = placing.solved(count, width)

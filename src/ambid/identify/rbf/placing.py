@@ -16,8 +16,8 @@ from ambid.identify.rbf.weights import Weights, fitted_weights
 
 Array = NDArray[np.float64]
 
-NEURONS = (2, 4, 8, 16, 32, 48)
-MIDDLE = 1.4
+NEURONS = (2, 4, 8, 16, 32, 48)  # that are compared
+MIDDLE = 1.4  # width, where it is not the question
 _NEIGHBOURS = 2
 _MOST_ROWS = 4000  # that are looked at
 _CANDIDATES = 200  # of the data that may become a centre
@@ -119,6 +119,8 @@ class Placing:
         Its number of units is not looked at.
     parts : tuple of (outputs, inputs), scaled
     seed : int
+    most : int
+        Units that will be asked for at most.
 
     Attributes
     ----------
@@ -130,8 +132,8 @@ class Placing:
         Typical distance of the data from their middle.
     """
 
-    def __init__(self, told: Told, shape: RbfShape, parts: Parts, seed: int) -> None:
-        self.told, self.shape, self.seed = told, shape, seed
+    def __init__(self, told: Told, shape: RbfShape, parts: Parts, seed: int, *, most: int) -> None:
+        self.told, self.shape, self.seed, self.most = told, shape, seed, most
         z, y = rows_of(shape, parts)
         step = -(-z.shape[0] // _MOST_ROWS)
         self.z, self.y = z[::step], y[::step]
@@ -187,8 +189,8 @@ class Placing:
                 self._found[key] = k_means(self.x, neurons, rng)
             return self._found[key]
         key = (0, width if self.told.widths == "common" else MIDDLE)
-        if key not in self._found or self._found[key].shape[0] < neurons:
-            self._found[key] = self._by_ols(max(neurons, self.told.neurons or NEURONS[-1]), key[1], rng)
+        if key not in self._found:
+            self._found[key] = self._by_ols(self.most, key[1], rng)
         return self._found[key][:neurons]
 
     def _by_ols(self, most: int, width: float, rng: np.random.Generator) -> Array:

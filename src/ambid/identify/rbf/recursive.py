@@ -1,7 +1,8 @@
 """Training sample by sample: recursive Gauss-Newton, and steepest descent as in the thesis, each with a bounded rate.
 
 Gauss-Newton: R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e, phi the slope of the prediction by all that is
-trained, R kept as its triangle (rows are rotated in, R^-1 phi comes of two triangular solutions). With the gain
+trained, R kept as its triangle S: [S | 0] and [sqrt(mu) phi | sqrt(mu) e] are rotated to [S+ | b], and the step is
+S+^-1 b, so that the condition of R, the square of that of S, never enters. With the gain
 mu = 1/(t + 1), R_0 the prior's and weights alone trained it is recursive least squares, and ends at the batch solution.
 Descent: w <- w + rate phi e, centres and widths likewise (thesis eqs 3.18-3.22; 3.22 is printed as W <- W eta e Phi',
 its plus sign lost).
@@ -125,7 +126,9 @@ class Recursion:
         gain = np.maximum(1.0 / (t + 1.0), self.rate)
         prior = slice(0, p.n_active if done >= N else 0)  # in the first pass it is in the triangle already
         mean, precision = p.mean[prior], p.precision[prior] * np.sqrt(p.n_active / N)
-        return int(recursive_pass(*signals, p.weight, gain, int(self.bounded), *kind, mean, precision, self.theta, S))
+        return int(
+            recursive_pass(*signals, p.weight, gain, int(self.bounded), *kind, mean, precision, done, self.theta, S)
+        )
 
     def _rms(self) -> float:
         with np.errstate(over="ignore", invalid="ignore"):

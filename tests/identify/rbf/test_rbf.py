@@ -1,0 +1,166 @@
+"""Radial basis networks from records: a known network, what is chosen, what the intervals of the function cover."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambid.errors import EstimationError
+from ambid.identify.networks.narx import narx
+from ambid.identify.networks.search import search
+from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.rbf.estimate import rbf
+from ambid.identify.rbf.model import RbfNetwork
+from ambid.identify.rbf.problem import problem_at
+from ambid.identify.rbf.result import laplace
+from tests.identify.rbf.systems import CENTRES, WEIGHTS, WIDTHS, bumpy, data, shape
+
+
+def network(fit: NonlinearFit) -> RbfNetwork:
+    assert isinstance(fit.model, RbfNetwork)
+    return fit.model
+
+
+def test_a_known_network_is_found_with_its_centres_and_widths() -> None:
+    truth = np.concatenate([[0.5, 0.3, 0.2], WEIGHTS, CENTRES.ravel(), np.log(WIDTHS)])
+    s, away, inside = shape(neurons=3), [], 0
+    for seed in range(40):
+        record, _ = bumpy(600, 100 + seed, 0.1)
+        start = truth + 0.15 * np.random.default_rng(seed).standard_normal(truth.size)
+        parts = ((record.y, record.u),)
+        problem = problem_at(s, parts, start, np.array([1e3]), start, everything=True, noise=np.array([0.01]))
+        found = search(problem, start, stage="", most=100)
+        P, noise, *_ = laplace(problem, found.theta)
+        assert found.converged
+        assert P is not None
+        assert np.sqrt(noise[0, 0]) == pytest.approx(0.1, rel=0.15)
+        score = (found.theta - truth) / np.sqrt(np.diag(P))
+        inside += np.count_nonzero(np.abs(score) < 1.96)
+        away.append(score)
+    assert 0.90 <= inside / (40 * truth.size) <= 0.98  # numbers of one record hang together
+    assert np.all(np.abs(np.median(away, axis=0)) < 0.6)
+
+
+@pytest.mark.parametrize(
+    ("told", "limit"),
+    [
+        ({}, 0.045),
+        ({"centres": "kmeans"}, 0.045),
+        ({"choice": "bic"}, 0.04),
+        ({"unit": "inverse-multiquadric"}, 0.045),
+        ({"unit": "thin-plate"}, 0.04),
+        ({"metric": "whitened", "centres": "kmeans", "widths": "common"}, 0.06),
+        ({"widths": "neighbours", "neurons": 24}, 0.07),
+        ({"linear": 0}, 0.045),
+        ({"trained": "all", "neurons": 6}, 0.055),
+    ],
+    ids=lambda x: ",".join(f"{k}={v}" for k, v in x.items()) if isinstance(x, dict) else "",
+)
+def test_every_way_of_placing_units_finds_the_function(told: dict[str, object], limit: float) -> None:
+    record, _ = bumpy(1500, 2, 0.1)
+    other, clean = bumpy(800, 3, 0.1)
+    fit = rbf([record], {"ny": 1, "nu": 1, "seen": "all", **told})  # type: ignore[dict-item]
+    model = network(fit)
+    assert np.std(clean) > 0.25
+    assert np.std((model.predict(other.u, other.y)[:, 0] - clean)[model.lag :]) < limit
+    assert float(np.sqrt(fit.noise_covariance[0, 0])) == pytest.approx(0.1, rel=0.12)
+    assert fit.details["effective_parameters"] <= model.theta.size + 1e-6
+
+
+def test_the_size_is_chosen_and_told() -> None:
+    record, _ = bumpy(1500, 4, 0.1)
+    fit = rbf([record], {})
+    assert fit.settings["ny"] == fit.settings["nu"] == 1
+    assert fit.settings["seen"] == "all"
+    assert 8 <= fit.settings["neurons"] == network(fit).shape.neurons <= 48
+    tried = fit.details["tried"]
+    best = min(t["score"] for t in tried)
+    mine = [t["score"] for t in tried if all(t[k] == fit.settings[k] for k in ("ny", "nu", "neurons", "width", "seen"))]
+    assert best <= min(mine) <= 1.01 * best
+    assert not rbf([record], {"neurons": 0}).settings["neurons"]
+
+
+def test_units_see_what_matters() -> None:
+    rng = np.random.default_rng(5)
+    u, y = rng.standard_normal(1200), np.zeros(1200)
+    for t in range(2, 1200):
+        y[t] = 0.9 * y[t - 1] - 0.3 * y[t - 2] + u[t - 1] - 0.3 * np.tanh(2 * y[t - 1]) + 0.05 * rng.standard_normal()
+    fit = rbf([data(u, y)], {"ny": 2, "nu": 2})
+    assert fit.settings["seen"] == "outputs"
+    assert network(fit).shape.n_seen == 2
+    with pytest.raises(EstimationError, match="seen"):
+        rbf([data(u, y)], {"nu": 0, "seen": "inputs"})
+
+
+def test_training_everything_stops_before_it_learns_the_noise() -> None:
+    record, _ = bumpy(150, 3, 0.5)
+    told = {"ny": 2, "nu": 2, "neurons": 25, "width": 0.5, "trained": "all", "prior": 1e3}
+    fit = rbf([record], told)
+    assert fit.details["stopped_early"]
+    assert any("held-out" in w for w in fit.warnings)
+    held = fit.curves[1].held_out
+    assert fit.details["held_out_rms"] == pytest.approx(held.min(), rel=1e-6)
+    assert held[-1] > held.min()
+
+
+def test_simulation_errors_fall_where_the_noise_is_on_the_sensor() -> None:
+    rng = np.random.default_rng(6)
+    u, x = rng.standard_normal(1500), np.zeros(1500)
+    for t in range(2, 1500):
+        x[t] = 1.5 * x[t - 1] - 0.7 * x[t - 2] + 0.3 * np.tanh(u[t - 1])
+    record = data(u, x + 0.1 * rng.standard_normal(1500))
+    errors = []
+    for focus in ("prediction", "simulation"):
+        fit = rbf([record], {"ny": 2, "nu": 2, "neurons": 5, "seen": "inputs", "focus": focus})
+        errors.append(float(np.std(network(fit).simulate(record.u, record.y)[20:, 0] - x[20:])))
+    assert errors[1] < 0.35 * errors[0]
+    assert fit.covariance is None
+    assert any("standard deviations" in w for w in fit.warnings)
+
+
+def test_two_outputs_and_two_inputs_over_two_records() -> None:
+    rng = np.random.default_rng(8)
+    records = []
+    for _ in range(2):
+        u, y = rng.standard_normal((700, 2)), np.zeros((700, 2))
+        for t in range(1, 700):
+            y[t, 0] = 0.5 * y[t - 1, 0] + np.tanh(u[t - 1, 0]) + 0.2 * y[t - 1, 1]
+            y[t, 1] = 0.7 * y[t - 1, 1] - 0.4 * np.tanh(u[t - 1, 1] + y[t - 1, 0])
+        records.append(data(u, y + [0.001, 0.05] * rng.standard_normal(y.shape)))
+    fit = rbf(records, {"ny": 1, "nu": 1, "neurons": 40})
+    left = (records[0].y - network(fit).predict(records[0].u, records[0].y))[1:]
+    assert np.all(left.std(axis=0) < [0.08 * 0.74, 1.5 * 0.05])
+    assert np.sqrt(fit.noise_covariance[0, 0]) < np.sqrt(fit.noise_covariance[1, 1])
+    assert len(fit.details["prior_by_output"]) == 2
+
+
+def test_it_does_about_as_well_as_a_neural_network() -> None:
+    record, _ = bumpy(800, 9, 0.1)
+    other, clean = bumpy(800, 10, 0.1)
+    off = []
+    for estimator, told in ((rbf, {"ny": 1, "nu": 1}), (narx, {"neurons": 8, "ny": 1, "nu": 1})):
+        model = estimator([record], told).model  # type: ignore[arg-type]
+        assert model is not None
+        off.append(float(np.std((model.predict(other.u, other.y)[:, 0] - clean)[model.lag :])))
+    assert off[0] < 2 * off[1]
+
+
+def test_feedback_is_warned_of_and_nothing_to_predict_from_refused() -> None:
+    record, _ = bumpy(300, 11, 0.1)
+    closed = data(record.u, record.y, open_loop=False)
+    assert any("feedback" in w for w in rbf([closed], {"neurons": 4}).warnings)
+    assert not any("feedback" in w for w in rbf([record], {"neurons": 4}).warnings)
+    with pytest.raises(EstimationError, match="nothing is left"):
+        rbf([record], {"ny": 0, "nu": 0})
+    with pytest.raises(EstimationError, match="gaussian"):
+        rbf([record], {"unit": "gausian"})
+
+
+def test_a_time_series_has_no_inputs() -> None:
+    rng = np.random.default_rng(12)
+    y = np.zeros(800)
+    for t in range(2, 800):
+        y[t] = np.sin(2 * y[t - 1]) + 0.3 * y[t - 2] + 0.1 * rng.standard_normal()
+    fit = rbf([data(np.empty((800, 0)), y)], {})
+    assert float(np.sqrt(fit.noise_covariance[0, 0])) == pytest.approx(0.1, rel=0.08)
+    assert network(fit).n_inputs == 0
