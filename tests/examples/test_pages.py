@@ -150,6 +150,45 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
     assert without_numbers(page) <= without_numbers(commissioned)
 
 
+def test_the_page_on_nonlinear_models_names_every_structure():
+    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+
+    text = (ROOT / "docs" / "nonlinear.md").read_text(encoding="utf-8")
+    assert {f"| `{name}` |" for name in NONLINEAR_STRUCTURES} <= set(re.findall(r"\| `\w+` \|", text))
+
+
+def test_the_page_on_nonlinear_models_runs_and_shows_what_comes_out(tmp_path, monkeypatch, capsys):
+    """Commands first, then the pieces of Python, which use the files that they leave."""
+    from ambid.cli.app import run_verb
+
+    monkeypatch.chdir(tmp_path)
+    page, said = ROOT / "docs" / "nonlinear.md", {}
+    for piece in blocks(page, "sh"):
+        for line in piece.splitlines():
+            words = shlex.split(line, comments=True)
+            assert run_verb(words[1:]) == 0, line
+            said[words[words.index("--structure") + 1] if "fit" in words else words[1]] = capsys.readouterr().out
+    assert {"ball.h5", "other.h5", "ball.json", "ball.png"} <= {p.name for p in tmp_path.iterdir()}
+    assert "other.h5 judged with ball.json" in said["validate"]
+    assert "2 records: narmax" in said["narmax"]
+    rows = re.compile(r"^(a\d\d|b3) +(-?[\d.]+) ± ([\d.]+)()$", re.MULTILINE)
+    text = page.read_text(encoding="utf-8")
+    same_values(rows, text, said["nn"])
+    truth = {"a21": 1962.0, "a23": -20.65, "a32": 10.59, "a33": -35.88, "b3": 8.544}
+    for value in truth.values():
+        assert str(abs(value)).removesuffix(".0") in text
+    assert all(abs(float(v) - truth[name]) < 3 * float(sd) for name, v, sd, _ in rows.findall(text))
+    names: dict[str, object] = {}
+    for number, piece in enumerate(blocks(page, "python"), start=1):
+        exec(compile(piece, f"nonlinear.md, piece {number}", "exec"), names)
+    printed = capsys.readouterr().out
+    assert "status converged, checks passed: True" in printed
+    assert re.search(r"^b3 = 8\.5\d* ± ", printed, re.MULTILINE)
+    shares = [x for x in names["shares"] if x is not None]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
 COMMISSIONED = re.compile(r"^  (m|k_x|k_i|R|L) = (-?[\d.]+) ± ([\d.]+) (\S+) \(95 %", re.MULTILINE)
 
 
