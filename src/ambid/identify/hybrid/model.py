@@ -25,6 +25,7 @@ class HybridNarmax:
     """Polynomial, network and linear noise model in one predictor (thesis eq. 3.24).
 
     The predictor takes the innovations before its first prediction as zero.
+    Implements `ambid.identify.nonlinear.model.NonlinearModel`.
 
     Attributes
     ----------
@@ -91,23 +92,7 @@ class HybridNarmax:
         return replace(self, theta=theta)
 
     def predict(self, u: Array, y: Array) -> Array:
-        """Return one-step-ahead predictions; past innovations are those of the predictor itself.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            NaN in the first `lag` rows, and from where the innovations diverge on.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.predict`; past innovations are its own. NaN from where they diverge on."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape, np.nan)
         if ys.shape[0] > self.lag:
@@ -117,23 +102,7 @@ class HybridNarmax:
         return found
 
     def jacobian(self, u: Array, y: Array) -> Array:
-        """Return the exact derivative of `predict` by `theta`, past innovations included.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs, n_theta)
-            The first `lag` rows are zero.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.jacobian`, past innovations included."""
         ys, us = scaled(self, u, y)
         out = np.zeros((*ys.shape, self.theta.size))
         if ys.shape[0] > self.lag:
@@ -143,25 +112,7 @@ class HybridNarmax:
         return out * (self.y_scale[:, None] / self.unit)
 
     def simulate(self, u: Array, y: Array) -> Array:
-        """Run freely from the first `lag` measured samples on, innovations zero.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (at least lag, n_outputs), SI
-            Only the first `lag` rows are looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
-            training data.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.simulate`, innovations zero."""
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)
         out: Array = self.y_level + self.y_scale * self.shape.free_run(self.theta / self.unit, ys, us)
@@ -169,23 +120,7 @@ class HybridNarmax:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return how far the lagged signals are from those of the training (see `networks.cloud`).
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples,)
-            0 in the middle, 1 at the edge, above 1 outside; the first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.novelty`, of the lagged signals (see `networks.cloud`)."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape[0], np.nan)
         if ys.shape[0] > self.lag:
@@ -194,12 +129,7 @@ class HybridNarmax:
         return out
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs.
-
-        Returns
-        -------
-        dict
-        """
+        """As `NonlinearModel.as_json`."""
         s = self.shape
         sizes = {k: getattr(s.network, k) for k in ("n_outputs", "n_inputs", "ny", "nu", "nk", "neurons")}
         arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}

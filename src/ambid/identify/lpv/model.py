@@ -26,6 +26,7 @@ class LpvModel:
     """A linear model of one output whose coefficients follow a scheduling signal; equations in `lpv.shape`.
 
     The predictor takes the process part before its first prediction as the output, and innovations there as zero.
+    Implements `ambid.identify.nonlinear.model.NonlinearModel`.
 
     Attributes
     ----------
@@ -125,23 +126,7 @@ class LpvModel:
         return frozen(float(p), self.dt, of.nk, values[: of.order], b, c, d, P)
 
     def predict(self, u: Array, y: Array) -> Array:
-        """Return one-step-ahead predictions.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, 1), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, 1), SI
-            NaN in the first `lag` rows, and everywhere if the predictor diverges.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.predict`; NaN everywhere if the predictor diverges."""
         part = self._part(u, y)
         found = errors(self.shape, part, self.theta / self.unit)
         out = np.full((part.y.size, 1), np.nan)
@@ -151,23 +136,7 @@ class LpvModel:
         return predicted
 
     def jacobian(self, u: Array, y: Array) -> Array:
-        """Return the exact derivative of `predict` by `theta`.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, 1), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, 1, n_theta)
-            The first `lag` rows are zero.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.jacobian`."""
         found = errors(self.shape, self._part(u, y), self.theta / self.unit, slopes=2)
         J = found.J[:, : self.theta.size] if found.finite else np.full((found.e.size, self.theta.size), np.nan)
         out = (J * (self.y_scale / self.unit))[:, None, :]
@@ -175,25 +144,7 @@ class LpvModel:
         return np.asarray(out)
 
     def simulate(self, u: Array, y: Array) -> Array:
-        """Run freely from the first `lag` measured samples on, without noise; a set point is that of the run itself.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (at least lag, 1), SI
-            Only the first `lag` rows are looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, 1), SI
-            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
-            training data.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.simulate`."""
         from ambid.identify.lpv._kernels import free_run
 
         whole, head = with_head(self, u, y)
@@ -220,24 +171,7 @@ class LpvModel:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return how far scheduling signal and regressors are from those of the training.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, 1), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples,)
-            The larger of: distance of p from the middle of its range, over half the range; that of `networks.cloud`.
-            The first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.novelty`: the larger of p's, over half its range, and that of `networks.cloud`."""
         ys, us = scaled(self, u, y)
         s = self.scheduling(u, y)
         out = np.full(ys.shape[0], np.nan)
@@ -265,12 +199,7 @@ class LpvModel:
         return part_of(self.shape, ys[:, 0], us, self.scheduling(u, y))
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs.
-
-        Returns
-        -------
-        dict
-        """
+        """As `NonlinearModel.as_json`."""
         arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
         return {
             "dt_s": self.dt,

@@ -39,7 +39,7 @@ class Cloud:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PolynomialNarmax:
-    """A NARMAX model with constant coefficients (implements `NonlinearModel`).
+    """A NARMAX model with constant coefficients (implements `ambid.identify.nonlinear.model.NonlinearModel`).
 
     The predictor takes the innovations before its first prediction as zero.
 
@@ -130,70 +130,20 @@ class PolynomialNarmax:
         return replace(self, theta=theta)
 
     def predict(self, u: Array, y: Array) -> Array:
-        """Return one-step-ahead predictions; past innovations are those of the predictor itself.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            NaN in the first `lag` rows, and from where the innovations diverge on.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.predict`; past innovations are its own. NaN from where they diverge on."""
         ys, us = scaled(self, u, y)
         found, _ = predicted(self.tables, self.theta / self.unit, ys, us)
         return self.y_level + self.y_scale * found
 
     def jacobian(self, u: Array, y: Array) -> Array:
-        """Return the exact derivative of `predict` by `theta`, past innovations included.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs, n_theta)
-            The first `lag` rows are zero.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.jacobian`, past innovations included."""
         ys, us = scaled(self, u, y)
         theta = self.theta / self.unit
         _, z = predicted(self.tables, theta, ys, us)
         return sensitivities(self.tables, theta, z) * (self.y_scale[:, None] / self.unit)
 
     def simulate(self, u: Array, y: Array) -> Array:
-        """Run freely from the first `lag` measured samples on, innovations zero.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (at least lag, n_outputs), SI
-            Only the first `lag` rows are looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
-            training data.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.simulate`, innovations zero."""
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)
         found, _ = predicted(self.tables, self.theta / self.unit, ys, us, free=True)
@@ -202,23 +152,7 @@ class PolynomialNarmax:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return the Mahalanobis distance of the lagged signals, 1 for the farthest training sample.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples,)
-            The first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.novelty`: Mahalanobis distance of the lagged signals."""
         ys, us = scaled(self, u, y)
         _, z = predicted(self.tables, self.theta / self.unit, ys, us)
         x = lagged_signals(self.tables, z)
@@ -227,12 +161,7 @@ class PolynomialNarmax:
         return out
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs.
-
-        Returns
-        -------
-        dict
-        """
+        """As `NonlinearModel.as_json`."""
         arrays: dict[str, Any] = {
             k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")
         }

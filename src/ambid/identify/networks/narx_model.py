@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 class NeuralNarx:
     """A neural NARX model; the function is that of `NarxShape`, on scaled signals.
 
+    Implements `ambid.identify.nonlinear.model.NonlinearModel`.
+
     Attributes
     ----------
     dt : float
@@ -79,23 +81,7 @@ class NeuralNarx:
         return replace(self, theta=theta)
 
     def predict(self, u: Array, y: Array) -> Array:
-        """Return one-step-ahead predictions.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.predict`."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape, np.nan)
         out[self.lag :] = self.shape.values(self.theta, self.shape.regressors(ys, us))
@@ -103,48 +89,14 @@ class NeuralNarx:
         return found
 
     def jacobian(self, u: Array, y: Array) -> Array:
-        """Return the exact derivative of `predict` by `theta`.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs, n_theta)
-            The first `lag` rows are zero.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.jacobian`."""
         ys, us = scaled(self, u, y)
         out = np.zeros((*ys.shape, self.theta.size))
         out[self.lag :] = self.shape.slopes(self.theta, self.shape.regressors(ys, us))
         return out * self.y_scale[:, None]
 
     def simulate(self, u: Array, y: Array) -> Array:
-        """Run freely from the first `lag` measured samples on.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (at least lag, n_outputs), SI
-            Only the first `lag` rows are looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
-            training data.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.simulate`."""
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)
         out: Array = self.y_level + self.y_scale * self.shape.free_run(self.theta, ys, us)[:, : self.n_outputs]
@@ -152,35 +104,14 @@ class NeuralNarx:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return how far the regressors are from those of the training (see `networks.cloud`).
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples,)
-            0 in the middle, 1 at the edge, above 1 outside; the first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.novelty`, of the regressors (see `networks.cloud`)."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.shape.regressors(ys, us))
         return out
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs.
-
-        Returns
-        -------
-        dict
-        """
+        """As `NonlinearModel.as_json`."""
         s = self.shape
         sizes = {k: getattr(s, k) for k in ("n_outputs", "n_inputs", "ny", "nu", "nk", "neurons")}
         arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}

@@ -23,6 +23,7 @@ class StateNetwork:
     """A network x+ = A x + B u + c + K e + G(x, u), y = x[heads] + e, of which A and B are weights (thesis eq. 5.1).
 
     The state at the beginning is that which fits the first `lag` samples best, without G and K.
+    Implements `ambid.identify.nonlinear.model.NonlinearModel`.
 
     Attributes
     ----------
@@ -117,23 +118,7 @@ class StateNetwork:
         return replace(self, theta=theta)
 
     def predict(self, u: Array, y: Array) -> Array:
-        """Return one-step-ahead predictions.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are NaN, and all from where the predictor diverges on.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.predict`; NaN from where the predictor diverges on."""
         X = self.states(u, y)
         out: Array = self.y_level + self.y_scale * X[:, self.layout.head_table]
         out[: self.lag] = np.nan
@@ -164,23 +149,7 @@ class StateNetwork:
         return out
 
     def jacobian(self, u: Array, y: Array) -> Array:
-        """Return the exact derivative of `predict` by `theta`, that of the first state included.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs, n_theta)
-            The first `lag` rows are zero.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.jacobian`, that of the first state included."""
         shot, m = self._shot(u, y), self._matrices
         x0, s = self._first_state(shot, m, derive=True)
         X, E = run(self.layout, m, shot, x0)
@@ -190,25 +159,7 @@ class StateNetwork:
         return out
 
     def simulate(self, u: Array, y: Array) -> Array:
-        """Run freely from the state that the first `lag` measured samples show.
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (at least lag, n_outputs), SI
-            Only the first `lag` rows are looked at.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are those of `y`; NaN from where the run leaves a million times the size of the
-            training data.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.simulate`, from the state that these samples show."""
         whole, head = with_head(self, u, y)
         shot, m = self._shot(u, whole), self._matrices
         x0, _ = self._first_state(shot, m, derive=False)
@@ -220,23 +171,7 @@ class StateNetwork:
         return whole
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return how far predicted states and inputs are from those of the training (see `networks.cloud`).
-
-        Parameters
-        ----------
-        u : ndarray, shape (n_samples, n_inputs), SI
-        y : ndarray, shape (n_samples, n_outputs), SI
-
-        Returns
-        -------
-        ndarray, shape (n_samples,)
-            0 in the middle, 1 at the edge, above 1 outside; the first `lag` rows are NaN.
-
-        Raises
-        ------
-        EstimationError
-            If the signals are not of the model's shape.
-        """
+        """As `NonlinearModel.novelty`, of predicted states and inputs (see `networks.cloud`)."""
         out = np.full(np.asarray(u).shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.regressors(u, y))
         return out
@@ -294,12 +229,7 @@ class StateNetwork:
         return x0, bent_back
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs.
-
-        Returns
-        -------
-        dict
-        """
+        """As `NonlinearModel.as_json`."""
         x = self.layout
         arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
         layout = {

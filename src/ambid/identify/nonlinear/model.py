@@ -58,6 +58,11 @@ class NonlinearModel(Protocol):
         -------
         ndarray, shape (n_samples, n_outputs), SI
             The first `lag` rows are NaN: there is no past to predict them from.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
         """
         ...
 
@@ -73,6 +78,11 @@ class NonlinearModel(Protocol):
         -------
         ndarray, shape (n_samples, n_outputs, n_theta)
             The first `lag` rows are zero.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
         """
         ...
 
@@ -88,7 +98,13 @@ class NonlinearModel(Protocol):
         Returns
         -------
         ndarray, shape (n_samples, n_outputs), SI
-            The first `lag` rows are those of `y`. NaN from where a run diverges on; never clipped.
+            The first `lag` rows are those of `y`. NaN from where a run diverges on (here: leaves
+            a million times the size of the training data); never clipped.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
         """
         ...
 
@@ -105,6 +121,11 @@ class NonlinearModel(Protocol):
         ndarray, shape (n_samples,)
             0 in the middle of what was trained on, 1 at its edge, above 1 outside: there the model extrapolates. The
             first `lag` rows are NaN.
+
+        Raises
+        ------
+        EstimationError
+            If the signals are not of the model's shape.
         """
         ...
 
