@@ -25,6 +25,7 @@ from ambid.physics.parameters import Parameter
 _NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole number is tried
 _SHORT = 12  # iterations with which a whole delay is tried
 _TRIED = 15  # iterations with which laws are compared
+_LONG = 30  # iterations with which a richer law is
 _STRETCH = 4000  # samples of each record on which laws are compared
 
 
@@ -90,7 +91,7 @@ def estimate_bearing(
             raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
         fit = min(fits, key=lambda f: f.criterion)
         if extend:
-            for name in ("rise", "asymmetric") if fit.problem.law.pair else ("rise",):
+            for name in ("asymmetric", "rise") if fit.problem.law.pair else ("rise",):
                 law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
                               asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
                 if law != fit.problem.law:
@@ -164,6 +165,8 @@ def _extended(
     linear: LinearStart, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
     """The fit with a richer law where it pays (BIC)."""
+    if fit.status == "stalled":  # else the richer law would be paid for going on
+        fit = search(fit.problem, fit.vector, iterations=_LONG, tick=tick)
     values, old = fit.problem.values(fit.vector), {n.name: n for n in fit.problem.numbers}
     fresh = {n.name: n for n in start_numbers(law, known, records, linear)}
     new = [n for n in law.names if fresh[n].estimated and not old[n].estimated]
@@ -179,7 +182,7 @@ def _extended(
     if "L_rise" in new:
         numbers = tuple(replace(n, value=values["L_rise"]) if n.name == "L_rise" else n for n in numbers)
     problem = replace(fit.problem, law=law, numbers=numbers)
-    found = search(problem, _carried(fit, problem), iterations=_TRIED, tick=tick)
+    found = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
     return found if fit.criterion - found.criterion > len(new) * np.log(fit.problem.n_used) else fit
 
 

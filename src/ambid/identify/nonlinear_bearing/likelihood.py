@@ -174,6 +174,11 @@ def _initial(problem: BearingProblem, r: int) -> tuple[Array, Array]:
         z[1] = (record.y[problem.skip + 3, 0] - record.y[problem.skip - 4, 0]) * rate / 7.0
         P[0, 0], P[1, 1] = (3.0 * moved) ** 2, (moved * rate) ** 2
     P[2, 2] = (3.0 * max(float(np.ptp(first[:, 1])), noise[1])) ** 2
+    # an offset that moves takes the state with it: the start must not hold it where the search began
+    free, spread = {n.name for n in problem.estimated}, record.y.std(axis=0)
+    for name, place, c in (("x_offset", 0, 0), ("i_offset", 2, 1)):
+        if name in free and not (record.held and c == 0):
+            P[place, place] += float(spread[c]) ** 2
     if flags[2]:  # the force behind the eddy pole starts at that of the weight
         z[3] = -begun["m"] * begun["g"]
         P[3, 3] = (0.3 * z[3]) ** 2 + (10.0 * noise[2]) ** 2
