@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from ambid.identify.networks.cloud import Cloud, cloud_of
 
@@ -34,3 +35,38 @@ def test_directions_that_do_not_move_are_very_narrow() -> None:
     x = np.random.default_rng(2).standard_normal((100, 2))
     cloud = cloud_of(np.hstack([x, np.full((100, 1), 3.0)]))
     assert np.all(cloud.novelty(np.hstack([x, np.full((100, 1), 3.1)])) > 1.0)
+
+
+def drawn(d: int, n: int, kind: str, seed: int) -> np.ndarray:
+    """Regressors in d dimensions, of very different sizes, that hang together."""
+    rng, mixed = np.random.default_rng(seed), np.random.default_rng(d)
+    x = rng.standard_normal((n, d)) if kind == "normal" else rng.uniform(-1.0, 1.0, (n, d))
+    return np.asarray(x @ mixed.standard_normal((d, d)) * 10.0 ** mixed.integers(-3, 4, d) + 3.0)
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform"])
+@pytest.mark.parametrize("d", range(2, 9))
+def test_outside_the_hull_is_novel_and_the_dense_part_is_not(d: int, kind: str) -> None:
+    x = drawn(d, 3000, kind, 1)
+    cloud = cloud_of(x)
+    middle = x.mean(axis=0)
+    assert cloud.novelty(x).max() == pytest.approx(1.0, abs=1e-9)
+    # a plane parts these from all training regressors: they are beyond the farthest one along a direction
+    white = np.linalg.inv(np.linalg.cholesky(np.cov(x.T)))
+    z, v = (x - middle) @ white.T, np.random.default_rng(2).standard_normal((500, d))
+    v /= np.linalg.norm(v, axis=1)[:, None]
+    far = v * ((1.05 if d < 4 else 1.5) * np.max(z @ v.T, axis=0))[:, None]
+    assert np.mean(cloud.novelty(middle + far @ np.linalg.inv(white).T) > 1.0) > (0.999 if d < 4 else 0.85)
+    corners = np.argsort(np.linalg.norm(z, axis=1))[-20:]
+    assert np.mean(cloud.novelty(middle + 1.2 * (x - middle)[corners]) > 1.0) >= 0.85
+    new = drawn(d, 2000, kind, 3)
+    depth = np.linalg.norm((new - middle) @ white.T, axis=1)
+    assert np.mean(cloud.novelty(new[depth < np.median(depth)]) < 1.0) > 0.98
+
+
+def test_the_corner_between_two_clouds_sides_is_outside_the_hull_though_inside_the_ellipsoid() -> None:
+    x = np.abs(np.random.default_rng(4).standard_normal((2000, 2)))  # no regressor is negative
+    cloud = cloud_of(x)
+    point = np.array([[-0.05, 1.0]])
+    assert np.linalg.norm((point - cloud.mean) @ cloud.whitening.T) < 0.5
+    assert cloud.novelty(point)[0] > 1.0

@@ -1,9 +1,11 @@
-"""Where the training regressors lie, and how far others are from them: Mahalanobis distance and nearest neighbour.
+"""Where the training regressors lie, and how far others are from them: ellipsoid, convex hull, nearest neighbour.
 
-A convex hull cannot be computed in many dimensions. Instead: the Mahalanobis distance from the middle of the training
-regressors, 1 at the farthest of them; and, because a cloud may have holes, the distance to the nearest of some hundred
-training regressors that were spread over the cloud (farthest first), 1 at the farthest that any training regressor has.
-The first counts inside; the second as well where it says "outside".
+Three distances, each 1 at the edge. Mahalanobis, from the middle, in that of the farthest training regressor. The gauge
+of the convex hull: in two and three dimensions of the hull itself; in more, where hulls have too many faces, of the
+polytope whose faces touch the hull across some hundred directions (towards its corners, along every regressor, along
+the principal axes), so that whatever counts as outside is outside the hull. And, because a cloud may have holes, the
+distance to the nearest of some hundred training regressors that were spread over the cloud (farthest first), in the
+farthest that any training regressor has. The first two count inside; the third where it says "outside".
 """
 
 from __future__ import annotations
@@ -19,6 +21,9 @@ Array = NDArray[np.float64]
 
 _MARKS = 300  # training regressors that stand for all
 _LOOKED_AT = 4000  # of which they are chosen
+_EXACT = 3  # dimensions up to which the hull itself is computed
+_FACES = 400  # of the hull, at most
+_DIRECTIONS = 200  # across which the polytope touches it
 _NARROW = 1e-6  # part of the widest direction below which a direction counts as that wide
 
 
@@ -37,6 +42,8 @@ class Cloud:
         Training regressors.
     reach : float
         Largest distance of a training regressor to the nearest mark, in deviations.
+    faces : ndarray, shape (n_faces, n_regressors)
+        Normals; the largest product with x - mean is the gauge of the hull, 1 on its surface.
     """
 
     mean: Array
@@ -44,6 +51,7 @@ class Cloud:
     scale: Array
     marks: Array
     reach: float
+    faces: Array
 
     def novelty(self, x: Array) -> Array:
         """Return how far regressors are from the training: 0 in the middle, 1 at the edge, above 1 outside.
@@ -59,6 +67,7 @@ class Cloud:
         from scipy.spatial import KDTree
 
         out: Array = np.linalg.norm((x - self.mean) @ self.whitening.T, axis=1)
+        out = np.maximum(out, np.max((x - self.mean) @ self.faces.T, axis=1, initial=0.0))
         sound = np.all(np.isfinite(x), axis=1)
         near = np.full(x.shape[0], np.nan)
         if np.any(sound):
@@ -78,6 +87,7 @@ class Cloud:
             "scale": self.scale.tolist(),
             "marks": self.marks.tolist(),
             "reach": self.reach,
+            "faces": self.faces.tolist(),
         }
 
     @classmethod
@@ -106,6 +116,7 @@ class Cloud:
             scale=np.array(found["scale"], dtype=np.float64).reshape(n),
             marks=marks,
             reach=float(found["reach"]),
+            faces=np.array(found["faces"], dtype=np.float64).reshape(-1, n),
         )
 
 
@@ -133,8 +144,47 @@ def cloud_of(x: Array) -> Cloud:
     marks = _spread(x[:: max(1, x.shape[0] // _LOOKED_AT)], mean, scale)
     reach = float(np.max(KDTree(marks / scale).query(x / scale)[0]))
     return Cloud(
-        mean=mean, whitening=W / far if far > 0 else W, scale=scale, marks=marks, reach=reach if reach > 0 else 1.0
+        mean=mean,
+        whitening=W / far if far > 0 else W,
+        scale=scale,
+        marks=marks,
+        reach=reach if reach > 0 else 1.0,
+        faces=_faces(x - mean, W, scale),
     )
+
+
+def _faces(x: Array, W: Array, scale: Array) -> Array:
+    """Normals of the hull, or of a polytope that touches it across many directions."""
+    z = x @ W.T
+    if z.shape[1] == 1 or not np.all(np.isfinite(z)):
+        found = np.array([[1.0], [-1.0]]) if z.shape[1] == 1 else np.zeros((0, z.shape[1]))
+    else:
+        exact = _hull(z) if z.shape[1] <= _EXACT else None
+        if exact is not None:
+            return np.asarray(exact @ W)
+        d = z.shape[1]
+        axes = (np.eye(d) / scale) @ np.linalg.pinv(W)  # along every regressor as it was given
+        length = np.linalg.norm(z, axis=1)
+        corners = z[np.argsort(length)[::-1][: max(_DIRECTIONS - 4 * d, 0)]]
+        found = np.concatenate([np.eye(d), -np.eye(d), axes, -axes, corners])
+        found = found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
+    support = np.max(z @ found.T, axis=0, initial=0.0)
+    live = support > 1e-9 * np.max(support, initial=1e-300)
+    return np.asarray((found[live] / support[live, None]) @ W)
+
+
+def _hull(z: Array) -> Array | None:
+    """Normals of the hull's faces, over their distance from the origin; None where it has too many, or no volume."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        equations = np.unique(np.round(ConvexHull(z).equations, 12), axis=0)
+    except (QhullError, ValueError):
+        return None
+    if equations.shape[0] > _FACES or not np.all(equations[:, -1] < -1e-12):
+        return None
+    found = -equations[:, :-1] / equations[:, -1:]
+    return np.asarray(found / max(float(np.max(z @ found.T)), 1.0))
 
 
 def _spread(x: Array, mean: Array, scale: Array) -> Array:

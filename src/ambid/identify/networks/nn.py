@@ -69,8 +69,9 @@ _LONG = (20, 30)  # samples of past for the first model of plants that a short o
 _NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
 _BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
 _MORE = 2  # states beyond the outputs, for the delay
-_DELAY, _TRAINING, _RESCUE = (0.0, 0.15), (0.15, 0.85), (0.3, 0.85)  # shares of the time, parts of a fit
-_SPREAD = (0.85, 1.0)
+_DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues are rare
+    (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0),
+)  # fmt: skip
 
 
 def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -227,7 +228,7 @@ def _rescued(
                 _delayed(s, second.state, whole, second, None)
                 if second.delay != work.delay:
                     second.state = _carried(second.state, second.data)
-            identify({**s, "descent": 0}, second.data, second, seed, part_of(tick, _RESCUE[1], _SPREAD[0]))
+            identify({**s, "descent": 0}, second.data, second, seed, part_of(tick, *_AGAIN))
     except KeyboardInterrupt as stop:
         after = stop.state if isinstance(stop, Interrupted) else second.state
         work.state = after if _better(after, before) else before

@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_train import State, white
 from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.residual import Ridge
+from ambid.identify.networks.residual import Orthogonal, Ridge, units
 from ambid.identify.networks.search import information_inverse
 from ambid.identify.networks.segments import StateProblem
-from ambid.identify.networks.spread import bootstrapped, sandwich
+from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance
 from ambid.identify.nonlinear.progress import Tick
 
 Array = NDArray[np.float64]
+
+
+_LONG = 1.0 / 16.0  # of a record, as a block: where it goes hangs together for as long as its slowest motion lasts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,7 +78,36 @@ def spread_of(state: State, data: Scaled, how: str, seed: int, tick: Tick | None
     elif how == "bootstrap":
         P, origin = bootstrapped(problem.sample_rows(v), _penalty_rows(problem, v), seed, tick), "bootstrap"
     unit, k = state.layout.unit, state.theta.size
-    return Spread(covariance=P[:k, :k] * unit[:, None] * unit, origin=origin, condition=condition)
+    P = P[:k, :k]
+    if any(isinstance(p, Orthogonal) for p in state.penalties):
+        P = P + _projection(state, problem)
+    return Spread(covariance=P * unit[:, None] * unit, origin=origin, condition=condition)
+
+
+def _projection(state: State, problem: StateProblem) -> Array:
+    """Covariance of what the physical weights take over from the network, because the record is one of many.
+
+    A and B are the best linear approximation over where the record went: (Z'Z)^-1 Z' of the whole right-hand side, of
+    which G is what is left over. On another record of the same kind the left-over projects differently.
+    """
+    layout = state.layout
+    rows = {r: [k for k, (row, _) in enumerate(layout.entries) if row == r] for r in layout.rows}
+    X, _ = problem.errors(state.vector)
+    m = layout.matrices(state.theta)
+    scores, inverse = [], np.zeros((layout.n_theta, layout.n_theta))
+    for x, shot in zip(X, problem.shots, strict=True):
+        z = np.hstack([x[:-1], shot.u])
+        G = units(z[:, :-1], m.W1, m.b1, layout.anchored)[0] @ m.W2.T
+        own = np.zeros((z.shape[0], layout.n_theta))
+        for j, at in enumerate(rows.values()):
+            Z = z[:, [layout.entries[k][1] for k in at]]
+            own[:, at] = Z * (layout.rates[j] * G[:, j])[:, None]
+            inverse[np.ix_(at, at)] += Z.T @ Z
+        scores.append(own)
+    for at in rows.values():
+        inverse[np.ix_(at, at)] = np.linalg.pinv(inverse[np.ix_(at, at)], hermitian=True)
+    found: Array = inverse @ score_covariance(scores, _LONG) @ inverse
+    return found
 
 
 def _sandwich(problem: StateProblem, v: Array) -> Array:

@@ -40,13 +40,15 @@ def block_length(n: int) -> int:
     return length
 
 
-def score_covariance(scores: Sequence[Array]) -> Array:
+def score_covariance(scores: Sequence[Array], part: float = 0.0) -> Array:
     """Return the covariance of the sum of all scores, from overlapping blocks around the circle of each record.
 
     Parameters
     ----------
     scores : sequence of ndarray, shape (n_samples, n_theta)
         Of each record.
+    part : float, optional
+        Of a record that a block has at least: long blocks where scores hang together for long.
 
     Returns
     -------
@@ -60,7 +62,7 @@ def score_covariance(scores: Sequence[Array]) -> Array:
     out = np.zeros((scores[0].shape[1],) * 2)
     for s in scores:
         n = s.shape[0]
-        length = block_length(n)
+        length = max(block_length(n), round(part * n))
         around = np.concatenate([s, s[: length - 1]]) - s.mean(axis=0)
         total = np.cumsum(np.concatenate([np.zeros((1, s.shape[1])), around]), axis=0)
         sums = total[length:] - total[:-length]
