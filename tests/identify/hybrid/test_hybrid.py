@@ -273,6 +273,20 @@ def test_two_outputs_two_inputs_and_two_records() -> None:
     assert J.shape == (200, 2, model_of(found).theta.size)
 
 
+def test_a_time_series_without_inputs() -> None:
+    rng = np.random.default_rng(0)
+    y, e = np.zeros(1000), 0.2 * rng.standard_normal(1000)
+    for t in range(2, 1000):
+        y[t] = 1.6 * np.tanh(2 * y[t - 1]) - 0.6 * y[t - 2] + e[t] + 0.5 * e[t - 1]
+    found = hybrid([record(np.empty((1000, 0)), y)], {"neurons": 1})
+    values = readable(found)
+    assert set(values) == {"y(t-2)", "e(t-1)"}
+    assert abs(values["y(t-2)"][0] + 0.6) < 4 * values["y(t-2)"][1]
+    assert abs(values["e(t-1)"][0] - 0.5) < 4 * values["e(t-1)"][1]
+    noise = hybrid([record(np.empty((999, 0)), e[1:] + 0.8 * e[:-1])], {"neurons": 0})  # nothing to explain but noise
+    assert readable(noise)["e(t-1)"][0] == pytest.approx(0.8, abs=0.1)
+
+
 def test_every_stage_has_its_curve_and_progress_never_falls() -> None:
     seen: list[tuple[str, float | None]] = []
 

@@ -305,6 +305,8 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
             if not 0 <= ne <= MOST_NOISE:
                 break
             other = shape.with_sizes(ne=ne)
+            if not other.n_theta:  # a polynomial without terms: only the noise model is left
+                break
             trial_value, trial = searched(other, moved(shape, theta, other), next(tries))
             if not trial_value < value:
                 break

@@ -7,7 +7,7 @@ innovations -> terms that no longer pay, order of C -> covariance by Laplace's a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Literal
@@ -47,6 +47,8 @@ class Work:
     theta : ndarray, shape (n_theta,), scaled
     n_candidates : int
         Terms that the polynomial's were chosen from.
+    err : Mapping of (output, term) to float
+        Error reduction ratios in the choice of the polynomial's terms.
     status : {"converged", "stalled"}
     curves : list of LearningCurve
     warnings : list of str
@@ -61,6 +63,7 @@ class Work:
     shape: HybridShape
     theta: Array
     n_candidates: int = 0
+    err: Mapping[tuple[str, str], float] = field(default_factory=dict)
     status: Literal["converged", "stalled"] = "converged"
     curves: list[LearningCurve] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -157,9 +160,17 @@ def _polynomial(s: HybridSettings, first: NonlinearFit, model: PolynomialNarmax)
         shape=shape,
         theta=theta,
         n_candidates=found if isinstance(found, int) else 0,
+        err=_ratios(first.details.get("terms")),
         curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
         drawn_in=factor,
     )
+
+
+def _ratios(terms: object) -> dict[tuple[str, str], float]:
+    """Error reduction ratios by output and term, from the details of the polynomial's fit."""
+    if not isinstance(terms, Mapping):
+        return {}
+    return {(out, x["term"]): x["err"] for out, one in terms.items() for x in one if x["err"] is not None}
 
 
 def _identify(s: HybridSettings, data: Scaled, work: Work, seed: int, ticks: list[Tick | None]) -> None:

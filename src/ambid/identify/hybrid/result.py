@@ -16,6 +16,7 @@ from ambid.identify.hybrid.revision import SHARED, inflation
 from ambid.identify.hybrid.settings import HybridSettings
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax.scaled import Scaled
+from ambid.identify.narmax.terms import term_name
 from ambid.identify.networks.cloud import cloud_of
 from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.search import information_inverse
@@ -54,7 +55,7 @@ def finished(records: Sequence[IOData], s: HybridSettings, data: Scaled, work: W
         return failed_fit("hybrid", records, used, seed, DIVERGED, work.timing_s)
     covariance, noise, effective, inflated = laplace(problem, theta)
     unit = units_of(shape, data.y_scale, data.u_scale)
-    warnings = [*work.warnings, *_cautions(records, data, work, inflated)]
+    warnings = [*work.warnings, *_cautions(records, s, data, work, inflated)]
     if covariance is None:
         warnings.append("no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons")
     net = shape.network
@@ -123,9 +124,9 @@ def laplace(problem: HybridProblem, theta: Array) -> tuple[Array | None, Array, 
     return P, noise, effective, inflated
 
 
-def _cautions(records: Sequence[IOData], data: Scaled, work: Work, inflated: Array) -> list[str]:
+def _cautions(records: Sequence[IOData], s: HybridSettings, data: Scaled, work: Work, inflated: Array) -> list[str]:
     shape, found = work.shape, []
-    if not shape.ne and records[0].n_inputs and not all(x.open_loop for x in records):
+    if s.ne == 0 and records[0].n_inputs and not all(x.open_loop for x in records):
         found.append(
             "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: "
             "raise ne, or say --open-loop if there was no feedback"
@@ -153,10 +154,11 @@ def _cautions(records: Sequence[IOData], data: Scaled, work: Work, inflated: Arr
 
 def _details(records: Sequence[IOData], data: Scaled, work: Work, effective: float) -> dict[str, object]:
     shape, y_all = work.shape, np.concatenate([y for y, _ in data.parts])
-    names, n_c = iter(shape.names), shape.sizes[0]
-    terms = {
-        out: [{"term": next(names)} for _ in one] for out, one in zip(records[0].outputs, shape.terms, strict=True)
-    }
+    n_c, p, m = shape.sizes[0], shape.n_outputs, shape.n_inputs
+    terms: dict[str, list[dict[str, object]]] = {}
+    for o, out in enumerate(records[0].outputs):
+        named = [term_name(x, p, m) for x in (*shape.terms[o], *shape.noise_terms)]
+        terms[out] = [{"term": x, "err": work.err.get((out, x))} for x in named]
     hidden = []
     for y, u in data.parts:
         rows = shape.rows(y, u)
