@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.lpv.choice import error_orders, information
+from ambid.identify.lpv.choice import error_orders, information, slowest_mode, slowest_that_does, time_constants
 from ambid.identify.lpv.problem import LpvProblem
-from ambid.identify.lpv.schedule import Schedule
+from ambid.identify.lpv.schedule import Schedule, schedule_over
 from ambid.identify.lpv.settings import LpvSettings
 from ambid.identify.lpv.shape import LpvShape, Part, part_of, stable_process
-from ambid.identify.lpv.start import from_earlier, least_squares, padded, without_error_model
+from ambid.identify.lpv.start import by_long_regression, from_earlier, least_squares, padded, without_error_model
 from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import LearningCurve
@@ -24,7 +24,7 @@ from ambid.identify.nonlinear.progress import Tick, guessed, portions
 Array = NDArray[np.float64]
 
 _DEGREES = (0, 1, 2, 3)
-_SHORT, _USUAL = 15, 6.0  # iterations of a candidate; half of what a search takes
+_USUAL = 8.0  # iterations, half of what a search takes
 _ENOUGH = 0.5  # gain of a candidate's criterion by an iteration below which it is judged
 
 
@@ -203,6 +203,43 @@ def _noted(work: Work, x: Candidate) -> Candidate:
     return x
 
 
+def chosen_level(s: LpvSettings, work: Work, tick: Tick | None) -> float:
+    """Choose the low-pass of the set point.
+
+    A linear model with moving-average errors says how slow the plant is; pseudo-linear regressions with its errors
+    compare what coefficients that follow each set point explain.
+
+    Parameters
+    ----------
+    s : LpvSettings
+    work : Work
+    tick : Tick or None
+        Of this part.
+
+    Returns
+    -------
+    float
+        s.
+    """
+    white = replace(work.shape, degree=0, error_degree=0, ar=0, ma=0)
+    shape = replace(white, ma=s.error_order)
+    starts: list[Array | None] = [padded(shape, white, least_squares(white, work.parts(white), work.first)[0])]
+    if s.error_order:
+        starts.append(by_long_regression(shape, work.parts(shape), work.first))
+    linear = _from_best(s, work, shape, starts, tick, "set point")
+    a = np.concatenate([[1.0], linear.theta[: shape.order]])
+    dt, shortest = work.records[0].dt, min(x.n_samples for x in work.records)
+    grid = time_constants(slowest_mode(a), shortest, dt)
+    degree = 2 if s.degree is None else max(s.degree, 1)
+    earlier, values = work.parts(shape), list[float]()
+    for tau in grid if len(grid) > 1 and np.isfinite(linear.cost) else ():
+        of = schedule_over(work.records, s.schedule, s.column, tau)
+        trial = replace(shape, degree=degree)
+        found = from_earlier(trial, work.parts(trial, of), work.first, shape, linear.theta, earlier)
+        values.append(np.inf if found is None else information("bic", found[1], linear.n, trial.n_theta))
+    return slowest_that_does(grid, values) if values and np.isfinite(min(values)) else grid[0]
+
+
 def by_degree(s: LpvSettings, work: Work, tick: Tick | None) -> Candidate:
     """Fit the equation form with an autoregressive error model, degree by degree.
 
@@ -228,7 +265,7 @@ def by_degree(s: LpvSettings, work: Work, tick: Tick | None) -> Candidate:
         starts: list[Array | None] = [start]
         if best is not None:
             starts.append(padded(shape, best.shape, best.theta))
-        found = _noted(work, _from_best(work, shape, starts, own, f"degree {degree}"))
+        found = _noted(work, _from_best(s, work, shape, starts, own, f"degree {degree}"))
         best = _better(work, found, best, s.criterion)
     assert best is not None
     return best
@@ -258,7 +295,7 @@ def other_degrees(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None
     for degree, own in zip(degrees, portions(tick, [1.0 + d for d in degrees]), strict=True):
         shape = replace(best.shape, degree=degree)
         start = padded(shape, best.shape, best.theta)
-        found = _noted(work, _from_best(work, shape, [start], own, f"degree {degree}"))
+        found = _noted(work, _from_best(s, work, shape, [start], own, f"degree {degree}"))
         best = _better(work, found, best, s.criterion)
     return best
 
@@ -272,13 +309,15 @@ def _better(work: Work, found: Candidate, best: Candidate | None, criterion: str
     return found
 
 
-def _from_best(work: Work, shape: LpvShape, starts: Sequence[Array | None], tick: Tick | None, stage: str) -> Candidate:
+def _from_best(
+    s: LpvSettings, work: Work, shape: LpvShape, starts: Sequence[Array | None], tick: Tick | None, stage: str
+) -> Candidate:
     """Search from the start with the least cost."""
     problem = work.problem(shape)
     ranked = sorted(((problem.cost(x), k) for k, x in enumerate(starts) if x is not None), key=lambda x: x[0])
     start = starts[ranked[0][1]]
     assert start is not None
-    return searched(work, shape, start, _SHORT, tick, stage)
+    return searched(work, shape, start, s.iterations, tick, stage)
 
 
 def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> Candidate:
@@ -304,9 +343,15 @@ def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> C
         for form in (("equation", "output") if s.form == "auto" else (s.form,))
         for ar, ma in error_orders(s.error_form, s.error_order)
     ]
+    steps = [  # on the way to both, each alone: from there the search does not end in a poor optimum
+        replace(x, ar=ar, ma=ma)
+        for x in wanted
+        for ar, ma in ([(x.ar, 0), (0, x.ma)] if x.ar and x.ma else []) + [(x.ar, x.ma)]
+    ]
+    steps = list(dict.fromkeys(steps))
     known = {best.shape: best}
     chosen = best if best.shape in wanted else None
-    for shape, own in zip(wanted, portions(tick, [1.0] * len(wanted)), strict=True):
+    for shape, own in zip(steps, portions(tick, [1.0] * len(steps)), strict=True):
         if shape in known:
             continue
         earlier = [x for x in known.values() if np.isfinite(x.cost)]
@@ -315,11 +360,15 @@ def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> C
             continue  # earlier[0]: the best of the equation form, or of the output form, which is stable
         parts = work.parts(shape)
         starts: list[Array | None] = [padded(shape, without_error_model(best.shape), _process(best))]
+        if shape.form == "equation" and shape.ma and not shape.ar:
+            starts.append(by_long_regression(shape, parts, work.first))
         for x in earlier[:2]:
-            starts += [padded(shape, x.shape, x.theta), from_earlier(shape, parts, work.first, x.shape, x.theta)]
+            regression = from_earlier(shape, parts, work.first, x.shape, x.theta)
+            starts += [padded(shape, x.shape, x.theta), None if regression is None else regression[0]]
         named = f"{shape.form} form, {_named(shape)}"
-        found = known[shape] = _noted(work, _from_best(work, shape, starts, own, named))
-        chosen = _better(work, found, chosen, "bic")
+        found = known[shape] = _noted(work, _from_best(s, work, shape, starts, own, named))
+        if shape in wanted:
+            chosen = _better(work, found, chosen, "bic")
     return chosen or best
 
 

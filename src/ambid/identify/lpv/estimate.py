@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.lpv.candidates import Work, by_degree, by_form, other_degrees, searched
-from ambid.identify.lpv.choice import chosen_time_constant
+from ambid.identify.lpv.candidates import Work, by_degree, by_form, chosen_level, other_degrees, searched
 from ambid.identify.lpv.result import finished
 from ambid.identify.lpv.schedule import schedule_over
 from ambid.identify.lpv.settings import LpvSettings, lpv_settings
@@ -132,7 +131,7 @@ def _identify(s: LpvSettings, work: Work, tick: Tick | None) -> str:
     if ticks[0] is not None:
         ticks[0]("set point", 0.0)
     if s.time_constant is None:
-        tau = chosen_time_constant(work.shape, work.records, work.data, work.first)
+        tau = chosen_level(s, work, ticks[0])
         work.schedule = schedule_over(work.records, s.schedule, s.column, tau)
         work.theta = least_squares(work.shape, work.parts(work.shape), work.first)[0]
     work.timing_s["set point"], began = perf_counter() - began, perf_counter()

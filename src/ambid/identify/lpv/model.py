@@ -1,4 +1,4 @@
-"""An LPV model with its schedule, scaling and training cloud (implements `NonlinearModel`)."""
+"""An LPV model with schedule, scaling and cloud (implements `NonlinearModel`)."""
 
 from __future__ import annotations
 

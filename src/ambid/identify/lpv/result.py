@@ -16,7 +16,7 @@ from ambid.identify.networks.search import information_inverse
 from ambid.identify.nonlinear.fit import NonlinearFit
 
 if TYPE_CHECKING:
-    from ambid.identify.lpv.estimate import Work
+    from ambid.identify.lpv.candidates import Work
 
 Array = NDArray[np.float64]
 

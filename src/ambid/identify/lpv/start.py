@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.identify.blackbox.roots import reflected
 from ambid.identify.lpv.schedule import basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors
 from ambid.identify.networks.search import triangle_of
@@ -19,6 +20,7 @@ from ambid.identify.networks.search import triangle_of
 Array = NDArray[np.float64]
 
 _BLIND = 1e-10
+_LONG, _ROWS = 4, 20  # lags of the long regression, times the order of C; samples for each of its numbers
 
 
 def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> tuple[Array, float]:
@@ -46,7 +48,14 @@ def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> tuple[A
     return theta, cost
 
 
-def from_earlier(shape: LpvShape, parts: Sequence[Part], first: int, old: LpvShape, theta: Array) -> Array | None:
+def from_earlier(
+    shape: LpvShape,
+    parts: Sequence[Part],
+    first: int,
+    old: LpvShape,
+    theta: Array,
+    earlier: Sequence[Part] | None = None,
+) -> tuple[Array, float] | None:
     """Fit all coefficients with errors and innovations of an earlier model in place of the true ones.
 
     Parameters
@@ -57,17 +66,21 @@ def from_earlier(shape: LpvShape, parts: Sequence[Part], first: int, old: LpvSha
     first : int
         Equations count from this sample on.
     old : LpvShape
-        Of the same degrees and basis.
     theta : ndarray, shape (n_theta of old,), scaled
+    earlier : sequence of Part, optional
+        Records made for the earlier model, where its functions of p are others.
 
     Returns
     -------
-    ndarray, shape (n_theta,), scaled; or None
-        None where the earlier model diverges.
+    theta : ndarray, shape (n_theta,), scaled
+    cost : float
+        Sum of squared errors of this regression.
+    None
+        Instead of both, where the earlier model diverges.
     """
     rows, targets = [], []
-    for part in parts:
-        found = errors(old, part, theta)
+    for part, before in zip(parts, earlier or parts, strict=True):
+        found = errors(old, before, theta)
         if not found.finite:
             return None
         v = part.y - found.x
@@ -77,8 +90,51 @@ def from_earlier(shape: LpvShape, parts: Sequence[Part], first: int, old: LpvSha
             by += [signal[first - k : n - k, None] * part.psi[first:] for k in range(1, size + 1)]
         rows.append(np.hstack(by))
         targets.append(part.y[first:])
-    found_theta, _ = _solved(rows, targets)
-    return found_theta if np.all(np.isfinite(found_theta)) else None
+    return _solved(rows, targets)
+
+
+def by_long_regression(shape: LpvShape, parts: Sequence[Part], first: int) -> Array:
+    """Fit an equation with moving-average errors: innovations by a long regression, then one with their lags.
+
+    Parameters
+    ----------
+    shape : LpvShape
+        Of the equation form, with ma alone.
+    parts : sequence of Part
+        Made for it.
+    first : int
+        Equations count from this sample on.
+
+    Returns
+    -------
+    ndarray, shape (n_theta,), scaled
+        Zeros of C outside the unit circle are reflected where C does not depend on p (Hannan and Rissanen 1982).
+    """
+    n, inputs = sum(p.y.size for p in parts), len(shape.columns)
+    spare = min(p.y.size for p in parts) - first - shape.ma
+    if spare < 1:
+        return np.zeros(shape.n_theta)
+    lags = min(_LONG * shape.ma, n // (_ROWS * (1 + inputs) * (shape.degree + 1)), spare // 4)
+    rows, targets = [], []
+    for p in parts:
+        begin, end = first + lags, p.y.size
+        by = [-p.y[begin - k : end - k, None] * p.phi[begin:] for k in range(1, shape.order + lags + 1)]
+        for i in range(inputs):  # the first lag of each input, put back further
+            newest = p.W[:, i * shape.nb, None]
+            by += [newest[begin - k : end - k] * p.phi[begin:] for k in range(shape.nb + lags)]
+        rows.append(np.hstack([*by, p.phi[begin:]]))
+        targets.append(p.y[begin:])
+    long = _solved(rows, targets)[0]
+    again, goal = [], []
+    for p, X, t in zip(parts, rows, targets, strict=True):
+        e, begin = t - X @ long, first + lags
+        by = [e[shape.ma - k : e.size - k, None] * p.psi[begin + shape.ma :] for k in range(1, shape.ma + 1)]
+        again.append(np.hstack([_process_rows(shape, p, p.y, begin + shape.ma), *by]))
+        goal.append(t[shape.ma :])
+    theta = _solved(again, goal)[0]
+    if not shape.error_degree:
+        theta[-shape.ma :] = reflected(np.concatenate([[1.0], theta[-shape.ma :]]))[1:]
+    return theta
 
 
 def padded(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
