@@ -41,13 +41,13 @@ def scores(fit, p, plant=damped):
 )
 def test_true_values_are_covered(options, plant, settings):
     found = []
-    for seed in range(60):
+    for seed in range(40):
         fit = lpv([record(seed, 1000, plant=plant, **options)], settings)
         assert fit.status == "converged"
         found.append([scores(fit, p, plant) for p in (0.2, 0.5, 0.8)])
     z = np.array(found)
-    assert 0.91 < np.mean(np.abs(z) < 1.96) < 0.985
-    assert np.all(np.abs(z.mean(axis=0)) < 4 / np.sqrt(60))  # no bias
+    assert 0.905 < np.mean(np.abs(z) < 1.96) < 0.985
+    assert np.all(np.abs(z.mean(axis=0)) < 4 / np.sqrt(40))  # no bias
     assert np.all((z.std(axis=0) > 0.72) & (z.std(axis=0) < 1.28))
 
 

@@ -143,7 +143,7 @@ def test_the_free_run_follows_its_own_set_point():
     b2, offset, first = model.theta[of.place(3)], model.theta[of.place(of.n_process - 1)], model.lag
     assert of.columns == (0, 1)
     w1, w2 = (model.theta[of.place(k)] for k in (4, 5))
-    expected = data.y[:, 0].copy()
+    expected, level = data.y[:, 0].copy(), 0.0
     for t in range(400):
         if t >= first:
             phi = np.array([1.0, (level - model.schedule.middle) / model.schedule.half])
@@ -151,7 +151,7 @@ def test_the_free_run_follows_its_own_set_point():
             x = -(a1 @ phi) * z[t - 1] - (a2 @ phi) * z[t - 2] + (b1 @ phi) * u[t - 1, 0] + (b2 @ phi) * u[t - 2, 0]
             x += (w1 @ phi) * u[t - 1, 1] + (w2 @ phi) * u[t - 2, 1] + offset @ phi
             expected[t] = x + model.y_level[0]
-        level = expected[t] if t == 0 else level + max(share, 1 / (t + 1)) * (expected[t] - level)
+        level += max(share, 1 / (t + 1)) * (expected[t] - level)
     np.testing.assert_allclose(run, expected, rtol=1e-9, atol=1e-10)
 
 
