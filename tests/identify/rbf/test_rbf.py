@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.narx import narx
 from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import NonlinearFit
@@ -103,19 +104,54 @@ def test_training_everything_stops_before_it_learns_the_noise() -> None:
     assert held[-1] > held.min()
 
 
+def on_the_sensor(seed: int, n: int = 1500) -> tuple[IOData, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    u, x = rng.uniform(-2, 2, n), np.zeros(n)
+    for t in range(2, n):
+        x[t] = 1.5 * x[t - 1] - 0.7 * x[t - 2] + 0.4 * np.exp(-((u[t - 1] - 0.5) ** 2) / 0.5)
+    return data(u, x + 0.1 * rng.standard_normal(n)), x
+
+
+BUMP = {"ny": 2, "nu": 1, "neurons": 8, "seen": "inputs", "width": 0.7}
+
+
 def test_simulation_errors_fall_where_the_noise_is_on_the_sensor() -> None:
-    rng = np.random.default_rng(6)
-    u, x = rng.standard_normal(1500), np.zeros(1500)
-    for t in range(2, 1500):
-        x[t] = 1.5 * x[t - 1] - 0.7 * x[t - 2] + 0.3 * np.tanh(u[t - 1])
-    record = data(u, x + 0.1 * rng.standard_normal(1500))
+    record, x = on_the_sensor(6)
     errors = []
     for focus in ("prediction", "simulation"):
-        fit = rbf([record], {"ny": 2, "nu": 2, "neurons": 5, "seen": "inputs", "focus": focus})
+        fit = rbf([record], {**BUMP, "focus": focus})
         errors.append(float(np.std(network(fit).simulate(record.u, record.y)[20:, 0] - x[20:])))
-    assert errors[1] < 0.35 * errors[0]
-    assert fit.covariance is None
-    assert any("standard deviations" in w for w in fit.warnings)
+        assert fit.covariance_from == ("laplace" if focus == "prediction" else "sandwich")
+    assert errors[1] < 0.5 * errors[0]
+    assert float(np.sqrt(fit.noise_covariance[0, 0])) == pytest.approx(0.1, rel=0.1)
+    none = rbf([record], {**BUMP, "focus": "simulation", "uncertainty": "laplace"})
+    assert none.covariance is None
+    assert any("standard deviations" in w for w in none.warnings)
+
+
+def test_intervals_of_the_linear_part_cover_the_truth_for_simulation_errors() -> None:
+    inside, seeds = 0, 40
+    for seed in range(seeds):
+        fit = rbf([on_the_sensor(200 + seed, 700)[0]], {**BUMP, "focus": "simulation"}, seed=seed)
+        assert fit.sd is not None
+        away = (network(fit).theta[:2] - [1.5, -0.7]) / fit.sd[:2]
+        inside += np.count_nonzero(np.abs(away) < 1.96)
+    assert 0.86 <= inside / (2 * seeds) <= 1.0  # 0.95 with a deviation of some 0.03
+
+
+def test_what_deviations_leave_out_is_said_and_is_as_much() -> None:
+    inside, total = 0, 0
+    for seed in range(20):
+        record, clean = bumpy(500, 100 + seed, 0.1)
+        fit = rbf([record], {"ny": 1, "nu": 1, "seen": "all", "neurons": 24, "width": 0.5}, seed=seed)
+        assert any("as few as 70 %" in w for w in fit.warnings)
+        assert fit.covariance is not None
+        model = network(fit)
+        J = model.jacobian(record.u, record.y)[1::10, 0]
+        sd = np.sqrt(np.einsum("tp,pq,tq->t", J, fit.covariance, J))
+        off = (model.predict(record.u, record.y)[:, 0] - clean)[1::10]
+        inside, total = inside + np.count_nonzero(np.abs(off) < 1.96 * sd), total + off.size
+    assert 0.65 < inside / total < 0.95
 
 
 def test_two_outputs_and_two_inputs_over_two_records() -> None:

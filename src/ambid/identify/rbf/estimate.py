@@ -57,6 +57,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
     "training": ("linear", "recursive", "descent"),
     "trained": ("weights", "all"),
     "focus": ("prediction", "simulation"),
+    "uncertainty": ("auto", "laplace", "sandwich", "none"),
 }
 _DEFAULTS: Mapping[str, object] = {
     "nk": 1,
@@ -71,6 +72,7 @@ _DEFAULTS: Mapping[str, object] = {
     "bounded": 1,
     "iterations": 60,
     "focus": "prediction",
+    "uncertainty": "auto",
 }
 _ARRIVED = 1.0  # squared standard deviations from the optimum, of all that is trained together
 
@@ -128,7 +130,8 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     """Identify a network of radial basis functions, y(t) = L z + c + W phi(z) + e(t) (thesis eqs 1.13, 1.14).
 
     Its errors are taken as white: under feedback, or with coloured noise, it is biased. The covariance is that of what
-    was trained; centres and widths that were chosen before are taken as given.
+    was trained; centres and widths that were chosen before are taken as given, which a warning says: intervals of the
+    weights hold for these units, those of the function are too narrow by what the choice of the units adds.
 
     Parameters
     ----------

@@ -121,11 +121,29 @@ class RbfProblem:
         ndarray, shape (n_active + 1, n_active + 1)
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            found = [triangle_of([block]) for block in self._blocks(theta)]
+            found = [triangle_of([block.reshape(-1, self.n_active + 1)]) for _, block in self._blocks(theta)]
         found.append(np.hstack([np.diag(self.precision[: self.n_active]), self._prior(theta)[:, None]]))
         return triangle_of([np.concatenate(found)])
 
-    def _blocks(self, v: Array) -> Iterator[Array]:
+    def scores(self, theta: Array) -> list[Array]:
+        """Return the slope of every sample's weighted error times that error, for the sandwich.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_active,)
+
+        Returns
+        -------
+        list of ndarray, shape (n_rows, n_active)
+            Of each part.
+        """
+        found: list[list[Array]] = [[] for _ in self.parts]
+        for k, block in self._blocks(theta):
+            found[k].append(np.einsum("tok,to->tk", block[:, :, :-1], block[:, :, -1]))
+        return [np.concatenate(x) for x in found]
+
+    def _blocks(self, v: Array) -> Iterator[tuple[int, Array]]:
+        """Yield weighted slopes and errors, shape (n, n_outputs, n_active + 1), with the number of their part."""
         s, theta, lag, active = self.shape, self.whole(v), self.shape.lags.lag, slice(0, self.n_active)
         for k, (y, u) in enumerate(self.parts):
             if self.free:
@@ -138,9 +156,7 @@ class RbfProblem:
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
                 J = steep[part] if self.free else s.slopes(theta, rows[part])[:, :, active]
-                yield np.hstack(
-                    [(J * self.weight[:, None]).reshape(-1, self.n_active), (left[part] * self.weight).reshape(-1, 1)]
-                )
+                yield k, np.concatenate([J, left[part, :, None]], axis=2) * self.weight[:, None]
 
     def _prior(self, v: Array) -> Array:
         out: Array = self.precision[: self.n_active] * (self.mean[: self.n_active] - v)

@@ -15,6 +15,7 @@ from ambid.identify.networks.cloud import cloud_of
 from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.search import information_inverse
+from ambid.identify.networks.spread import sandwich
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.identify.rbf.choice import error
 from ambid.identify.rbf.model import RbfNetwork
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+GIVEN_UNITS = (
+    "standard deviations are those of the weights of these units: what the choice of the units adds is not "
+    "in them, and intervals of 95 % for the function may hold in as few as 70 % of places"
+)
 DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
 
 
@@ -53,7 +58,7 @@ def finished(
     if not np.isfinite(problem.cost(theta[: problem.n_active])):
         return failed_fit("rbf", records, used, seed, DIVERGED, work.timing_s)
     P, noise, effective, condition = laplace(problem, theta[: problem.n_active])
-    covariance, warnings = _covariance(work, P)
+    covariance, origin, warnings = _covariance(work, problem, P, str(used["uncertainty"]))
     regressors = np.concatenate([shape.lags.regressors(y, u) for y, u in data.parts])
     model = RbfNetwork(
         dt=records[0].dt,
@@ -72,7 +77,7 @@ def finished(
         settings={**used, "focus": "simulation" if work.free else "prediction"},
         model=model,
         covariance=covariance,
-        covariance_from="" if covariance is None else "laplace",
+        covariance_from=origin,
         n_estimated=problem.n_active,
         noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
         seed=seed,
@@ -126,18 +131,43 @@ def laplace(problem: RbfProblem, v: Array) -> tuple[Array | None, Array, float, 
     return P, noise, effective, condition
 
 
-def _covariance(work: Work, P: Array | None) -> tuple[Array | None, list[str]]:
-    if work.free:
-        return None, [
-            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white"
-        ]
+def sandwiched(problem: RbfProblem, v: Array) -> Array | None:
+    """Return the covariance that does not take errors as white, as those of a free run are not.
+
+    Parameters
+    ----------
+    problem : RbfProblem
+    v : ndarray, shape (n_active,)
+        At the optimum.
+
+    Returns
+    -------
+    ndarray, shape (n_active, n_active), or None
+        None where the data and the prior together leave a direction open.
+    """
+    prior = np.diag(problem.precision[: v.size] ** 2)
+    return sandwich(problem.triangle(v)[:, :-1], problem.scores(v), prior)[0]
+
+
+def _covariance(work: Work, problem: RbfProblem, P: Array | None, how: str) -> tuple[Array | None, str, list[str]]:
+    """Return the covariance of all numbers, where it is from, and what must be said of it."""
+    if how == "none":
+        return None, "", ["no covariance was asked for, and so there are no standard deviations"]
     if not work.arrived:
-        return None, ["no standard deviations: the training has not come to an optimum"]
+        return None, "", ["no standard deviations: the training has not come to an optimum"]
+    if how == "laplace" and work.free:
+        return None, "", [
+            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
+            "Say uncertainty = sandwich"
+        ]  # fmt: skip
+    origin = "sandwich" if how == "sandwich" or work.free else "laplace"
+    if origin == "sandwich":
+        P = sandwiched(problem, work.theta[: problem.n_active])
     if P is None:
-        return None, ["no standard deviations: data and prior do not determine the weights. Fewer units or lags"]
+        return None, "", ["no standard deviations: data and prior do not determine the weights. Fewer units or lags"]
     whole = np.zeros((work.theta.size, work.theta.size))
     whole[: P.shape[0], : P.shape[0]] = P
-    return whole, []
+    return whole, origin, [] if work.everything or not work.shape.neurons else [GIVEN_UNITS]
 
 
 def _cautions(records: Sequence[IOData], data: Scaled, work: Work) -> list[str]:
