@@ -10,6 +10,7 @@ from ambid.acquire.devices.plant_file import write_plant_file
 from ambid.acquire.scales import scale_of
 from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Limits
+from ambid.physics.power_stage import PowerStage
 from ambid.physics.presets import preset, preset_names
 from ambid.record.calibration import Calibration
 from ambid.rig.load import load_rig
@@ -122,3 +123,21 @@ def test_what_the_emulated_bench_cannot_be_is_refused(written, rig):
     bent = Calibration(unit_in="1", unit_out="V", raw=np.array([0.0, 400.0, 800.0]), out=np.array([-12.0, 1.0, 12.0]))
     with pytest.raises(DeviceError, match="power stage is a straight line"):
         written(calibrated(rig, "voltage", bent))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stage": PowerStage(v_drop=0.5)},
+        {"eddy_pole": 900.0},
+        {"magnet": {"k_asym": 0.1}},
+        {"magnet": {"bias_asym": 0.1}},
+    ],
+)
+def test_what_the_emulated_bench_does_not_know_is_refused(written, change):
+    b = preset("prototype")
+    if "magnet" in change:
+        change = {"magnet": dataclasses.replace(b.plant.magnet, **change["magnet"])}
+    other = dataclasses.replace(b, plant=dataclasses.replace(b.plant, **change))
+    with pytest.raises(DeviceError, match="knows none"):
+        written(bench=other)

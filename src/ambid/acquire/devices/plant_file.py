@@ -18,6 +18,7 @@ from ambid.acquire.scales import Scale, scale_of
 from ambid.errors import DeviceError
 from ambid.physics.magnet import DifferentialPair
 from ambid.physics.nonlinear import NonlinearPlant
+from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 
@@ -100,6 +101,11 @@ def _plant(bench: Bench) -> Iterator[str]:
     if isinstance(plant, NonlinearPlant):
         w = plant.magnet.coenergy
         pair = isinstance(plant.magnet, DifferentialPair)
+        if (pair and (w.k_a != w.k_b or w.i0_asym != 0.0)) or plant.stage != IDEAL or math.isfinite(plant.eddy_pole):
+            raise DeviceError(
+                f"bench {bench.name!r} has unequal magnets, an eddy pole or a lossy stage; the emulated one knows none"
+                " of them. Simulate it with ambid.simulate"
+            )
         yield f"kind {'differential' if pair else 'single'}"
         yield from _numbers({"m": plant.m, "R": plant.R, "c": plant.c, "k": w.k_b, "leakage": w.leakage})
         yield from _numbers({"gravity": plant.gravity} | ({"gap": w.s_b, "bias": w.i0} if pair else {}))
