@@ -102,12 +102,12 @@ def test_standard_deviations_are_those_of_repeated_records() -> None:
 
 def test_without_neurons_it_is_narmax() -> None:
     data = polynomial(1500, 0)
-    settings = {"ny": 2, "nu": 2, "ne": 1}
+    settings = {"ny": 2, "nu": 2, "ne": 1, "selection": "frols"}
     one, same = narmax([data], settings), hybrid([data], {**settings, "neurons": 0})
     a, b = coefficients(one), coefficients(same)
     assert set(a) == set(b)
     for name, (value, sd) in a.items():
-        assert b[name][0] == pytest.approx(value, abs=1e-4 * sd)
+        assert b[name][0] == pytest.approx(value, abs=1e-3 * sd)
         assert b[name][1] == pytest.approx(sd, rel=1e-3)
     assert model_of(same).lag == one.model.lag  # type: ignore[union-attr]
     np.testing.assert_allclose(same.noise_covariance, one.noise_covariance, rtol=1e-3)
