@@ -70,6 +70,8 @@ def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit
     ]
     assert named_lines(replace(few, model=Renamed(names=("a21", "unit 1: u"), theta=np.ones(2)))) == []
     assert named_lines(replace(fit, details={})) == []
+    assert bars_of(few) is not None
+    assert bars_of(replace(few, model=Renamed(names=("a21", "y: unit 1"), theta=np.ones(2)))) is None
 
 
 def test_a_schedule_is_shown_at_its_ends_and_in_the_middle(fit: NonlinearFit) -> None:

@@ -24,7 +24,7 @@ from ambid.report._drawing import (
     worst_stretch,
 )
 from ambid.report._panels import Traces
-from ambid.report.nonlinear_parameters import coefficient_text
+from ambid.report.nonlinear_parameters import coefficient_text, is_weight
 from ambid.report.numbers import prefixed
 from ambid.validate.nonlinear.runs import model_of
 
@@ -163,8 +163,8 @@ def bars_of(fit: NonlinearFit) -> Bars | None:
     Returns
     -------
     Bars or None
-        None where there are no standard deviations, or the numbers are weights of a network that say nothing one by
-        one: more than 25, and not named after terms. Of those with terms only these are shown.
+        None where there are no standard deviations, or the numbers say nothing one by one: more than 25 that are not
+        named after terms, or weights of a network. Of a model with terms only these are shown.
     """
     sd, model = fit.sd, fit.model
     if sd is None or model is None:
@@ -173,7 +173,7 @@ def bars_of(fit: NonlinearFit) -> Bars | None:
     named = term_names(fit)
     if named:
         worth = np.array([k for k in worth if model.names[k] in named], dtype=int)
-    elif worth.size > MOST_COEFFICIENTS:
+    elif worth.size > MOST_COEFFICIENTS or any(map(is_weight, model.names)):
         return None
     if not worth.size:
         return None

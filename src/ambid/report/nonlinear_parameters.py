@@ -47,6 +47,20 @@ def parameter_table(fit: NonlinearFit) -> list[str]:
     return [*rows, *_count(fit, shown=bool(rows))]
 
 
+def is_weight(name: str) -> bool:
+    """Return whether a parameter is a weight of a network's unit, which says nothing by itself.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    bool
+    """
+    return _WEIGHT.search(name) is not None
+
+
 def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
     assert fit.model is not None
     known = "no standard deviations"
@@ -84,7 +98,7 @@ def term_lines(fit: NonlinearFit) -> list[str]:
         for o, output in enumerate(fit.outputs)
         for t in terms[output]
     }
-    named = [k for k, name in enumerate(fit.model.names) if not _WEIGHT.search(name)]
+    named = [k for k, name in enumerate(fit.model.names) if not is_weight(name)]
     weights, rest = fit.model.theta.size - len(named), max(len(named) - _SHOWN, 0)
     rows: list[tuple[str, ...]] = [("term", _column(fit)), *(_row(fit, k) for k in named[:_SHOWN])]
     if any(isinstance(x, (int, float)) for x in ratio.values()):
@@ -111,7 +125,7 @@ def named_lines(fit: NonlinearFit) -> list[str]:
     assert fit.model is not None
     sd = fit.sd
     estimated = [k for k in range(fit.model.theta.size) if sd is None or sd[k] > 0]
-    if len(estimated) > _SHOWN or any(_WEIGHT.search(x) for x in fit.model.names):
+    if len(estimated) > _SHOWN or any(is_weight(x) for x in fit.model.names):
         return []
     return columns([("parameter", _column(fit)), *(_row(fit, k) for k in estimated)])
 

@@ -299,6 +299,7 @@ def test_interruption_gives_the_best_so_far(s: NonlinearStructure) -> None:
     fitted(s, smooth(), tick=listen)
     assert stages
     assert all(isinstance(x, str) and x for x in stages)
+    assert shares  # from which the time left is told
     assert all(0.0 <= x <= 1.0 for x in shares)
     assert all(b >= a for a, b in pairwise(shares))  # what is over stays so
     for stop in sorted({0, len(stages) // 2}):
