@@ -350,6 +350,7 @@ def _refine(s: Mapping[str, Any], data: Scaled, work: Work, tick: Tick | None) -
         keep(found.theta)
         _note(work, found, problem, "simulation errors")
         work.status = "converged" if found.converged else "stalled"
+        work.arrived = work.arrived or found.converged  # wherever it came from
         if found.converged and data.y_level.size == 1:
             break
         problem = _problem(data, work, work.theta, free=True)
