@@ -37,7 +37,9 @@ def innovations(left: Array, a: Array, W2: Array, We: Array, C: Array, E: Array,
             for i in range(h):
                 s -= W2[o, i] * T[t, i]
             if not abs(s) < _FAR:
-                E[t:] = np.nan
+                for later in range(t, n):
+                    for q in range(p):
+                        E[later, q] = np.nan
                 return
             E[t, o] = s
 
@@ -75,7 +77,8 @@ def free_run(
     n, p, h, d = z.shape[0], W2.shape[0], W1.shape[0], z_column.size
     out = np.empty(p)
     for t in range(lag, n):
-        out[:] = 0.0
+        for o in range(p):
+            out[o] = 0.0
         for k in range(terms.shape[0]):
             s = theta[k]
             for j in range(terms.shape[1]):
@@ -93,6 +96,9 @@ def free_run(
                 out[o] += W2[o, i] * s
         for o in range(p):
             if not abs(out[o]) < _FAR:
-                z[t:, :p] = np.nan
+                for later in range(t, n):
+                    for q in range(p):
+                        z[later, q] = np.nan
                 return
-        z[t, :p] = out
+        for o in range(p):
+            z[t, o] = out[o]
