@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
+from ambid.identify.lpv.beginning import beginning, settling
 from ambid.identify.lpv.frozen import Frozen, frozen
 from ambid.identify.lpv.schedule import BASES, Schedule, basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors, part_of
@@ -25,7 +26,7 @@ Array = NDArray[np.float64]
 class LpvModel:
     """A linear model of one output whose coefficients follow a scheduling signal; equations in `lpv.shape`.
 
-    The predictor takes the process part before its first prediction as the output, and innovations there as zero.
+    What was before a record the predictor estimates from the first `lag` samples, see `lpv.beginning`.
     Implements `ambid.identify.nonlinear.model.NonlinearModel`.
 
     Attributes
@@ -68,7 +69,7 @@ class LpvModel:
     @property
     def lag(self) -> int:
         """Samples of the past that a prediction needs."""
-        return self.shape.lag
+        return self.shape.lag + settling(self.shape)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,17 +129,23 @@ class LpvModel:
     def predict(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.predict`; NaN everywhere if the predictor diverges."""
         part = self._part(u, y)
-        found = errors(self.shape, part, self.theta / self.unit)
+        theta = self.theta / self.unit
+        start = beginning(self.shape, part, theta)
+        found = None if start is None else errors(self.shape, part, theta, start[0])
         out = np.full((part.y.size, 1), np.nan)
-        if found.finite:
+        if found is not None and found.finite:
             out[self.lag :, 0] = found.g[self.lag :]
         predicted: Array = self.y_level + self.y_scale * out
         return predicted
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.jacobian`."""
-        found = errors(self.shape, self._part(u, y), self.theta / self.unit, slopes=2)
-        J = found.J[:, : self.theta.size] if found.finite else np.full((found.e.size, self.theta.size), np.nan)
+        part, theta, P = self._part(u, y), self.theta / self.unit, self.theta.size
+        start = beginning(self.shape, part, theta, slopes=True)
+        found = None if start is None else errors(self.shape, part, theta, start[0], slopes=2)
+        J = np.full((part.y.size, P), np.nan)
+        if start is not None and found is not None and found.finite:
+            J = found.J[:, :P] + found.J[:, P:] @ start[1]
         out = (J * (self.y_scale / self.unit))[:, None, :]
         out[: self.lag] = 0.0
         return np.asarray(out)
@@ -176,7 +183,7 @@ class LpvModel:
         s = self.scheduling(u, y)
         out = np.full(ys.shape[0], np.nan)
         x = regressors(self.shape, ys[:, 0], us, s)
-        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), self.cloud.novelty(x))
+        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), self.cloud.novelty(x[settling(self.shape) :]))
         return out
 
     def scheduling(self, u: Array, y: Array) -> Array:
