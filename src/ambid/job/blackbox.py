@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -16,6 +17,7 @@ from ambid.identify.blackbox.data import IOData, io_data
 from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.identify.blackbox.orders import Orders
 from ambid.identify.blackbox.structures import STRUCTURES, Structure, structure
+from ambid.identify.nonlinear.progress import guessed
 from ambid.job._progress import Tick, silent
 from ambid.job.bench_data import bench_data
 from ambid.physics.models import model
@@ -27,6 +29,9 @@ from ambid.units import UNKNOWN
 if TYPE_CHECKING:
     from ambid.identify.physical import PhysicalFit
     from ambid.validate.comparison import Comparison
+
+_ORDERS = 0.95  # of a job's time goes into the choice of orders, where they are chosen
+_USUAL_ORDERS = 12  # fits, about half of those that it takes
 
 
 def fit(
@@ -86,7 +91,8 @@ def fit(
     rig : Rig, str or Path, optional
         Names and calibrates the channels; without `inputs` and `outputs` all of its model are taken.
     tick : callable, optional
-        Called with the name of the present stage; may raise to interrupt.
+        Called with the name of the present stage and, where it is known, the share of the job that is over:
+        ``tick(stage, done)``; may raise to interrupt.
 
     Returns
     -------
@@ -128,11 +134,15 @@ def fit(
         if orders is None:
             from ambid.validate.selection import select
 
-            say("orders")
-            choice = select(of.name, data, criterion=criterion)
+            say("orders", 0.0)
+            tried = count()
+            choice = select(
+                of.name, data, criterion=criterion,
+                tick=lambda _: say("orders", _ORDERS * guessed(next(tried), _USUAL_ORDERS)),
+            )  # fmt: skip
             orders, chosen = choice.orders, {"selection": choice.summary()}
             laps["orders"], last = time.perf_counter() - last, time.perf_counter()
-        say("fit")
+        say("fit", _ORDERS if chosen else None)
         options: dict[str, object] = {"fixed": dict(fixed)} if fixed else {}
         options |= {"at_rest": True} if at_rest else {}
         found = of.estimator(data, orders, **options)
