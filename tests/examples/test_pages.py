@@ -189,6 +189,30 @@ def test_the_page_on_nonlinear_models_runs_and_shows_what_comes_out(tmp_path, mo
     assert shares[-1] == 1.0
 
 
+def test_the_page_on_the_nonlinear_magnet_runs_and_shows_what_comes_out(tmp_path, monkeypatch):
+    """Its records, its rig and its Python, which does what its command does."""
+    from ambid.cli.app import run_verb
+    from ambid.report.bearing_text import bearing_text
+
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "nonlinear_bearing.md"
+    (tmp_path / "bearing.toml").write_text(blocks(page, "toml")[0], encoding="utf-8")
+    for line in blocks(page, "sh")[0].splitlines():
+        words = shlex.split(line)
+        assert words[1] != "simulate" or run_verb(words[1:]) == 0
+    names: dict[str, object] = {}
+    exec(compile(blocks(page, "python")[0], "nonlinear_bearing.md", "exec"), names)
+    estimate, again = names["estimate"], names["again"]
+    assert again.dumps() == estimate.dumps()
+    assert estimate.passed
+    rows = re.compile(r"^(k|s|L_leak) +([\d.]+) ± ([\d.]+) \S+", re.MULTILINE)
+    shown, found = (rows.findall(text) for text in (page.read_text(encoding="utf-8"), bearing_text(estimate)))
+    assert [x[0] for x in shown] == [x[0] for x in found] == ["k", "s", "L_leak"]
+    for (_, value, sd), (_, now, sd_now) in zip(shown, found, strict=True):
+        assert abs(float(value) - float(now)) < 0.2 * float(sd)
+        assert float(sd) == pytest.approx(float(sd_now), rel=0.2)
+
+
 COMMISSIONED = re.compile(r"^  (m|k_x|k_i|R|L) = (-?[\d.]+) ± ([\d.]+) (\S+) \(95 %", re.MULTILINE)
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ambid.cli import run
+from ambid.job.estimates import read_estimate
 from ambid.job.nonlinear_bearing import identify_nonlinear
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
@@ -33,6 +35,8 @@ column = "position"
 m = {{ value = 60.54, unit = "g", role = "fixed" }}
 c = {{ value = 0.0, unit = "N s/m", role = "fixed" }}
 R = {{ unit = "ohm" }}
+[magnet]
+off_below = 0.0431
 [record]
 from = 2.0
 """
@@ -52,13 +56,24 @@ def rig(tmp_path_factory):
 def over_all(rig, **wishes):
     return identify_nonlinear(
         [MAGLEV / f"levitate_{n}.csv" for n in LEVITATION], rig,
-        held=[MAGLEV / f"coil_steps_{n}.csv" for n in COIL], off_below=0.0431, **wishes,
+        held=[MAGLEV / f"coil_steps_{n}.csv" for n in COIL], **wishes,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def estimate(rig):
-    return over_all(rig)
+def files(rig, tmp_path_factory):
+    """What the command of docs/nonlinear_bearing.md writes."""
+    at = tmp_path_factory.mktemp("estimate")
+    words = ["identify", *(MAGLEV / f"levitate_{n}.csv" for n in LEVITATION), "--rig", rig, "--nonlinear"]
+    for n in COIL:
+        words += ["--held", MAGLEV / f"coil_steps_{n}.csv"]
+    assert run([str(w) for w in (*words, "--json", at / "ball.json", "--plot", at / "ball.png")]) == 0
+    return at
+
+
+@pytest.fixture(scope="module")
+def estimate(files):
+    return read_estimate(files / "ball.json")
 
 
 def standing(z):
@@ -107,6 +122,14 @@ def test_the_model_error_is_owned_up_to(estimate):
     assert not estimate.checks["residuals_white"].passed
     assert estimate.checks["carries_its_weight"].passed
     assert any("robust" in w for w in estimate.warnings)
+
+
+def test_the_command_draws_and_judges(files, capsys):
+    assert (files / "ball.png").read_bytes().startswith(b"\x89PNG")
+    assert run(["validate", str(files / "ball.json"), str(MAGLEV / "levitate_updown_c.csv")]) == 0
+    said = capsys.readouterr().out
+    for check in ("innovations_consistent", "inside_range", "carries_its_weight"):
+        assert f"✓ {check}" in said
 
 
 def test_a_free_mass_is_right_or_flagged(rig):

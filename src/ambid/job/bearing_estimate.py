@@ -51,10 +51,10 @@ def judged(
 
     problem, names = fit.problem, _names(fit)
     tests = [whiteness(fit, r) for r in range(len(problem.records))]
-    white = _white(tests, names)
-    robust = not white.passed or known.inflation > _INFLATION or fit.status != "converged"
+    residuals = _residuals(tests, names)
+    robust = not all(c.passed for c in residuals.values()) or known.inflation > _INFLATION or fit.status != "converged"
     parameters = _parameters(fit, known, robust=robust)
-    checks = {"residuals_white": white, "identifiable": _shown(parameters)} | _gravity(fit)
+    checks = {**residuals, "identifiable": _shown(parameters)} | _gravity(fit)
     noise = {
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
@@ -87,16 +87,25 @@ def judged(
     )
 
 
-def _white(tests: Sequence[WhitenessTest], names: Sequence[str]) -> Check:
+def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
+    """One-step errors against their own past and against past voltages: a check passes where every record does."""
     from ambid.identify.estimate import Check
 
-    worst = min(range(len(tests)), key=lambda r: tests[r].p)
-    return Check(
-        passed=tests[worst].p >= _P_LEAST, p=tests[worst].p,
-        detail=f"one-step errors against their past: p = {tests[worst].p:.2g} on {names[worst]}, largest correlation "
-        f"{max(t.largest for t in tests):.3f}",
-        values={n: t.p for n, t in zip(names, tests, strict=True)},
-    )  # fmt: skip
+    against = {
+        "residuals_white": ("their past", [t.p_own for t in tests]),
+        "residuals_uncorrelated": ("past voltages", [t.p_input for t in tests]),
+    }
+    found = {}
+    for check, (what, p) in against.items():
+        worst = min(range(len(p)), key=lambda r: p[r])
+        more = f", largest correlation {max(t.largest for t in tests):.3f}" if check == "residuals_white" else ""
+        found[check] = Check(
+            passed=p[worst] >= _P_LEAST,
+            p=p[worst],
+            detail=f"one-step errors against {what}: p = {p[worst]:.2g} on {names[worst]}{more}",
+            values=dict(zip(names, p, strict=True)),
+        )
+    return found
 
 
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
