@@ -192,6 +192,18 @@ def test_feedback_is_warned_of_and_nothing_to_predict_from_refused() -> None:
         rbf([record], {"unit": "gausian"})
 
 
+def test_units_that_have_no_place_are_left_out_and_told() -> None:
+    record, _ = bumpy(120, 13, 0.1)
+    for centres in ("ols", "kmeans"):
+        fit = rbf([record], {"ny": 1, "nu": 1, "neurons": 100, "centres": centres})
+        assert 20 < fit.settings["neurons"] == network(fit).shape.neurons < 60
+        assert any("instead of 100" in w for w in fit.warnings)
+    steps = data(np.repeat([0.0, 1.0, 0.0, 1.0], 40), record.y[:, 0].repeat(2)[:160])
+    few = rbf([steps], {"ny": 1, "nu": 1, "seen": "inputs", "neurons": 8, "centres": "kmeans"})
+    assert few.settings["neurons"] == 2
+    assert not any("instead" in w for w in rbf([record], {"ny": 1, "nu": 1}).warnings)
+
+
 def test_a_time_series_has_no_inputs() -> None:
     rng = np.random.default_rng(12)
     y = np.zeros(800)

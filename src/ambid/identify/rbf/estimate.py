@@ -210,6 +210,11 @@ def _identify(s: Mapping[str, Any], told: Told, data: Scaled, work: Work, seed: 
         tick("start", 0.0)
     found = chosen(told, data.parts, seed, ticks[0])
     work.width, work.seen, work.tried = found.width, found.seen, found.tried
+    if told.neurons is not None and found.shape.neurons < told.neurons:
+        work.warnings.append(
+            f"{found.shape.neurons} units instead of {told.neurons}: more have no place of their own in the data, or "
+            "there are fewer than two samples for each"
+        )
     work.timing_s["choice"] = perf_counter() - began
     began = perf_counter()
     if ticks[1] is not None:

@@ -179,7 +179,7 @@ class Placing:
         return shape, fitted_weights(shape, theta, self.z, self.y, self.told.prior)
 
     def _centres(self, neurons: int, width: float) -> Array:
-        neurons = min(neurons, max((self.z.shape[0] - self.shape.n_weights) // 2, 0))
+        neurons = min(neurons, max((self.z.shape[0] - sum(self.shape.sizes[:2])) // 2, 0))  # two samples for each
         if not neurons or not self.shape.n_seen:
             return np.empty((0, self.shape.n_seen))
         rng = np.random.default_rng([self.seed, 2])
