@@ -1,11 +1,15 @@
 """The job of the nonlinear bearing: records and rig in, curves with bands out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.job.bearing_records import Reading, taken_record
 from ambid.job.nonlinear_bearing import identify_nonlinear
 from ambid.physics.coenergy_law import law_numbers
+from ambid.physics.loop import Limits
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.rig import load_rig
@@ -122,3 +126,18 @@ def test_what_is_asked_wrongly_is_refused(balls, rig):
         identify_nonlinear(balls, rig, parameters=[Parameter(name="gap", unit="m")])
     with pytest.raises(EstimationError, match="every one holds the rotor"):
         identify_nonlinear([], rig, held=balls, magnet="single")
+
+
+def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, rig):
+    x, u = balls[0]["position"], balls[0]["voltage"]
+    for part, told in ((1.0, 0), (0.999, 1), (0.5, 2)):  # of the samples that lie below the upper stop
+        stop = float(np.quantile(x, part)) + (1e-3 if part == 1.0 else 0.0)
+        taken = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, stop))), Reading())
+        assert len(taken.warnings) == told
+        assert (taken.record.knock is not None) == (told > 0)
+    assert "lies on a stop" in taken.warnings[1]
+    high = float(np.quantile(u, 0.9))
+    taken = taken_record(balls[0], replace(rig, limits=Limits(voltage=(0.0, high))), Reading())
+    assert taken.record.u.max() == high
+    assert taken.record.u.size == u.size  # none thrown away
+    assert "the limit was taken" in taken.warnings[0]

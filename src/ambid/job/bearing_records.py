@@ -216,7 +216,7 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
     """
     import numpy as np
 
-    from ambid.identify.nonlinear_bearing.contact import touching
+    from ambid.identify.nonlinear_bearing.contact import LYING, touching
     from ambid.identify.nonlinear_bearing.problem import BearingRecord
     from ambid.job.physical import load
 
@@ -253,6 +253,11 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
                 f"{name}: the rotor is at a stop (loop.limits.position) for {at} samples; the force there counts "
                 "as unknown"
             )
+            if at > LYING * taken.u.size:
+                told.append(
+                    f"{name}: the rotor lies on a stop in {at / taken.u.size:.0%} of the record; numbers are off by "
+                    "more than their deviations then. Cut the record to where the rotor moves freely"
+                )
     remembered = {
         "samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
         "file": bench.provenance.get("file"), "held": held, "history": [str(step) for step in bench.history],

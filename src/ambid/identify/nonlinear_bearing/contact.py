@@ -2,7 +2,8 @@
 
 A few touches in thousands of samples are enough to move every number by deviations, as each hits the predictor with a
 force hundreds of times the noise. They are not thrown away: position and current are measured on; force and motional
-voltage are what is unknown, as the speed ends somewhere within the sample.
+voltage are what is unknown, as the speed ends somewhere within the sample. This holds for touches. A rotor that lies
+on a stop is carried by a force that does not average out: such stretches have to be cut out.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ import numpy as np
 from ambid.identify.nonlinear_bearing.problem import BearingRecord
 from ambid.identify.scaling import noise_floor
 from ambid.physics.loop import Interval
+
+LYING = 0.05
+"""Share of a record's samples at a stop above which it is more than touches."""
 
 _NEAR = 6.0  # standard deviations of the sensor from a stop within which the rotor may lie at it
 _LOCAL, _REST = 3, 3.0  # samples over which the speed is looked for, and its floor in the sensor's deviations a sample
