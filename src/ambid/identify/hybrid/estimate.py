@@ -139,7 +139,7 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
 def _costs(s: HybridSettings) -> tuple[float, ...]:
     """What the parts of a fit are expected to take, of each other: as `_identify` goes through them."""
     h = float(s.neurons if s.neurons is not None else 4)
-    return 3.0, 1.0, 8.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
+    return 3.0, 1.0, 100.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
 
 
 def _polynomial(s: HybridSettings, first: NonlinearFit, model: PolynomialNarmax) -> Work:
