@@ -18,7 +18,7 @@ AMBID = [sys.executable, "-c", "from ambid.cli import main; main()"]
 USAGE = {
     "unknown verb": (["identfy", "x"], "No such command 'identfy'. Did you mean 'identify'? See 'ambid --help'"),
     "unknown option": (["models", "--all"], "No such option: --all. See 'ambid models --help'"),
-    "missing argument": (["identify"], "Missing argument 'RECORD'. See 'ambid identify --help'"),
+    "missing argument": (["identify"], "Missing argument 'RECORD...'. See 'ambid identify --help'"),
     "too many arguments": (["models", "x"], "(x)"),
     "no number": (["identify", "record.csv", "--from", "soon"], "Invalid value for '--from'"),
     "missing output": (["simulate", "thesis"], "Missing option '--output'"),

@@ -80,7 +80,8 @@ def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_o
         if bool(r["held"]) == record.held and abs(float(str(r["rate_hz"])) / record.rate_hz - 1.0) < 1e-6
     ]
     if delay is None or not kind:
-        rates = ", ".join(estimate.delay)
+        of_kind = [r for r in estimate.records if bool(r["held"]) == record.held]
+        rates = ", ".join(dict.fromkeys(f"{float(str(r['rate_hz'])):g} Hz" for r in of_kind))
         raise EstimationError(
             f"{record.name} is sampled at {record.rate_hz:g} Hz, the estimate's predictor at {rates}; they have to "
             "agree. Resample the record, or identify with it"
