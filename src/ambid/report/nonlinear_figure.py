@@ -194,6 +194,7 @@ def _training(figure: Figure | SubFigure, fit: NonlinearFit) -> None:
             by_step.plot(np.arange(c.training.size), c.held_out, "--", color=color, linewidth=0.9)
     by_time.set_xlabel("time [s]")
     by_step.set_xlabel("iteration")
+    by_step.xaxis.get_major_locator().set_params(integer=True)
     _scaled(by_time, "x", [x for c in fit.curves for x in np.maximum(c.seconds, earliest)])
     _scaled(by_time, "y", [x for c in fit.curves for x in (*c.training, *c.held_out)])
     by_time.set_ylabel("rms error / sd of output")
@@ -209,6 +210,8 @@ def _scaled(axes: Axes, which: Literal["x", "y"], values: list[float]) -> None:
 
     finite = [float(v) for v in values if np.isfinite(v) and v > 0]
     if not finite or max(finite) < 5 * min(finite):
+        if which == "y" and finite and max(finite) < 1.01 * min(finite):  # a search that began where it ended is flat
+            axes.set_ylim(0.98 * min(finite), 1.02 * max(finite))
         return
     if which == "x":
         axes.set_xscale("log")

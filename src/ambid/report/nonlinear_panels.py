@@ -96,8 +96,8 @@ def records_panel(figure: Figure | SubFigure, panels: Sequence[Panel]) -> None:
     for k in range(len(panels), across * down):
         for a in axes[2 * n_y * (down - 1) :, k % across]:
             a.axis("off")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", fontsize=8, ncols=4, frameon=False)
+    named = {label: h for a in axes.flat for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(named.values()), list(named), loc="outside upper center", fontsize=8, ncols=4, frameon=False)
 
 
 def columns_of(n_panels: int) -> int:
