@@ -216,6 +216,12 @@ def _train(s: Mapping[str, object], shape: NarxShape, data: Scaled, work: Work, 
         found = search(problem, found.theta, stage="all data", most=most, tick=third)
         _keep(work, shape, found.theta)
     work.status = "converged" if found.converged else "stalled"
+    if not found.converged and len(found.costs) > most:  # a valley of networks that differ little: no fault of the data
+        lately = 50.0 * (1.0 - found.costs[-1] / found.costs[-min(11, len(found.costs))])
+        work.warnings.append(
+            f"the training was still improving at its limit of {most} iterations, the errors by {lately:.1g} % over "
+            "the last ten: raise iterations if that matters. Standard deviations are those of a linearisation there"
+        )
 
 
 def _keep(work: Work, shape: NarxShape, theta: Array) -> None:

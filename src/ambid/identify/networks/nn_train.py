@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.layout import Layout
 from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.residual import Orthogonal, Ridge, orthogonal_to_physics
+from ambid.identify.networks.residual import STIFF, Orthogonal, Ridge, orthogonal_to_physics
 from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import Penalty, StateProblem, largest_pole, shots
 from ambid.identify.networks.start import carried_to_continuous, widened
@@ -353,16 +353,25 @@ def added_network(
     d, k = layout.n + layout.n_inputs, layout.n_directions
     theta[k : k + neurons * d] = rng.standard_normal(neurons * d) / np.sqrt(d)
     theta[k + neurons * d : k + neurons * (d + 1)] = rng.standard_normal(neurons)
-    penalties: list[Penalty] = [Ridge(layout=layout, prior=prior)]
-    if not anchored:
-        problem = state.problem(data)
-        X, E = problem.errors(state.vector)
-        noise = np.full(layout.n, float(np.sqrt(np.mean(np.concatenate(E) ** 2))))
-        penalties.append(
-            orthogonal_to_physics(layout, [x[:-1] for x in X], [s.u[:, :-1] for s in problem.shots], noise)
-        )
-    new = replace(state, layout=layout, theta=theta, penalties=tuple(penalties))
-    return trained(new, data, stage="hidden layer", iterations=iterations, tick=tick)
+    ridge = Ridge(layout=layout, prior=prior)
+    new = replace(state, layout=layout, theta=theta, penalties=(ridge,))
+    if anchored:
+        return trained(new, data, stage="hidden layer", iterations=iterations, tick=tick)
+    found: Trained = None
+    for k, stiff in enumerate(STIFF):  # where the network goes, and its errors, are known only afterwards
+        bound = _orthogonal(state if found is None else found[0], layout, data, stiff)
+        new = replace(new if found is None else found[0], penalties=(ridge, bound))
+        own = part_of(tick, k / len(STIFF), (k + 1) / len(STIFF))
+        found = trained(new, data, stage="hidden layer", iterations=iterations, tick=own) or found
+    return found
+
+
+def _orthogonal(state: State, layout: Layout, data: Scaled, stiff: float) -> Orthogonal:
+    """The penalty at the states that a network goes through."""
+    problem = state.problem(data)
+    X, E = problem.errors(state.vector)
+    noise = np.full(layout.n, float(np.sqrt(np.mean(np.concatenate(E) ** 2))))
+    return orthogonal_to_physics(layout, [x[:-1] for x in X], [s.u[:, :-1] for s in problem.shots], noise, stiff)
 
 
 def white(state: State, data: Scaled) -> bool:

@@ -17,7 +17,7 @@ from ambid.identify.networks.layout import Layout
 
 Array = NDArray[np.float64]
 
-_STIFF = 30.0  # weight of what is left of the projection, in errors' standard deviations over the whole record
+STIFF = (3.0, 30.0)  # weight of what is left of the projection, in errors' deviations over the record, by round
 _POINTS = 2000
 
 
@@ -126,7 +126,9 @@ def units(z: Array, W1: Array, b1: Array, anchored: bool) -> tuple[Array, Array,
     return value, by_a, by_b
 
 
-def orthogonal_to_physics(layout: Layout, states: list[Array], inputs: list[Array], noise: Array) -> Orthogonal:
+def orthogonal_to_physics(
+    layout: Layout, states: list[Array], inputs: list[Array], noise: Array, stiff: float = STIFF[-1]
+) -> Orthogonal:
     """Return the penalty for the data at hand.
 
     Parameters
@@ -136,6 +138,8 @@ def orthogonal_to_physics(layout: Layout, states: list[Array], inputs: list[Arra
     inputs : list of ndarray, shape (n_samples, n_inputs), scaled
     noise : ndarray, shape (n,)
         Size of the one-step errors of the states.
+    stiff : float, optional
+        Too stiff from the beginning holds the network at zero.
 
     Returns
     -------
@@ -149,5 +153,5 @@ def orthogonal_to_physics(layout: Layout, states: list[Array], inputs: list[Arra
         columns = [c for row, c in layout.entries if row == r]
         bases.append(np.linalg.qr(known[:, columns])[0])
         step = rate * (layout.dt if layout.form == "one-axis" else 1.0)
-        strength.append(_STIFF * step / max(float(noise[r]), 1e-12) * np.sqrt(whole.shape[0] / z.shape[0]))
+        strength.append(stiff * step / max(float(noise[r]), 1e-12) * np.sqrt(whole.shape[0] / z.shape[0]))
     return Orthogonal(layout=layout, z=z, bases=tuple(bases), strength=np.array(strength))

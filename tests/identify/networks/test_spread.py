@@ -1,0 +1,142 @@
+"""Spread of networks where errors are not white, and where physics is a projection: coverage over Monte Carlo."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ambid.identify.blackbox.data import IOData
+from ambid.identify.networks.narx import narx
+from ambid.identify.networks.nn import nn
+from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance
+from ambid.identify.nonlinear.fit import NonlinearFit
+from tests.identify.networks.test_narx_network import data
+from tests.identify.networks.test_state_network import sampled
+
+
+def coloured(n: int, seed: int, size: float, pole: float = 0.9) -> np.ndarray:
+    e, v = np.random.default_rng([seed, 9]).standard_normal(n), np.zeros(n)
+    for t in range(1, n):
+        v[t] = pole * v[t - 1] + size * e[t]
+    return v
+
+
+def test_the_sum_of_correlated_scores_is_estimated() -> None:
+    found = [score_covariance([coloured(4000, s, 1.0, 0.8)[:, None]])[0, 0] / 4000 for s in range(20)]
+    assert np.mean(found) == pytest.approx(1.0 / 0.2**2, rel=0.15)
+    white = [score_covariance([coloured(100, s, 1.0, 0.0)[:, None]])[0, 0] / 100 for s in range(100)]
+    assert np.mean(white) == pytest.approx(1.0, rel=0.15)
+    many = [score_covariance([np.full((7, 1), v) for v in coloured(40, s, 1.0, 0.0)])[0, 0] for s in range(50)]
+    assert np.mean(many) == pytest.approx(40 * 49.0, rel=0.1)  # whole records are what is independent
+
+
+def test_sandwich_and_bootstrap_are_those_of_a_linear_regression_with_correlated_errors() -> None:
+    spreads = np.array([[0.0, 0.0]] * 40)
+    errors = np.zeros(40)
+    for s in range(40):
+        z, e = coloured(2000, 500 + s, 1.0, 0.8), coloured(2000, s, 1.0, 0.8)
+        slope = float(z @ e / (z @ z))
+        rows = np.stack([z, e - slope * z], axis=1)[:, None, :]
+        R = np.linalg.qr(rows[:, 0], mode="r")[:, :1]
+        P, _ = sandwich(R, [(z * (e - slope * z))[:, None]])
+        assert P is not None
+        spreads[s] = P[0, 0], bootstrapped([rows], np.zeros((0, 2)), s, repeats=60)[0, 0]
+        errors[s] = slope
+    np.testing.assert_allclose(spreads.mean(axis=0), np.var(errors), rtol=0.45)
+    assert spreads.mean(axis=0)[1] == pytest.approx(spreads.mean(axis=0)[0], rel=0.15)
+    white = 1.0 / 2000  # variance of errors over that of z, were they white
+    assert np.all(spreads.mean(axis=0) > 3.0 * white)
+
+
+def coverage(fit: NonlinearFit, true: np.ndarray) -> np.ndarray:
+    """Whether the first values of the impulse response are inside their 95 % intervals."""
+    assert fit.model is not None
+    assert fit.covariance is not None
+
+    def impulse(theta: np.ndarray) -> np.ndarray:
+        m = fit.model.with_theta(theta)  # type: ignore[union-attr]
+        return np.array([(np.linalg.matrix_power(m.A, k) @ m.B)[0, 0] for k in range(true.size)])
+
+    theta = fit.model.theta
+    J = np.stack([(impulse(theta + h) - impulse(theta - h)) / 2e-6 for h in 1e-6 * np.eye(theta.size)], axis=1)
+    return np.abs(impulse(theta) - true) < 1.96 * np.sqrt(np.diag(J @ fit.covariance @ J.T))
+
+
+def test_intervals_of_a_network_trained_on_coloured_simulation_errors_cover_the_truth() -> None:
+    _, A, B = sampled(10, 1)
+    true = np.array([(np.linalg.matrix_power(A, k) @ B)[0] for k in range(6)])
+    inside: dict[str, list[np.ndarray]] = {"auto": [], "bootstrap": [], "laplace": []}
+    origins = {}
+    for seed in range(24):
+        clean = sampled(1000, 300 + seed)[0]
+        # slow noise over fast: 4 times the power of white noise where this plant is slow
+        y = clean.y + coloured(1000, seed, 0.1, 0.9)[:, None]
+        record = IOData(
+            u=clean.u, y=y, dt=0.01, inputs=("u",), outputs=("y",), units={"u": "V", "y": "1"}, open_loop=True
+        )
+        for how, found in inside.items():
+            told = {"states": 2, "descent": 0, "delay": 0, "noise": "output", "uncertainty": how}
+            fit = nn([record], told, seed=seed)
+            found.append(coverage(fit, true))
+            origins[how] = fit.covariance_from
+    assert origins == {"auto": "sandwich", "bootstrap": "bootstrap", "laplace": "information"}
+    share = {k: float(np.mean(v)) for k, v in inside.items()}
+    assert 0.87 <= share["auto"] <= 0.99, share
+    assert 0.87 <= share["bootstrap"] <= 0.99, share
+    assert abs(share["laplace"] - 0.95) > abs(share["auto"] - 0.95), share
+
+
+def test_physics_beside_an_orthogonal_network_is_covered_as_the_projection_it_is() -> None:
+    def made(n: int, seed: int) -> IOData:
+        rng = np.random.default_rng(seed)
+        u, x = coloured(n, seed + 1000, 0.4, 0.9), np.zeros(n)
+        for t in range(1, n):
+            x[t] = 0.8 * x[t - 1] + 0.5 * np.tanh(1.5 * u[t - 1])
+        y = x + 0.01 * rng.standard_normal(n)
+        units = {"u": "V", "y": "1"}
+        return IOData(u=u[:, None], y=y[:, None], dt=0.01, inputs=("u",), outputs=("y",), units=units, open_loop=True)
+
+    long = made(200_000, 0)
+    u, x = long.u[:, 0], np.zeros(200_000)
+    for t in range(1, 200_000):
+        x[t] = 0.8 * x[t - 1] + 0.5 * np.tanh(1.5 * u[t - 1])
+    Z = np.stack([x[:-1], u[:-1], np.ones(199_999)], axis=1)
+    a, b, _ = np.linalg.lstsq(Z, x[1:], rcond=None)[0]
+    errors, spreads = [], []
+    for seed in range(1, 21):
+        told = {"states": 1, "delay": 0, "descent": 0, "neurons": 3, "starts": 1, "residual": "orthogonal"}
+        fit = nn([made(1000, seed)], told, seed=seed)
+        assert fit.model is not None
+        assert fit.sd is not None
+        assert np.sqrt(fit.noise_covariance[0, 0]) < 0.012  # the network has learnt what is left over
+        errors.append(fit.model.theta[:2] - [a, b])
+        spreads.append(fit.sd[:2])
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.mean(spreads, axis=0)
+    assert np.all((ratio > 0.6) & (ratio < 1.7)), ratio  # ten times too small without the projection
+
+
+def test_intervals_of_a_free_run_trained_on_it_cover_the_truth() -> None:
+    def plant(u: np.ndarray) -> np.ndarray:
+        x = np.zeros(u.size)
+        for t in range(1, u.size):
+            x[t] = 0.8 * x[t - 1] + 0.4 * np.tanh(u[t - 1])
+        return x
+
+    u0 = np.random.default_rng(99).standard_normal(60)
+    inside = []
+    for seed in range(16):
+        u = np.random.default_rng(seed).standard_normal(600)
+        record = data(u, plant(u) + coloured(600, seed, 0.1, 0.8))
+        told = {"ny": 1, "nu": 1, "neurons": 2, "focus": "simulation", "held_out": 0.0}
+        fit = narx([record], told, seed=seed)
+        assert fit.model is not None
+        assert fit.covariance is not None
+        theta, U, Y = fit.model.theta, u0[:, None], plant(u0)[:, None]
+        both = [
+            [fit.model.with_theta(theta + s * h).simulate(U, Y)[5::6, 0] for s in (1, -1)]  # type: ignore[attr-defined]
+            for h in 1e-5 * np.eye(theta.size)
+        ]
+        J = np.stack([(p - m) / 2e-5 for p, m in both], axis=1)
+        off = fit.model.simulate(U, Y)[5::6, 0] - Y[5::6, 0]
+        inside.append(np.abs(off) < 1.96 * np.sqrt(np.einsum("tp,pq,tq->t", J, fit.covariance, J)))
+    assert 0.8 <= np.mean(inside) <= 1.0, np.mean(inside)
