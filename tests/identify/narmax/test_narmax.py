@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.identify.blackbox.data import IOData
 from ambid.identify.narmax import Factor, PolynomialNarmax, narmax
 from ambid.identify.narmax.model import Cloud
 from ambid.identify.narmax.recursion import predicted, sensitivities
@@ -245,3 +246,47 @@ def test_settings_that_make_no_sense_are_refused(settings: dict[str, object], sa
         return
     with pytest.raises(EstimationError, match=says):
         narmax([polynomial(200, 0)], settings)
+
+
+def swinging(n: int, seed: int, noise: float, cubic: float) -> tuple[IOData, np.ndarray]:
+    """A damped oscillator sampled at 300 times its frequency, with white noise on the output: fast against its size."""
+    rng = np.random.default_rng(seed)
+    u, x, y = np.repeat(rng.standard_normal(n // 20 + 1), 20)[:n], np.zeros(2), np.zeros(n)
+    for t in range(n):
+        y[t] = x[0]
+        x = x + 0.02 * np.array([x[1], -x[0] - 0.4 * x[1] - cubic * x[0] ** 3 + u[t]])
+    return record(u, y + noise * y.std() * rng.standard_normal(n)), y
+
+
+def test_noise_on_an_output_that_is_sampled_fast_does_not_bias_the_model() -> None:
+    # without innovations from a long model no noise term pays, and the free run is off by most of the output
+    for degree, cubic in ((1, 0.0), (3, 0.3)):
+        found = narmax([swinging(3000, 1, 0.01, cubic)[0]], {"degree": degree})
+        assert found.model is not None
+        assert {"e(t-1)", "e(t-2)"} <= set(found.model.names)
+        fresh, true = swinging(3000, 7, 0.01, cubic)
+        off = (found.model.simulate(fresh.u, fresh.y)[:, 0] - true)[50:]
+        assert np.std(off) < 0.05 * np.std(true)
+        assert float(np.sqrt(found.noise_covariance[0, 0])) < 1.2 * 0.01 * np.std(swinging(3000, 1, 0.01, cubic)[1])
+
+
+def test_where_the_last_output_hides_the_rest_all_candidates_are_looked_at() -> None:
+    # position and current of a magnet: an increment of the position is hidden by its noise, its ratio by the position
+    rng = np.random.default_rng(5)
+    n = 3000
+    u, x, i = np.repeat(rng.standard_normal(n // 10), 10), np.zeros(2), np.zeros(n)
+    z = np.zeros((n, 2))
+    for t in range(n - 1):
+        z[t] = x[0], i[t]
+        i[t + 1] = 0.95 * i[t] + 0.05 * u[t]
+        x = x + np.array([0.01 * x[1], 0.01 * (-x[0] - 0.3 * x[1] + 3.0 * i[t])])
+    z[-1] = x[0], i[-1]
+    data = record(u, z + 0.003 * z.std(axis=0) * rng.standard_normal(z.shape))
+    plain = narmax([data], {"degree": 1, "selection": "frols"})
+    found = narmax([data], {"degree": 1})
+    assert found.model is not None
+    assert found.settings["selection"] == "auto"
+    assert found.criteria == plain.criteria  # made elsewhere
+    assert np.linalg.det(found.noise_covariance) <= np.linalg.det(plain.noise_covariance) * (1.0 + 1e-9)
+    again = narmax([data], {"degree": 1})
+    np.testing.assert_array_equal(again.model.theta, found.model.theta)  # type: ignore[union-attr]

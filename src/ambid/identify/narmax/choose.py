@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
 
 
+_NEARLY_ALL = 0.99  # of the output's energy
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Draft:
     """A model in scaled signals on its way.
@@ -148,6 +151,24 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Draft:
         err=err,
         n_candidates=len(terms),
         passes=passes,
+    )
+
+
+def sampled_fast(draft: Draft) -> bool:
+    """Say whether an output's last value takes so much of an error reduction ratio that the ratios say little.
+
+    Parameters
+    ----------
+    draft : Draft
+        Chosen by the ratios.
+
+    Returns
+    -------
+    bool
+    """
+    return any(
+        len(x) == 1 and x[0].kind == "y" and (x[0].channel, x[0].lag) == (o, 1) and ratio > _NEARLY_ALL
+        for (o, x), ratio in draft.err.items()
     )
 
 

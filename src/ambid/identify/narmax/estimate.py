@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.narmax.choose import Draft, process_terms
+from ambid.identify.narmax.choose import Draft, process_terms, sampled_fast
 from ambid.identify.narmax.costs import stage_costs
 from ambid.identify.narmax.noise_model import with_all_noise, with_noise_terms
 from ambid.identify.narmax.pruning import pruned_by_prediction, pruned_by_simulation
@@ -33,6 +33,10 @@ from ambid.identify.nonlinear.progress import Tick, part_of, portions
 
 Array = NDArray[np.float64]
 
+_CLEAR = 10.0  # of the information criterion, which all candidates have to gain over those of the ratios
+_MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more take minutes
+_PRUNINGS = 6
+_ITERATIONS, _ROUGHLY = 60, 12  # of a search at most; of one between, with terms too many, which creeps
 DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
 
 
@@ -139,6 +143,37 @@ def _linear_start(s: NarmaxSettings, scaled: Scaled) -> Draft:
 def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
     if tick is not None:
         tick("start", 0.0)
+    if s.selection != "auto":
+        _along(s, scaled, work, tick)
+        return
+    first = process_terms(replace(s, selection="frols"), scaled.parts, None)
+    if not sampled_fast(first) or s.kind != "polynomial" or not _few(s, scaled, first):
+        _along(replace(s, selection="frols"), scaled, work, tick)
+        return
+    _along(replace(s, selection="frols"), scaled, work, part_of(tick, 0.0, 0.2))
+    by_ratio, status, curves, focus = work.draft, work.status, len(work.curves), work.focus
+    weight = _weight(scaled, by_ratio, free=False)
+    _along(replace(s, selection="all"), scaled, work, part_of(tick, 0.2, 1.0))
+    gained = _value(s, scaled, by_ratio, weight) - _value(s, scaled, work.draft, weight)
+    if gained > _CLEAR and work.focus == focus:
+        work.warnings.append(
+            "sampled so fast that the last output takes nearly all of an error reduction ratio and hides what drives "
+            "the plant: terms are what is left of all candidates (selection = all), which predict better than those "
+            "chosen by the ratios"
+        )
+        return
+    work.draft, work.status, work.focus = by_ratio, status, focus
+    del work.curves[curves:]
+
+
+def _few(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> bool:
+    """Whether all candidates can be in a model at once."""
+    n = sum(max(y.shape[0] - s.lag, 0) for y, _ in scaled.parts)
+    return bool(draft.n_candidates <= min(_MOST_AT_ONCE, n // 20))
+
+
+def _along(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
+    """All stages, one after the other."""
     terms, below, noise, pruning, free = portions(tick, stage_costs(s, scaled.n_outputs, scaled.parts[0][1].shape[1]))
     with _Timed(work, "terms"):
         if s.selection == "simulation":
@@ -208,7 +243,9 @@ def _keep(work: Work, scaled: Scaled, draft: Draft) -> None:
         work.draft, work.focus = draft, "prediction"
 
 
-def _searched(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, free: bool) -> Draft:
+def _searched(
+    scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, free: bool, most: int = _ITERATIONS
+) -> Draft:
     """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
     t = draft.tables
     if not free and not t.noisy and not any(draft.denominators):
@@ -220,7 +257,7 @@ def _searched(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, fr
     def keep(theta: Array) -> None:
         work.draft, work.focus = draft.with_theta(theta), "simulation" if free else "prediction"
 
-    found = search(t, draft.theta, scaled.parts, weight, free=free, tick=tick, keep=keep)
+    found = search(t, draft.theta, scaled.parts, weight, free=free, most=most, tick=tick, keep=keep)
     if not found.finite:
         return draft
     _note(work, found, n, weight, free=free)
@@ -248,9 +285,14 @@ def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: T
         return draft if fewer is draft else _searched(scaled, fewer, work, part_of(tick, 0.6, 1.0), free=False)
     weight = _weight(scaled, draft, free=False)
 
-    def pruned(d: Draft, share: float, *, noise: bool = True) -> Draft:
-        fewer = pruned_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
-        return _searched(scaled, fewer, work, part_of(tick, share, share + 0.25), free=False)
+    def pruned(d: Draft, share: float, *, noise: bool = True, most: int = _ITERATIONS) -> Draft:
+        for k in range(_PRUNINGS):  # a search between, for what may go is judged where the rest is at its best
+            fewer = pruned_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
+            same, begin = fewer.theta.size == d.theta.size, share + 0.25 * k / _PRUNINGS
+            d = _searched(scaled, fewer, work, part_of(tick, begin, begin + 0.25 / _PRUNINGS), free=False, most=most)
+            if same:
+                break
+        return d
 
     best = pruned(draft, 0.0)
     ended = work.status
@@ -258,8 +300,8 @@ def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: T
     if richer is not draft and draft.tables.noisy:
         # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
         # these are there can the surplus process terms go one by one.
-        other = _searched(scaled, richer, work, part_of(tick, 0.25, 0.5), free=False)
-        other = pruned(pruned(other, 0.5, noise=False), 0.75)
+        other = _searched(scaled, richer, work, part_of(tick, 0.25, 0.5), free=False, most=_ROUGHLY)
+        other = pruned(pruned(other, 0.5, noise=False, most=_ROUGHLY), 0.75)
         if _value(s, scaled, other, weight) < _value(s, scaled, best, weight):
             best, ended = other, work.status
     work.status = ended

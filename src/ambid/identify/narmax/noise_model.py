@@ -16,12 +16,14 @@ from ambid.identify.narmax.choose import Draft, least_squares, redrawn
 from ambid.identify.narmax.recursion import predicted
 from ambid.identify.narmax.selection import select_terms
 from ambid.identify.narmax.settings import NarmaxSettings
-from ambid.identify.narmax.terms import Term, noise_terms
+from ambid.identify.narmax.terms import Term, lagged, noise_terms
 from ambid.identify.nonlinear.progress import Tick, guessed
 
 Array = NDArray[np.float64]
 Parts = Sequence[tuple[Array, Array]]
 
+_LONG = 20  # lags of the model whose errors begin
+_LESS = 0.95  # part of the errors' variance that it must leave
 _ROUNDS = 12
 _USUAL = 3.0  # rounds, about half of those that it takes
 _CHOOSING = 3  # rounds in which the choice of noise terms may still change
@@ -48,6 +50,7 @@ def with_noise_terms(s: NarmaxSettings, draft: Draft, parts: Parts, tick: Tick |
     errors = innovations(draft, parts)
     if not extra or errors is None:
         return draft
+    errors = _of_a_long_model(draft, parts, errors)
     chosen: list[tuple[Term, ...]] = [()] * n_y
     process, last, best = draft.numerators, draft.theta, draft
     targets = [np.concatenate([x[s.lag :, o] for x in y]) for o in range(n_y)]
@@ -75,6 +78,32 @@ def with_noise_terms(s: NarmaxSettings, draft: Draft, parts: Parts, tick: Tick |
         if still and rounds >= _CHOOSING - 1:
             break
     return best
+
+
+def _of_a_long_model(draft: Draft, parts: Parts, errors: list[Array]) -> list[Array]:
+    """First innovations from many linear lags beside the process terms (Hannan and Rissanen 1982), if they are less.
+
+    Where noise on the output is sampled fast, least squares without noise terms is so biased that its errors are nearly
+    white, and no noise term pays beside them.
+    """
+    n = min(int(y.shape[0]) for y, _ in parts)
+    n_y, n_u = len(draft.numerators), draft.n_inputs
+    most = min(_LONG, n // (10 * (n_y + n_u)))
+    if any(draft.denominators) or most <= draft.tables.lag:
+        return errors
+    linear = [(f,) for f in lagged(n_y, n_u, ny=most, nu=most, nk=1, ne=0)]
+    num, theta = [], []
+    for o, terms in enumerate(draft.numerators):
+        all_terms = (*terms, *(x for x in linear if x not in terms))
+        rows = candidates(all_terms, [p[0] for p in parts], [p[1] for p in parts], None, most)
+        target = np.concatenate([y[most:, o] for y, _ in parts])
+        num.append(all_terms)
+        theta.append(least_squares(rows.columns(range(len(all_terms))), target))
+    found = innovations(redrawn(tuple(num), draft.denominators, np.concatenate(theta), draft), parts)
+    if found is None:
+        return errors
+    size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, found)]
+    return found if np.any(size[1] < _LESS * size[0]) else errors
 
 
 def _denominators(s: NarmaxSettings, draft: Draft, parts: Parts) -> tuple[list[Array], list[tuple[Array, ...] | None]]:

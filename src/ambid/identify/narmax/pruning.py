@@ -23,6 +23,10 @@ Parts = Sequence[tuple[Array, Array]]
 _USUAL = 4.0  # terms that are left out, about half of them
 
 
+_TRIED = 10  # coefficients that are tried before it is said that none can go
+_WORSE = 1.2  # times the errors' squares: beyond, leaving one out is far from what the linearised problem says
+
+
 def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Draft:
     """Leave out terms as long as the information criterion of the one-step errors falls.
 
@@ -50,15 +54,23 @@ def pruned_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: s
         may = _may_go(draft) & (noise | ~_noisy(draft))
         if not np.any(may):
             return draft
-        k = int(np.argmin(np.where(may, loss, np.inf)))
         saved = penalty(criterion, draft.theta.size, n, m) - penalty(criterion, draft.theta.size - 1, n, m)
-        if not loss[k] < saved:
-            return draft
-        fewer = draft.without([k], _readjusted(R, draft.theta, k))
-        if not evaluated(fewer.tables, fewer.theta, parts, weight, free=False).finite:
+        order = np.argsort(np.where(may, loss, np.inf), kind="stable")[:_TRIED]
+        fewer = _without_one(draft, [int(k) for k in order if may[k] and loss[k] < saved], R, parts, weight)
+        if fewer is None:
             return draft
         draft = fewer
     return draft
+
+
+def _without_one(draft: Draft, tried: list[int], R: Array, parts: Parts, weight: Array) -> Draft | None:
+    """The draft without the first of the coefficients tried that leaves a predictor which does not run away."""
+    worst = _WORSE * evaluated(draft.tables, draft.theta, parts, weight, free=False).cost
+    for k in tried:
+        fewer = draft.without([k], _readjusted(R, draft.theta, k))
+        if evaluated(fewer.tables, fewer.theta, parts, weight, free=False).cost < worst:
+            return fewer
+    return None
 
 
 def pruned_by_simulation(draft: Draft, parts: Parts, weight: Array, criterion: str, tick: Tick | None) -> Draft:

@@ -165,7 +165,8 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
     if criterion in ("bic", "mdl"):
         return k * log(n)
     if criterion == "ebic":
-        return k * log(n) + 2.0 * (lgamma(m + 1) - lgamma(k + 1) - lgamma(m - k + 1))
+        j = min(k, m // 2)  # beyond, fewer and fewer choices would make terms cheap: none of all could go again
+        return k * log(n) + 2.0 * (lgamma(m + 1) - lgamma(j + 1) - lgamma(m - j + 1))
     if criterion == "aic":
         return 2.0 * k
     if criterion == "aicc":

@@ -12,7 +12,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "criterion": CRITERIA,
     "pruning": ("none", "prediction", "simulation"),
     "kind": ("polynomial", "rational"),
-    "selection": ("frols", "simulation", "all"),
+    "selection": ("auto", "frols", "simulation", "all"),
     "focus": ("prediction", "simulation"),
     "levels": ("auto", "zero", "mean"),
     "output": ("signed", "magnitude", "mean magnitude"),
@@ -51,7 +51,7 @@ class NarmaxSettings:
     criterion: str = "ebic"
     pruning: str = "prediction"
     kind: str = "polynomial"
-    selection: str = "frols"
+    selection: str = "auto"
     focus: str = "prediction"
     levels: str = "auto"
     output: str = "signed"

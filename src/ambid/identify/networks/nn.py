@@ -52,6 +52,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
 }
 _DEFAULTS: Mapping[str, object] = {
     "form": "auto",
+    "output": "signed",
     "connections": "thesis",
     "neurons": 0,
     "residual": "anchored",

@@ -66,7 +66,8 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
             "criterion": "what ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic",
             "pruning": "what decides on terms to leave out again: prediction, simulation, none; prediction",
             "kind": "polynomial or rational; polynomial",
-            "selection": "frols, simulation (by what terms do for the free run), all (every candidate); frols",
+            "selection": "frols (by ratios), simulation (by the free run), all (every candidate), auto (frols; all if a"
+            " plant is sampled so fast that the ratios say little, and all predict better); auto",
             "focus": "prediction or simulation: which errors the coefficients make small at last; prediction",
             "levels": "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
             "output": "magnitude, or mean magnitude (over a sample), where the sensor sees no sign; signed",
