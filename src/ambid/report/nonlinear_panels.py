@@ -26,7 +26,7 @@ from ambid.report._drawing import (
 from ambid.report._panels import Traces
 from ambid.report.nonlinear_parameters import coefficient_text, is_weight
 from ambid.report.numbers import prefixed
-from ambid.validate.nonlinear.runs import model_of
+from ambid.validate.nonlinear.runs import beyond, model_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -283,7 +283,7 @@ def band_panel(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, wher
     assert fit.covariance is not None
     variance = np.maximum(np.einsum("tok,kl,tol->to", slopes, fit.covariance, slopes, optimize=True), 0.0)
     noise = np.maximum(np.diag(fit.noise_covariance), 0.0)
-    outside = model.novelty(data.u, data.y)[first:last] > 1.0
+    outside = beyond(model.novelty(data.u, data.y)[first:last])
     t = np.arange(first, last) * data.dt
     axes = figure.subplots(data.n_outputs, 2, squeeze=False, sharex="col", width_ratios=(3, 2))
     for j, name in enumerate(data.outputs):
@@ -301,8 +301,8 @@ def band_panel(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, wher
             inside = np.where(outside, np.nan, points / scale)
             a.plot(t, inside, ".", color=MEASURED, markersize=3.5, label="measured")
             if np.any(outside):
-                beyond = points[outside] / scale
-                a.plot(t[outside], beyond, "x", color=BOUND, markersize=4, label="measured, outside the training data")
+                far = points[outside] / scale
+                a.plot(t[outside], far, "x", color=BOUND, markersize=4, label="measured, outside the training data")
             a.set_ylabel(f"{name} [{unit}]" if a is axes[j, 0] else f"[{unit}]")
             grid(a)
     for a, title in zip(axes[0], (f"{where}, where errors are largest", "measured - predicted"), strict=True):

@@ -11,6 +11,7 @@ from ambid.errors import EstimationError
 from ambid.identify.narmax.estimate import narmax
 from ambid.validate.blackbox.criteria import criteria
 from ambid.validate.nonlinear import judged, validation
+from ambid.validate.nonlinear.runs import beyond
 from tests.validate.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit
 
 
@@ -159,3 +160,8 @@ def test_short_records_are_judged_without_residual_tests() -> None:
     found = judged(static_fit(Static(), data), [data])
     assert set(found.checks) == {"finite_prediction", "simulation_stable"}
     assert found.criteria
+
+
+def test_the_edge_of_the_training_data_is_not_outside_by_rounding() -> None:
+    found = beyond(np.array([0.3, 1.0, 1.0 + 1e-15, 1.0 + 1e-6, np.nan]))
+    assert found.tolist() == [False, False, False, True, True]

@@ -23,7 +23,7 @@ from ambid.validate.nonlinear.checks import (
     unconverged_warnings,
 )
 from ambid.validate.nonlinear.residual_tests import material, residual_tests
-from ambid.validate.nonlinear.runs import Run, looks_back, model_of, run, sizes
+from ambid.validate.nonlinear.runs import Run, beyond, looks_back, model_of, run, sizes
 
 Array = NDArray[np.float64]
 
@@ -129,7 +129,7 @@ def validation(fit: NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
             )
     found = run(fit, second)
     novelty = model.novelty(second.u, second.y)[found.lag :]
-    share = float(np.mean(~(novelty <= 1.0)))
+    share = float(np.mean(beyond(novelty)))
     one, free = _sizes([second], [found], free=False), _sizes([second], [found], free=True)
     return {
         name: {"one_step": one and one[j], "simulation": free and free[j], "extrapolated": share}

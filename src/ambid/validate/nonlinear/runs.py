@@ -15,6 +15,7 @@ from ambid.validate.prediction import fit_of
 
 Array = NDArray[np.float64]
 
+_ROUNDING = 1e-9  # of a novelty of 1
 _SAME = 1e-9  # one-step prediction against free run, relative to the output's size
 
 
@@ -109,6 +110,23 @@ def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
             f"the record has {data.n_samples} samples; the model looks back over {fit.model.lag}. Give a longer record"
         )
     return fit.model
+
+
+def beyond(novelty: Array) -> NDArray[np.bool_]:
+    """Return where a model extrapolates.
+
+    Parameters
+    ----------
+    novelty : ndarray, shape (n_samples,)
+        As `NonlinearModel.novelty` gives it; the sample at the edge, which has 1, may be above by rounding.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,)
+        True outside the training data, and where novelty is no number.
+    """
+    out: NDArray[np.bool_] = ~(novelty <= 1.0 + _ROUNDING)
+    return out
 
 
 def looks_back(data: IOData, found: Run) -> bool:
