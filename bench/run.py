@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection")
+PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection", "nonlinear")
 
 
 def main(wanted: list[str]) -> None:
@@ -93,6 +93,10 @@ def _measured(part: str) -> Iterator[Any]:
         from selection import selection_tables
 
         return selection_tables()
+    if part == "nonlinear":
+        from nonlinear import nonlinear_tables
+
+        return nonlinear_tables()
     from records import record_tables
 
     return record_tables()
