@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -200,9 +201,57 @@ def test_predictions_near_and_far_are_told_apart(usual):
     assert np.nanmedian(fit.model.novelty(away, data.y)) > 1.5
 
 
+def test_between_set_points_it_interpolates():
+    fit = lpv([record(k, 800, at=p) for k, p in enumerate((0.1, 0.5, 0.9))], KNOWN)
+    between, beyond = record(9, 800, at=0.3), record(9, 800, at=1.3)
+    assert np.mean(fit.model.novelty(between.u, between.y)[fit.model.lag :] > 1.0) < 0.02
+    assert np.all(fit.model.novelty(beyond.u, beyond.y)[fit.model.lag :] > 1.5)
+    upset = replace(between, u=between.u * np.array([10.0, 1.0]), y=10 * between.y)
+    assert np.median(fit.model.novelty(upset.u, upset.y)[fit.model.lag :]) > 1.0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"schedule": "p"}, {"degree": 1}, {"schedule": "p", "degree": 1, "error_order": 0}, {"error_form": "white"}],
+)
+def test_settings_as_used_give_the_same_fit(settings):
+    data = record(0, 400)
+    first = lpv([data], settings)
+    again = lpv([data], first.settings)
+    assert again.settings == first.settings
+    np.testing.assert_allclose(again.model.theta, first.model.theta, rtol=1e-3, atol=1e-4)
+
+
+def test_an_interrupted_fit_says_which_error_model_it_has():
+    def stop(stage, done=None, /):
+        raise KeyboardInterrupt
+
+    found = lpv([record(0, 300)], {"schedule": "p"}, tick=stop)
+    assert {k: found.settings[k] for k in ("error_order", "error_form")} == {"error_order": 0, "error_form": "white"}
+
+
+def test_too_short_for_the_numbers_asked_for():
+    data = record(0, 60)
+    with pytest.raises(EstimationError, match="48 samples are left after lags for 50 numbers"):
+        lpv([data.part(0, 55)], {"schedule": "p", "degree": 8})
+    few = lpv([data.part(0, 28)], {"schedule": "p"})  # a cubic would have more coefficients than there are samples
+    assert few.settings["degree"] == 0
+    json.dumps(few.details, allow_nan=False)
+
+
+def test_a_scheduling_input_alone_is_told_of():
+    data = record(0, 400)
+    alone = replace(data, u=data.u[:, 1:], inputs=("p",), units={"p": "m", "y": "m"})
+    assert any("exciting = yes" in w for w in lpv([alone], {"schedule": "p", "degree": 1}).warnings)
+    told = lpv([alone], {"schedule": "p", "degree": 1, "exciting": "yes"})
+    assert not any("exciting = yes" in w for w in told.warnings)
+
+
 @pytest.mark.parametrize(
     ("settings", "what"),
     [
+        ({"error_form": "white", "error_order": 5}, "error_form = white"),
+        ({"error_degree": 2, "error_order": 0}, "error_degree = 2"),
         ({"schedule": "gap"}, "an input, the output or level"),
         ({"schedule": "p", "time_constant": 0.1}, "time_constant"),
         ({"exciting": "yes"}, "exciting"),

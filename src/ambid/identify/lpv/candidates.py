@@ -198,7 +198,7 @@ def searched(
 
 
 def _noted(work: Work, x: Candidate) -> Candidate:
-    of, found = x.shape, {k: x.value(k) if np.isfinite(x.cost) else None for k in ("aicc", "bic")}
+    of, found = x.shape, {k: v if np.isfinite(v := x.value(k)) else None for k in ("aicc", "bic")}
     work.tried.append({"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found})
     return x
 

@@ -35,13 +35,13 @@ def information(criterion: str, cost: float, n: int, k: int, starts: int = 0) ->
     Returns
     -------
     float
-        The smaller the better.
+        The smaller the better; infinite where there are no more samples than numbers, which fits anything.
     """
-    if not np.isfinite(cost) or cost < 0:
+    if not np.isfinite(cost) or cost < 0 or n <= k + starts + 1:
         return math.inf
     each = math.log(n) if criterion == "bic" else 2.0
     if criterion == "aicc":
-        each *= n / (n - k - 1) if n > k + 1 else math.inf
+        each *= n / (n - k - 1)
     return n * math.log(max(cost / n, 1e-300)) + k * each + 2.0 * starts
 
 

@@ -98,6 +98,7 @@ def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
         if r == 0 and s.column >= 0:
             schedule_over(records, s.schedule, s.column, 0.0)
     data = scaled_records("lpv", records, lag=first)
+    _long_enough(s, shape, sum(x.n_samples - first for x in records))
     tau = 0.0 if s.column >= 0 else (s.time_constant if s.time_constant is not None else 50.0 * records[0].dt)
     work = Work(
         data=data,
@@ -111,6 +112,16 @@ def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
     return work
 
 
+def _long_enough(s: LpvSettings, shape: LpvShape, n: int) -> None:
+    """Refuse records that have no more samples than the numbers asked for: those fit anything."""
+    k = shape.n_theta + s.error_order * (s.error_degree + 1) * (2 if s.error_form == "arma" else 1)
+    if n <= k + 1:
+        raise EstimationError(
+            f"lpv: {n} samples are left after lags for {k} numbers. Give longer records, or lower "
+            f"{'order or error_order' if s.degree is None else 'degree, order or error_order'}"
+        )
+
+
 def _used(s: LpvSettings, work: Work) -> dict[str, object]:
     """Settings with nothing left open."""
     of = work.shape
@@ -119,6 +130,7 @@ def _used(s: LpvSettings, work: Work) -> dict[str, object]:
         **s.as_mapping(),
         "degree": of.degree,
         "time_constant": work.schedule.time_constant,
+        "error_order": max(of.ar, of.ma),
         "form": of.form,
         "error_form": form[of.ar > 0, of.ma > 0],
     }

@@ -178,12 +178,18 @@ class LpvModel:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`: the larger of p's, over half its range, and that of `networks.cloud`."""
+        """As `NonlinearModel.novelty`: the largest of p's, over half its range, and of ellipsoid and hull of the cloud.
+
+        Holes of the cloud do not count: between set points an LPV model interpolates.
+        """
         ys, us = scaled(self, u, y)
         s = self.scheduling(u, y)
         out = np.full(ys.shape[0], np.nan)
         x = regressors(self.shape, ys[:, 0], us, s)
-        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), self.cloud.novelty(x[settling(self.shape) :]))
+        away = x[settling(self.shape) :] - self.cloud.mean
+        ellipsoid = np.linalg.norm(away @ self.cloud.whitening.T, axis=1)
+        hull = np.max(away @ self.cloud.faces.T, axis=1, initial=0.0)
+        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), np.maximum(ellipsoid, hull))
         return out
 
     def scheduling(self, u: Array, y: Array) -> Array:

@@ -93,26 +93,6 @@ class LpvProblem:
             rows.append(np.asarray(np.linalg.qr(R, mode="r"))[k:, k:])
         return triangle_of(rows) * self.weight
 
-    def innovations(self, theta: Array) -> list[Array] | None:
-        """Return the innovations of each record that count.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (n_theta,)
-
-        Returns
-        -------
-        list of ndarray, shape (n_samples - first,), scaled; or None
-            None where the predictor diverges.
-        """
-        out = []
-        for part in self.parts:
-            e = self._solved(part, theta)[1]
-            if e is None:
-                return None
-            out.append(e)
-        return out
-
     def _solved(self, part: Part, theta: Array) -> tuple[Array, Array | None]:
         """Start that explains most, and the innovations with it."""
         k, P = self.shape.n_start, self.shape.n_theta

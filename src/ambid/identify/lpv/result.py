@@ -147,6 +147,11 @@ def _cautions(records: Sequence[IOData], work: Work) -> list[str]:
             f"without an error model (error_order = 0) lpv is biased under feedback unless its {what}, and nothing "
             "says that these records are open loop: raise error_order, or say --open-loop if there was no feedback"
         )
+    if not of.columns and records[0].n_inputs:
+        found.append(
+            f"no input acts on the output: {work.schedule.name!r}, the only one, moves coefficients alone. Say "
+            "exciting = yes if it does, or name the input that does"
+        )
     if of.degree == 0:
         found.append(
             f"no coefficient depends on the scheduling signal {work.schedule.name!r} (degree 0"

@@ -22,7 +22,7 @@ _RANGES: Mapping[str, tuple[float, float]] = {
     "iterations": (1, 2000),
 }
 _CHOICES: Mapping[str, tuple[str, ...]] = {
-    "error_form": ("auto", "ar", "ma", "arma"),
+    "error_form": ("auto", "white", "ar", "ma", "arma"),
     "form": ("auto", "equation", "output"),
     "basis": BASES,
     "exciting": ("no", "yes"),
@@ -101,26 +101,26 @@ def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
         )
     name = str(name)
     column = schedule_column(name, first)
-    if "exciting" in s and column < 0:
+    if s.get("exciting") == "yes" and column < 0:
         raise EstimationError(
-            f"lpv: exciting = {s['exciting']} says whether the scheduling input excites, but schedule = {name} is "
-            "none. Leave it out"
+            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {name} is none. Leave it out"
         )
-    if "time_constant" in s and name != LEVEL:
+    if s.get("time_constant") and name != LEVEL:
         raise EstimationError(
             f"lpv: time_constant is that of schedule = level; with schedule = {name} the column is taken as it is. "
             "Leave it out"
         )
+    error_order, error_form = _error_model(s)
     excites = s.get("exciting", "no") == "yes"
     order = int(s.get("order", 2))
     return LpvSettings(
         order=order,
-        error_order=int(s.get("error_order", 5)),
+        error_order=error_order,
         nb=int(s.get("nb", order)),
         nk=int(s.get("nk", 1)),
         degree=s.get("degree"),
         error_degree=int(s.get("error_degree", 0)),
-        error_form=str(s.get("error_form", "auto")),
+        error_form=error_form,
         form=str(s.get("form", "auto")),
         basis=str(s.get("basis", "legendre")),
         schedule=name,
@@ -131,3 +131,17 @@ def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
         column=column,
         columns=tuple(k for k in range(first.n_inputs) if k != column or excites),
     )
+
+
+def _error_model(s: Mapping[str, Any]) -> tuple[int, str]:
+    """Order and form of the error model; any form of order 0 is white noise."""
+    form = str(s.get("error_form", "auto"))
+    order = int(s.get("error_order", 0 if form == "white" else 5))
+    if order > 0 and form == "white":
+        raise EstimationError(f"lpv: error_form = white has no coefficients, but error_order = {order}. Leave one out")
+    if order == 0 and s.get("error_degree"):
+        raise EstimationError(
+            f"lpv: error_degree = {s['error_degree']} is of the error model's coefficients, and error_order = 0 leaves "
+            "none. Leave one out"
+        )
+    return order, form
