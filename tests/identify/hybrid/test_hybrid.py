@@ -9,11 +9,14 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.identify.hybrid import HybridNarmax, hybrid
+from ambid.identify.hybrid.choice import chosen_noise
 from ambid.identify.hybrid.function import HybridShape
+from ambid.identify.hybrid.result import laplace
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax import Factor, narmax
 from ambid.identify.networks.narx import narx
 from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import NonlinearFit
 from tests.identify.narmax.systems import coefficients, polynomial, record
 
@@ -160,21 +163,67 @@ def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior() -> None:
     shape, theta, y, u = random_model(2, 1, deep=False, ne=1)
     held = np.arange(200) < 150
     at = problem_at(shape, ((y, u), (y[:50], u[:50])), theta, 2.0, counted=(held, np.ones(50, dtype=bool)))
-    at = replace(at, weight=np.array([0.5, 2.0]))
+    at = replace(at, weight=np.array([[0.5, 0.0], [-1.5, 2.0]]))
     R = at.triangle(theta)
     rows = shape.rows(y, u)
     E, T = shape.innovations(theta, rows)
     J = shape.slopes(theta, rows, E, T, slice(None))
     n = 150 - shape.lag
-    first = np.dstack([J, E])[:n].reshape(-1, theta.size + 1) * np.tile(at.weight, n)[:, None]
-    second = np.dstack([J, E])[: 50 - shape.lag].reshape(-1, theta.size + 1)
-    second = second * np.tile(at.weight, 50 - shape.lag)[:, None]
+    weighted = np.einsum("op,tpk->tok", at.weight, np.dstack([J, E]))
+    first, second = (weighted[:k].reshape(-1, theta.size + 1) for k in (n, 50 - shape.lag))
     prior = np.hstack([np.diag(at.precision), -(at.precision * theta)[:, None]])
     whole = np.concatenate([first, second, prior])
     np.testing.assert_allclose(R.T @ R, whole.T @ whole, rtol=1e-9, atol=1e-9)
     assert at.cost(theta) == pytest.approx(float(np.sum(whole[:, -1] ** 2)))
     assert not np.any(at.precision[: shape.n_linear])
     assert isinstance(at, HybridProblem)
+
+
+def two_axes(n: int, seed: int, c: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
+    """Two outputs, each pushed by its own input, with innovations that hang together: y+ = a y + u + e+ + c e."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.uniform(-1.5, 1.5, (n, 2)), np.zeros((n, 2))
+    e = 0.3 * rng.standard_normal((n, 2)) @ np.linalg.cholesky(np.array([[1.0, rho], [rho, 1.0]])).T
+    e[0] = 0
+    for t in range(1, n):
+        y[t] = [0.5, 0.3] * y[t - 1] + u[t - 1] + e[t] + c @ e[t - 1]
+    return y, u
+
+
+def two_lags(*, ne: int) -> HybridShape:
+    terms = tuple(((Factor("y", o, 1),), (Factor("u", o, 1),)) for o in range(2))
+    network = NarxShape(n_outputs=2, n_inputs=2, ny=1, nu=1, nk=1, neurons=0)
+    return HybridShape(terms=terms, ne=ne, network=network)
+
+
+def test_innovations_that_hang_together_are_weighted_as_such() -> None:
+    c, rho, seeds = np.array([[0.5, 0.3], [0.0, 0.6]]), 0.95, 40
+    truth = np.array([0.5, 1.0, 0.3, 1.0, 0.5, 0.3, 0.0, 0.6])
+    shape, z, off = two_lags(ne=1), [], []
+    for seed in range(seeds):
+        y, u = two_axes(300, seed, c, rho)
+        problem = problem_at(shape, ((y, u),), truth, 3.0)
+        theta = search(problem, truth, stage="", most=30).theta
+        P, noise, *_ = laplace(problem, theta)
+        assert P is not None
+        np.testing.assert_allclose(noise[0, 1] / np.sqrt(noise[0, 0] * noise[1, 1]), rho, atol=0.03)
+        z.append((theta - truth) / np.sqrt(np.diag(P)))
+        off.append(theta - truth)
+    gains = np.array(off)[:, [1, 3]]
+    assert np.sqrt(np.mean(gains**2)) < 0.5 * 0.3 / (0.866 * np.sqrt(300))  # half of what each output alone gives
+    assert 0.91 < np.mean(np.abs(z) < 1.96) < 0.98
+    together = np.array(z)[:, 4:]
+    assert 0.8 < np.sqrt(np.mean(together**2)) < 1.18
+
+
+def test_the_order_of_the_noise_model_pays_for_all_outputs_and_is_paid_by_all() -> None:
+    start, orders = np.array([0.5, 1.0, 0.3, 1.0]), []
+    for c in (0.15, 0.0):
+        for seed in range(6):
+            problem = problem_at(two_lags(ne=0), (two_axes(1000, seed, c * np.eye(2), 0.0),), start, 3.0)
+            orders.append(chosen_noise(problem, start, "ebic", None)[0].ne)
+    assert orders[:6].count(1) >= 5  # gain about 2 n c^2 = 45, price 4 log n = 28
+    assert orders[6:].count(0) == 6
 
 
 def test_feedback_does_no_harm_where_the_noise_model_is_right() -> None:

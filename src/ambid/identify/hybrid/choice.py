@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.settings import MOST_NOISE
 from ambid.identify.hybrid.train import HybridProblem, Parts, problem_at, random_start
-from ambid.identify.narmax.selection import information
+from ambid.identify.narmax.selection import penalty
 from ambid.identify.networks.search import Found, search
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
@@ -175,11 +176,12 @@ def learning(found: Found, problem: HybridProblem, stage: str) -> LearningCurve:
     -------
     LearningCurve
     """
-    size = float(np.sqrt(np.mean(problem.weight**2))) if np.isfinite(found.cost) else 1.0
+    noise = np.linalg.inv(problem.weight) if np.isfinite(found.cost) else np.ones((1, 1))  # its square root
+    size = float(np.sqrt(np.sum(noise**2) / noise.shape[0]))
     return LearningCurve(
         method=f"{stage}: Levenberg-Marquardt, prediction errors",
         seconds=np.array(found.seconds),
-        training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) / size,
+        training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) * size,
     )
 
 
@@ -292,8 +294,10 @@ def chosen_noise(problem: HybridProblem, theta: Array, criterion: str, tick: Tic
         at = replace(at, weight=problem.weight)
         found = search(at, start, stage="order of the noise model", most=_FIRST, enough=ROUGH, tick=share)
         n = max(at.n_errors // shape.n_outputs, 2)
-        k = shape.n_linear
-        return information(criterion, found.cost / at.n_errors, k, n, max(k, 1)), found.theta
+        k = shape.n_linear + shape.neurons * shape.n_deep
+        # orders are nested, not chosen out of many; all outputs' errors count, as all their numbers do
+        price = penalty("bic" if criterion == "ebic" else criterion, k, n, max(k, 1))
+        return at.n_errors * log(max(found.cost / at.n_errors, 1e-26)) + price, found.theta
 
     shape = problem.shape
     value, theta = searched(shape, theta, part_of(tick, 0.0, 0.2))

@@ -14,7 +14,7 @@ from ambid.identify.blackbox.data import IOData
 from ambid.identify.hybrid.model import HybridNarmax, units_of
 from ambid.identify.hybrid.revision import SHARED, inflation
 from ambid.identify.hybrid.settings import HybridSettings
-from ambid.identify.hybrid.train import HybridProblem, problem_at
+from ambid.identify.hybrid.train import HybridProblem, problem_at, whitening
 from ambid.identify.narmax.scaled import Scaled
 from ambid.identify.narmax.terms import term_name
 from ambid.identify.networks.cloud import cloud_of
@@ -113,7 +113,7 @@ def laplace(problem: HybridProblem, theta: Array) -> tuple[Array | None, Array, 
     n_terms, n_linear = problem.shape.sizes[0], problem.shape.n_linear
     inflated = np.ones(n_terms)
     for _ in range(2):  # the degrees of freedom are those that the prior leaves
-        at = replace(problem, weight=1.0 / np.sqrt(np.maximum(np.diag(noise), 1e-14)))
+        at = replace(problem, weight=whitening(noise))
         R = at.triangle(theta)[:, :-1]
         P, _condition = information_inverse(R)
         if P is None:

@@ -58,7 +58,8 @@ class Candidates:
         float
             In squared errors of unit variance.
         """
-        n, m = max(problem.n_errors // problem.shape.n_outputs, 2), max(len(self.terms), count)
+        p = problem.shape.n_outputs
+        n, m = max(problem.n_errors // p, 2), max(p * len(self.terms), count)
         return penalty(self.criterion, count, n, m) - penalty(self.criterion, count - 1, n, m)
 
 

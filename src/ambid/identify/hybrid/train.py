@@ -25,6 +25,8 @@ Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
 
 _BLOCK = 4096
+_LEAST = 1e-7  # standard deviation of errors, scaled
+_APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
 _DRAWS = 40  # of a random hidden layer
 _DRAWN_ON = 1000  # rows by which they are compared
 
@@ -37,8 +39,8 @@ class HybridProblem:
     ----------
     shape : HybridShape
     parts : tuple of (outputs, inputs), scaled
-    weight : ndarray, shape (n_outputs,)
-        One over the errors' standard deviation.
+    weight : ndarray, shape (n_outputs, n_outputs)
+        By which errors are multiplied, so that they have unit variance and do not hang together.
     prior : float
         Standard deviation of the network's weights before the data.
     base : ndarray, shape (n_theta,)
@@ -131,7 +133,7 @@ class HybridProblem:
             return np.inf
         with np.errstate(over="ignore", invalid="ignore"):
             found = float(np.sum((self.precision * whole)[self.live] ** 2))
-            found += sum(float(np.sum((e * self.weight) ** 2)) for e in self.errors(whole))
+            found += sum(float(np.sum((e @ self.weight.T) ** 2)) for e in self.errors(whole))
         return found if np.isfinite(found) else np.inf
 
     def triangle(self, theta: Array) -> Array:
@@ -165,8 +167,8 @@ class HybridProblem:
             part = slice(k, min(k + _BLOCK, E.shape[0]))
             D = s.slopes(theta, rows, E, T, part, before)
             before = D[D.shape[0] - s.ne :].copy() if s.ne else None
-            J = D[counts[part]] * self.weight[:, None]
-            r = (E[part][counts[part]] * self.weight).reshape(-1, 1)
+            J = np.matmul(self.weight, D[counts[part]])
+            r = (E[part][counts[part]] @ self.weight.T).reshape(-1, 1)
             both = np.hstack([J.reshape(r.size, -1), r])[:, columns]
             if both.shape[0]:
                 out.append(triangle_of([both]))
@@ -180,7 +182,7 @@ class HybridProblem:
         return out
 
     def at(self, theta: Array, live: NDArray[np.bool_] | None = None) -> Self:
-        """Return the problem around other numbers, its errors there of unit variance.
+        """Return the problem around other numbers, its errors there of unit covariance.
 
         Parameters
         ----------
@@ -193,7 +195,7 @@ class HybridProblem:
         HybridProblem
         """
         live = self.live if live is None else live
-        return replace(self, base=theta, live=live, weight=unit_weight(self.errors(theta)))
+        return replace(self, base=theta, live=live, weight=weight_of(self.errors(theta)))
 
 
 def problem_at(
@@ -205,7 +207,7 @@ def problem_at(
     live: NDArray[np.bool_] | None = None,
     counted: tuple[NDArray[np.bool_], ...] | None = None,
 ) -> HybridProblem:
-    """Return the problem whose errors have unit variance at given numbers.
+    """Return the problem whose errors have unit covariance at given numbers.
 
     Parameters
     ----------
@@ -224,13 +226,13 @@ def problem_at(
     """
     every = np.ones(shape.n_theta, dtype=np.bool_)
     one = HybridProblem(
-        shape=shape, parts=parts, weight=np.ones(shape.n_outputs), prior=prior, base=theta, live=every, counted=counted
+        shape=shape, parts=parts, weight=np.eye(shape.n_outputs), prior=prior, base=theta, live=every, counted=counted
     )
     return one.at(theta, every if live is None else live)
 
 
-def unit_weight(errors: list[Array]) -> Array:
-    """Return one over the root mean square of the errors of each output; 1 where they are not finite.
+def weight_of(errors: list[Array]) -> Array:
+    """Return what makes errors of unit covariance; the identity where they are not finite.
 
     Parameters
     ----------
@@ -238,11 +240,30 @@ def unit_weight(errors: list[Array]) -> Array:
 
     Returns
     -------
-    ndarray, shape (n_outputs,)
+    ndarray, shape (n_outputs, n_outputs)
     """
+    whole = np.concatenate(errors)
     with np.errstate(over="ignore", invalid="ignore"):
-        size = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
-    out: Array = 1.0 / np.where(np.isfinite(size), np.maximum(size, 1e-7), 1.0)
+        noise = whole.T @ whole / max(whole.shape[0], 1)
+    return whitening(noise) if np.all(np.isfinite(noise)) else np.eye(whole.shape[1])
+
+
+def whitening(noise: Array) -> Array:
+    """Return W, lower triangular, with W noise W' = 1.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (n_outputs, n_outputs), scaled
+
+    Returns
+    -------
+    ndarray, shape (n_outputs, n_outputs)
+        Finite also where errors vanish, or are the same in several outputs.
+    """
+    size = np.maximum(np.sqrt(np.diag(noise)), _LEAST)
+    alike = (1.0 - _APART) * noise / size[:, None] / size
+    np.fill_diagonal(alike, 1.0)
+    out: Array = np.linalg.inv(np.linalg.cholesky(alike)) / size
     return out
 
 
@@ -296,6 +317,6 @@ def _linear_rows(problem: HybridProblem, theta: Array, columns: NDArray[np.intp]
     for k, rows in enumerate(problem.rows()):
         E, T = s.innovations(theta, rows)
         D, counts = s.slopes(theta, rows, E, T, some)[:, :, columns], problem.counts(k)[some]
-        A.append((D * problem.weight[:, None])[counts].reshape(-1, columns.size))
-        r.append((E[some] * problem.weight)[counts].ravel())
+        A.append(np.matmul(problem.weight, D[counts]).reshape(-1, columns.size))
+        r.append((E[some][counts] @ problem.weight.T).ravel())
     return np.concatenate(A), np.concatenate(r)
