@@ -24,9 +24,9 @@ def test_the_prototypes_rig_is_written_and_its_controller_takes_it(bench, ambid)
         (("record.csv", "--preset", "prototype"), "both a record and --preset were given"),
         (
             ("--preset", "prototyp"),
-            "--preset 'prototyp' has no rig file; there is one of prototype. Did you mean 'prototype'?",
+            "--preset 'prototyp' is no bench; there are thesis, unstable-bearing,",
         ),
-        (("--preset", "rmit"), "there is one of prototype."),
+        (("--preset", "prototyp"), "Did you mean 'prototype'?"),
         (("--preset", "prototype", "--rate", "100"), "--rate and --gaps are for reading a record"),
     ],
 )

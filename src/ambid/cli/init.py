@@ -11,7 +11,7 @@ from ambid.cli.options import Gaps, Rate
 from ambid.cli.output import Outputs
 from ambid.errors import AmbidError, nearest
 
-_PRESETS = ("prototype",)  # those whose rig is among the package's data
+_WIRED = ("prototype",)  # presets with a controller, whose rig is among the package's data
 
 
 def command(
@@ -27,7 +27,7 @@ def command(
         typer.Option(
             "--preset",
             metavar="NAME",
-            help="Instead of a record: the rig of a bench with a controller (prototype).",
+            help="Instead of a record: the rig of a bench that 'ambid models' lists; prototype has a controller.",
             show_default=False,
         ),
     ] = None,
@@ -38,7 +38,7 @@ def command(
     """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
     if (record is None) == (preset is None):
         given = "both a record and --preset were given" if record is not None else "neither a record nor --preset given"
-        raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_PRESETS[0]}")
+        raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_WIRED[0]}")
     if preset is not None and (rate is not None or gaps is not None):
         raise AmbidError("--rate and --gaps are for reading a record; with --preset none is read. Leave them out")
     with Outputs(record) as outputs:
@@ -50,8 +50,11 @@ def command(
             outputs.stage_text(rig, text)
     if rig is None:
         typer.echo(text, nl=False)
-    elif record is None:
+    elif preset in _WIRED:
         typer.echo(f"{rig} written; change what differs on your bench. Then: ambid commission --rig {rig} --port PORT")
+    elif record is None:
+        law = " --nonlinear" if "\n[magnet]" in text else ""
+        typer.echo(f"{rig} written; change what differs on your bench. Then: ambid simulate {rig} -o RECORD{law}")
     else:
         open_points = [
             line for line in text.splitlines() if "CHECK" in line.partition("#")[2] and not line.startswith("# G")
@@ -72,9 +75,14 @@ def _of_record(record: Path | None, rate: Rate, gaps: Gaps) -> str:
 def _of_preset(name: str) -> str:
     from importlib.resources import files
 
-    if name not in _PRESETS:
+    from ambid.physics.presets import preset, preset_names
+    from ambid.rig import preset_text
+
+    if name not in preset_names():
         raise AmbidError(
-            f"--preset {name!r} has no rig file; there is one of {', '.join(_PRESETS)}.{nearest(name, _PRESETS)}"
-            f" Give --preset {_PRESETS[0]}, or RECORD"
+            f"--preset {name!r} is no bench; there are {', '.join(preset_names())}.{nearest(name, preset_names())}"
+            " Give one of them, or RECORD"
         )
+    if name not in _WIRED:
+        return preset_text(preset(name))
     return files("ambid").joinpath("data", f"{name}.toml").read_text(encoding="utf-8")

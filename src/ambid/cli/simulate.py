@@ -104,8 +104,18 @@ def command(
         typer.Option("--loop", help="With or without the controller.", show_default="as the bench usually works"),
     ] = None,
     nonlinear: Annotated[
-        bool, typer.Option("--nonlinear", help="The nonlinear magnet instead of its linearisation (presets only).")
+        bool,
+        typer.Option("--nonlinear", help="The nonlinear magnet, of a rig its [magnet], instead of its linearisation."),
     ] = False,
+    position: Annotated[
+        float | None,
+        typer.Option(
+            "--position",
+            metavar="M",
+            help="With --nonlinear: where the loop holds the rotor, in m.",
+            show_default="the operating point's",
+        ),
+    ] = None,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records.
 
@@ -117,18 +127,20 @@ def command(
     preset, closed = preset_of(rig), None if loop is None else loop == "closed"
     if scenario is not None:
         _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
-                               "--periods": None if periods == 1 else periods})  # fmt: skip
+                               "--position": position, "--periods": None if periods == 1 else periods})  # fmt: skip
         course = Course(scenario, duration, rate, amplitude, at, size, seed, closed, log_excitation)
         simulate_course(course, preset, rig, record)
         return
     _refuse("a simulation without --scenario", {"--at": at, "--size": size})
+    if not nonlinear:
+        _refuse("a simulation without --nonlinear", {"--position": position})
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
         outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"))
         respond, rate_hz, limits, point = (
-            _of_preset(preset, rate, seed, closed, nonlinear)
+            _of_preset(preset, rate, seed, closed, nonlinear, position)
             if preset
-            else _of_rig(Path(rig), rate, seed, closed, nonlinear)
+            else _of_rig(Path(rig), rate, seed, closed, nonlinear, position)
         )
         n = _samples(duration, rate_hz)
         shape = _repeated(
@@ -152,10 +164,14 @@ def _refuse(of: str, given: Mapping[str, object]) -> None:
             raise AmbidError(f"{of} has no {option}. Leave {option} out")
 
 
-def _of_preset(preset: Preset, rate: float | None, seed: int, closed: bool | None, nonlinear: bool) -> tuple[Any, ...]:
+def _of_preset(
+    preset: Preset, rate: float | None, seed: int, closed: bool | None, nonlinear: bool, position: float | None
+) -> tuple[Any, ...]:
     from ambid.simulate import simulate_preset
 
     rate_hz = preset.rate_hz if rate is None else rate
+    if position is not None and preset.plant is not None:
+        preset = replace(preset, operating_point=preset.plant.equilibrium(position))
 
     def respond(u: Array) -> Simulation:
         return simulate_preset(preset, u, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
@@ -163,21 +179,24 @@ def _of_preset(preset: Preset, rate: float | None, seed: int, closed: bool | Non
     return respond, rate_hz, preset.limits, preset.operating_point
 
 
-def _of_rig(path: Path, rate: float | None, seed: int, closed: bool | None, nonlinear: bool) -> tuple[Any, ...]:
+def _of_rig(
+    path: Path, rate: float | None, seed: int, closed: bool | None, nonlinear: bool, position: float | None
+) -> tuple[Any, ...]:
     from ambid.rig import load_rig
     from ambid.simulate import simulate_rig
+    from ambid.simulate.rig_bench import parts_of_rig
 
     rig = load_rig(path)
+    if position is not None:
+        rig = replace(rig, operating_point={**rig.operating_point, "position": position})
     rate_hz = rig.record.rate_hz if rate is None else rate
     if rate_hz is None:
         raise AmbidError(f"rig {path} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
-    if nonlinear:
-        raise AmbidError(f"rig {path} describes a linear model; only presets are nonlinear. Leave --nonlinear out")
 
     def respond(u: Array) -> Simulation:
-        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed)
+        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed, nonlinear=nonlinear)
 
-    return respond, rate_hz, rig.limits, None
+    return respond, rate_hz, rig.limits, parts_of_rig(rig, closed, nonlinear=nonlinear)[2]
 
 
 def _largest(respond: Respond, shape: Array, limits: Limits | None, point: OperatingPoint | None) -> float:

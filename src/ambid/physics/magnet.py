@@ -75,8 +75,8 @@ class CoEnergy:
         j = self.i0_asym + i
         return self.k_a * (self.i0 + j) / (self.s_a - x) - self.k_b * (self.i0 - j) / (self.s_b + x) + self.leakage * i
 
-    def inductance(self, x: Number) -> Number:
-        """Return L = dlambda/di in H at `x` in m; it does not depend on the current."""
+    def inductance(self, x: Number, i: Number | float = 0.0) -> Number:  # noqa: ARG002  (other laws saturate)
+        """Return L = dlambda/di in H at `x` in m; here it does not depend on the current `i` in A."""
         return self.k_a / (self.s_a - x) + self.k_b / (self.s_b + x) + self.leakage
 
     def force_per_current(self, x: Number, i: Number) -> Number:
@@ -92,11 +92,39 @@ class CoEnergy:
         return -(self.k_a * (self.i0 + j) ** 2 * a * a * a + self.k_b * (self.i0 - j) ** 2 * b * b * b)
 
 
+class Energy(Protocol):
+    """What a plant asks of a co-energy: itself and its derivatives at a position in m and an axis current in A."""
+
+    def value(self, x: Number, i: Number) -> Number:
+        """Return W' in J at `x` and `i`."""
+        ...
+
+    def force(self, x: Number, i: Number) -> Number:
+        """Return dW'/dx in N along +x at `x` and `i`."""
+        ...
+
+    def flux_linkage(self, x: Number, i: Number) -> Number:
+        """Return dW'/di in V s at `x` and `i`."""
+        ...
+
+    def inductance(self, x: Number, i: Number | float = 0.0) -> Number:
+        """Return d2W'/di2 in H at `x` and `i`."""
+        ...
+
+    def force_per_current(self, x: Number, i: Number) -> Number:
+        """Return d2W'/dx di in N/A at `x` and `i`."""
+        ...
+
+    def displacement_coefficient(self, x: Number, i: Number) -> Number:
+        """Return -d2W'/dx2 in N/m at `x` and `i`."""
+        ...
+
+
 class Magnet(Protocol):
     """What a plant asks of a magnet."""
 
     @property
-    def coenergy(self) -> CoEnergy:
+    def coenergy(self) -> Energy:
         """Co-energy as a function of position and axis current."""
         ...
 

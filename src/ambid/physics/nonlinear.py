@@ -37,7 +37,7 @@ class NonlinearPlant:
     Attributes
     ----------
     magnet : Magnet
-        `SingleMagnet` or `DifferentialPair`.
+        `SingleMagnet`, `DifferentialPair`, or any law of `coenergy_law` as `LawMagnet`.
     m : float
         Mass in kg.
     R : float
@@ -93,7 +93,7 @@ class NonlinearPlant:
         x, v, i = state
         w = self.magnet.coenergy
         acceleration = (w.force(x, i) - self.c * v + force) / self.m + self.gravity
-        return v, acceleration, (voltage - self.R * i - w.force_per_current(x, i) * v) / w.inductance(x)
+        return v, acceleration, (voltage - self.R * i - w.force_per_current(x, i) * v) / w.inductance(x, i)
 
     def equilibrium(self, position: float) -> OperatingPoint:
         """Return the rest point at `position`.
@@ -114,7 +114,8 @@ class NonlinearPlant:
             If the position closes a gap or the magnet cannot hold the load there.
         """
         current = self.magnet.holding_current(position, self.m * self.gravity)
-        return OperatingPoint(position, current, self.R * current + self.stage.drop(current))
+        voltage = self.R * current + float(self.stage.drop(current)) - self.stage.offset
+        return OperatingPoint(position, current, voltage)
 
     def linearise(self, position: float) -> dict[str, float]:
         """Return the parameters of the linear model ``one-axis`` at the rest point (thesis eq. 4.8).
@@ -138,7 +139,7 @@ class NonlinearPlant:
             "k_x": w.displacement_coefficient(x, i),
             "k_i": w.force_per_current(x, i),
             "R": self.R + self.stage.slope(i),
-            "L": w.inductance(x),
+            "L": w.inductance(x, i),
             "c": self.c,
         }
 

@@ -1,8 +1,8 @@
 """What a power stage makes of the voltage that it is told to give: limits, and a drop against the current.
 
 A transistor that conducts, a diode that carries on, and the dead time between two transistors all act against the
-current, whatever its size: the coil gets v = clip(u, low, high) - v_drop tanh(i/i_drop). For a dead time t_d of a half
-bridge on the supply V_s at the switching frequency f_s, v_drop is V_s t_d f_s (Jeong and Park 1991); drops of
+current, whatever its size: the coil gets v = clip(u, low, high) + offset - v_drop tanh(i/i_drop). For a dead time t_d
+of a half bridge on the supply V_s at the switching frequency f_s, v_drop is V_s t_d f_s (Jeong and Park 1991); drops of
 semiconductors add to it. The sign changes smoothly over i_drop, which is about the ripple of the current: within it,
 both signs occur in every period. For a pair, i is the current of the axis, so this is the stage of a differential
 winding; where each coil has its own stage and its current never changes sign, the drops are constant and cancel.
@@ -22,7 +22,7 @@ from ambid.physics.magnet import Number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerStage:
-    """Limits and drop of a power stage.
+    """Limits, drop and offset of a power stage.
 
     Attributes
     ----------
@@ -32,19 +32,23 @@ class PowerStage:
         Voltage in V that is lost against the current.
     i_drop : float
         Current in A over which that loss changes its sign.
+    offset : float
+        Voltage in V that acts beside the one that is commanded.
     """
 
     limits: Interval = UNLIMITED
     v_drop: float = 0.0
     i_drop: float = 0.02
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.limits[0] < self.limits[1]:
             raise ModelError(
                 f"stage.limits is {self.limits} V; the lower must be below the upper. Swap or correct them"
             )
-        if not math.isfinite(self.v_drop):
-            raise ModelError(f"stage.v_drop is {self.v_drop} V; it must be a finite number. Correct it")
+        for name, value in (("v_drop", self.v_drop), ("offset", self.offset)):
+            if not math.isfinite(value):
+                raise ModelError(f"stage.{name} is {value} V; it must be a finite number. Correct it")
         if not (math.isfinite(self.i_drop) and self.i_drop > 0.0):
             raise ModelError(f"stage.i_drop is {self.i_drop} A; it must be a positive number. Correct it")
 

@@ -3,6 +3,7 @@
 from ambid.rig.bench import bench_record, mat_variables, read_bench
 from ambid.rig.draft import draft_rig
 from ambid.rig.load import default_rig, load_rig, rig_from_text
+from ambid.rig.preset_rig import preset_text, rig_of_preset
 from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet
 from ambid.rig.write import rig_text, write_rig
 
@@ -17,8 +18,10 @@ __all__ = [
     "draft_rig",
     "load_rig",
     "mat_variables",
+    "preset_text",
     "read_bench",
     "rig_from_text",
+    "rig_of_preset",
     "rig_text",
     "write_rig",
 ]

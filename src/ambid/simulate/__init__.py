@@ -6,6 +6,7 @@ from ambid.simulate.levels import largest_amplitude, noise_at_snr
 from ambid.simulate.plant import LinearPlant
 from ambid.simulate.poles import closed_loop_matrix, closed_loop_poles
 from ambid.simulate.rig_bench import simulate_rig
+from ambid.simulate.rig_magnet import plant_of_rig
 from ambid.simulate.scenario_run import ScenarioBlock, scenario_blocks, simulate_scenario, truth_columns
 from ambid.simulate.scenarios import Scenario, scenario, scenario_names
 from ambid.simulate.schedule import Schedule
@@ -29,6 +30,7 @@ __all__ = [
     "largest_amplitude",
     "losses",
     "noise_at_snr",
+    "plant_of_rig",
     "scenario",
     "scenario_blocks",
     "scenario_names",

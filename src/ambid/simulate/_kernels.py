@@ -3,26 +3,42 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ambid.physics.coenergy_law import coenergy_derivatives
+
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+# Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
+_energy: Callable[..., None] = njit(cache=True, nogil=True)(coenergy_derivatives)
+
+
+@njit(cache=True, nogil=True)
+def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
+    """Return force, k_i and L of a `CoEnergy` (7 numbers) or a `LawMagnet` (12), as `Standing.nonlinear` has them."""
+    if magnet.size > 7:
+        w, dw = np.empty(12), np.empty((7, 9))
+        _energy(x - magnet[11], i, magnet, magnet[9] != 0.0, magnet[10] != 0.0, w, dw)
+        return w[0], w[2], w[3]
+    j = magnet[6] + i
+    gap_a, gap_b = 1.0 / (magnet[1] - x), 1.0 / (magnet[3] + x)
+    flux_a, flux_b = (magnet[4] + j) * gap_a, (magnet[4] - j) * gap_b
+    pull = 0.5 * (magnet[0] * flux_a * flux_a - magnet[2] * flux_b * flux_b)
+    motional = magnet[0] * flux_a * gap_a + magnet[2] * flux_b * gap_b
+    return pull, motional, magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
 
 
 @njit(cache=True, nogil=True)
 def rate_of_change(
     x: float, v: float, i: float, p: float, voltage: float, force: float, magnet: Array, body: Array
 ) -> tuple[float, float, float]:
-    """Return x'', i' and p' of the nonlinear plant (`ambid.physics.magnet.CoEnergy`); p lags the force."""
-    j = magnet[6] + i
-    gap_a, gap_b = 1.0 / (magnet[1] - x), 1.0 / (magnet[3] + x)
-    flux_a, flux_b = (magnet[4] + j) * gap_a, (magnet[4] - j) * gap_b
-    pull = 0.5 * (magnet[0] * flux_a * flux_a - magnet[2] * flux_b * flux_b)
-    motional = magnet[0] * flux_a * gap_a + magnet[2] * flux_b * gap_b
-    inductance = magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
+    """Return x'', i' and p' of the nonlinear plant; p lags the force."""
+    pull, motional, inductance = magnet_at(x, i, magnet)
     lag = 0.0
     if body[4] < math.inf:
         lag = body[4] * (pull - p)
@@ -103,7 +119,7 @@ def advance_nonlinear(
         length = period * (fraction if part == 0 else 1.0 - fraction)
         if length == 0.0:
             continue
-        voltage = min(max(late if part == 0 else now, body[7]), body[8]) + disturbance[1]
+        voltage = min(max(late if part == 0 else now, body[7]), body[8]) + body[9] + disturbance[1]
         h = length / substeps
         for _ in range(substeps):
             if v == 0.0 and (p >= high or p <= low):

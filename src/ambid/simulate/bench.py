@@ -24,6 +24,7 @@ from ambid.record.record import Record
 from ambid.simulate._logging import drawn_noise, logged, written
 from ambid.simulate.plant import LinearPlant, Standing
 from ambid.simulate.poles import closed_loop_poles
+from ambid.simulate.rig_magnet import nonlinear_truth
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,8 @@ class Simulation:
     state_names : tuple of str
         Names of the columns of `states`.
     truth : Mapping[str, float]
-        Parameters of the (linearised) model in SI units, and ``delay`` in samples.
+        Parameters of the (linearised) model in SI units, ``delay`` in samples, and of a nonlinear plant the numbers of
+        its law, as `nonlinear_truth` has them.
     first_contact : int or None
         First sample at which the rotor lies at, or has come back from, a stop.
     first_saturated : int or None
@@ -100,6 +102,7 @@ def simulate(
     setpoint: ArrayLike | None = None,
     start: ArrayLike | None = None,
     substeps: int = 1,
+    current_offset: float = 0.0,
 ) -> Simulation:
     """Simulate a plant in open or closed loop.
 
@@ -130,6 +133,8 @@ def simulate(
         Initial state; default at rest at the operating point. With an eddy pole its force comes last.
     substeps : int
         Runge-Kutta steps in each sample (nonlinear only).
+    current_offset : float
+        What the current sensor shows without current, in A; the controller knows what it shows at rest.
 
     Returns
     -------
@@ -152,6 +157,9 @@ def simulate(
         raise ModelError(f"rate_hz {rate_hz} and substeps {substeps} must be positive. Correct them")
     of, period, whole = standing.model, 1.0 / rate_hz, math.floor(loop.delay)
     sensor, disturbance = drawn_noise(of, noise, u.size, rate_hz, seed)
+    if current_offset and "current" in of.outputs:
+        sensor[:, of.outputs.index("current")] += current_offset
+        u += loop.kc * current_offset
     measured, command, states, contact, first, count, lost = run(
         standing.linear,
         u,
@@ -180,7 +188,9 @@ def simulate(
             f"the simulation leaves the air gap or the finite numbers at sample {lost} ({lost / rate_hz:.6g} s); an"
             " unstable plant needs a loop, and stops in the gap. Give limits.position, another loop, or more substeps"
         )
-    truth = {**standing.parameters(), "delay": loop.delay}
+    linear = {**standing.parameters(), "delay": loop.delay}
+    more = {} if isinstance(plant, LinearPlant) else nonlinear_truth(plant)
+    truth = {**linear, **more, **({"i_offset": current_offset} if current_offset else {})}
     settings = {"rate_hz": rate_hz, "loop": written(loop), "noise": written(noise), "limits": written(limits)}
     return Simulation(
         record=logged(standing, command, measured, rate_hz, seed, settings),
@@ -191,7 +201,7 @@ def simulate(
         first_saturated=None if first < 0 else first,
         n_saturated=count,
         n_over_current=_beyond(of, states, limits),
-        largest_pole=float(np.abs(closed_loop_poles(truth, loop, rate_hz, of=of.name)[0])),
+        largest_pole=float(np.abs(closed_loop_poles(linear, loop, rate_hz, of=of.name)[0])),
     )
 
 

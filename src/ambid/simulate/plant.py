@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from ambid.errors import ModelError
 from ambid.physics.discretise import discretise
+from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import LinearModel
+from ambid.physics.magnet import CoEnergy
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
@@ -128,15 +130,29 @@ class Standing:
         return full, now, late, noise
 
     def nonlinear(self) -> tuple[Array, Array]:
-        """Return the numbers of co-energy, shape (7,), and of body and stage, shape (9,); zeros for a linear plant.
+        """Return the numbers of the magnet, and of body and stage, for compiled loops; zeros for a linear plant.
 
-        Body and stage are m, c, R, gravity, eddy pole, v_drop, i_drop, and the stage's limits.
+        Returns
+        -------
+        magnet : ndarray, shape (7,) or (12,)
+            k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a `CoEnergy`, or `LawMagnet.vector`; SI.
+        body : ndarray, shape (10,)
+            m, c, R, gravity, eddy pole, v_drop, i_drop, the stage's limits and its offset; SI.
+
+        Raises
+        ------
+        ModelError
+            If the co-energy is neither.
         """
         if isinstance(self.plant, LinearPlant):
-            return np.zeros(7), np.zeros(9)
+            return np.zeros(7), np.zeros(10)
         w, p = self.plant.magnet.coenergy, self.plant
+        if isinstance(w, LawMagnet):
+            magnet = w.vector
+        elif isinstance(w, CoEnergy):
+            magnet = np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage, w.i0_asym])
+        else:
+            raise ModelError(f"a {type(w).__name__} cannot be simulated. Give a CoEnergy or a LawMagnet")
         stage = p.stage
-        return (
-            np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage, w.i0_asym]),
-            np.array([p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits]),
-        )
+        body = [p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits, stage.offset]
+        return magnet, np.array(body)

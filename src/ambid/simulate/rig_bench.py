@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.errors import RigError
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
-from ambid.physics.nonlinear import OperatingPoint
+from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.bench import Simulation, simulate
 from ambid.simulate.plant import LinearPlant
+from ambid.simulate.rig_magnet import current_offset, enough_steps, plant_of_rig, rest_of_rig
 from ambid.units import parse_unit
 
 Array = NDArray[np.float64]
@@ -35,15 +36,18 @@ def simulate_rig(
     seed: int | np.random.Generator,
     closed: bool | None = None,
     setpoint: ArrayLike | None = None,
+    nonlinear: bool = False,
+    substeps: int | None = None,
 ) -> Simulation:
-    """Simulate the linear model of a rig about its operating point.
+    """Simulate the linear model of a rig about its operating point, or the nonlinear plant of its ``[magnet]``.
 
-    A value that the operating point does not give is zero; a voltage that it does not give is R times the current.
+    Linear: a value that the operating point does not give is zero; a voltage that it does not give is R times the
+    current. Nonlinear: it gives the position alone, current and voltage are those that hold the rotor there.
 
     Parameters
     ----------
     rig : Rig
-        Every parameter needs a value, whatever its role.
+        Every parameter needs a value, whatever its role; a nonlinear plant the numbers that `plant_of_rig` names.
     excitation : array_like, shape (n_samples,), in the unit of the model's input
         Added at the controller's output.
     rate_hz : float
@@ -54,6 +58,10 @@ def simulate_rig(
         Closed or open loop; default closed where the rig has a loop and does not say ``open_loop``.
     setpoint : array_like, shape () or (n_samples,), in m, optional
         Wanted position; default the operating point's.
+    nonlinear : bool
+        Simulate the nonlinear plant instead of the linear one.
+    substeps : int, optional
+        Runge-Kutta steps in each sample (nonlinear only); default what the plant's rates ask for.
 
     Returns
     -------
@@ -67,7 +75,9 @@ def simulate_rig(
     ModelError
         As `ambid.simulate.simulate`.
     """
-    plant, loop, point = parts_of_rig(rig, closed)
+    plant, loop, point = parts_of_rig(rig, closed, nonlinear=nonlinear)
+    if isinstance(plant, NonlinearPlant) and substeps is None:
+        substeps = enough_steps(plant, point, rate_hz)
     done = simulate(
         plant,
         excitation,
@@ -78,6 +88,8 @@ def simulate_rig(
         noise=rig.noise,
         operating_point=point,
         setpoint=setpoint,
+        substeps=substeps or 1,
+        current_offset=current_offset(rig) if nonlinear else 0.0,
     )
     wanted = np.broadcast_to(
         np.asarray(point.position if setpoint is None else setpoint, dtype=np.float64), done.record.n_samples
@@ -85,7 +97,17 @@ def simulate_rig(
     return replace(done, record=as_columns(done.record, rig, wanted))
 
 
-def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | None, OperatingPoint]:
+@overload
+def parts_of_rig(
+    rig: Rig, closed: bool | None, *, nonlinear: Literal[False] = False
+) -> tuple[LinearPlant, Loop | None, OperatingPoint]: ...
+@overload
+def parts_of_rig(
+    rig: Rig, closed: bool | None, *, nonlinear: bool
+) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]: ...
+def parts_of_rig(
+    rig: Rig, closed: bool | None, *, nonlinear: bool = False
+) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]:
     """Return what a rig gives a simulation.
 
     Parameters
@@ -94,10 +116,12 @@ def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | Non
         Every parameter needs a value, whatever its role.
     closed : bool or None
         Closed or open loop; None: closed where the rig has a loop and does not say ``open_loop``.
+    nonlinear : bool
+        The nonlinear plant and its rest point, as `simulate_rig`.
 
     Returns
     -------
-    plant : LinearPlant
+    plant : LinearPlant or NonlinearPlant
         With the rig's parameters.
     loop : Loop or None
         The controller, or its delay alone.
@@ -109,6 +133,14 @@ def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | Non
     RigError
         If a parameter has no value, or a closed loop is asked for and the rig has none.
     """
+    loop = rig.loop
+    if closed and (loop is None or not loop.closed):
+        raise RigError(f"rig {rig.name!r} has no [loop] with a gain; a closed loop needs one. Add it, or simulate open")
+    if loop is not None and (rig.open_loop if closed is None else not closed):
+        loop = loop.opened()
+    if nonlinear:
+        body = plant_of_rig(rig)
+        return body, loop, rest_of_rig(rig, body)
     values = {p.name: p.value for p in rig.parameters}
     parameters = {name: value for name, value in values.items() if value is not None}
     missing = [name for name in values if name not in parameters]
@@ -117,11 +149,6 @@ def parts_of_rig(rig: Rig, closed: bool | None) -> tuple[LinearPlant, Loop | Non
             f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a simulation needs every parameter. Give"
             " value = ..."
         )
-    if closed and (rig.loop is None or not rig.loop.closed):
-        raise RigError(f"rig {rig.name!r} has no [loop] with a gain; a closed loop needs one. Add it, or simulate open")
-    loop = rig.loop
-    if loop is not None and (rig.open_loop if closed is None else not closed):
-        loop = loop.opened()
     plant = LinearPlant(model=model(rig.model), parameters=parameters)
     rest = dict(rig.operating_point)
     rest.setdefault("voltage", parameters.get("R", 0.0) * rest.get("current", 0.0))

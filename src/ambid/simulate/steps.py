@@ -44,7 +44,7 @@ def advance_plant(
         Held over the sample; of the nonlinear plant force, then voltage.
     matrices : tuple of ndarray
         A (n_states, n_states), B and B_late (n_states,), E (n_states, n_disturbances), as `Standing.matrices` has them.
-    magnet, body : ndarray, shapes (7,) and (9,)
+    magnet, body : ndarray, shapes (7,) or (12,), and (10,)
         As `Standing.nonlinear` has them.
     timing : (float, float, int)
         Fraction of the period in which the earlier voltage acts, period in s, Runge-Kutta steps.

@@ -16,7 +16,7 @@ from ambid.acquire.devices.benches import Bench, bench_of
 from ambid.acquire.layout import has_position
 from ambid.acquire.scales import Scale, scale_of
 from ambid.errors import DeviceError
-from ambid.physics.magnet import DifferentialPair
+from ambid.physics.magnet import CoEnergy, DifferentialPair
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset
@@ -101,6 +101,11 @@ def _plant(bench: Bench) -> Iterator[str]:
     if isinstance(plant, NonlinearPlant):
         w = plant.magnet.coenergy
         pair = isinstance(plant.magnet, DifferentialPair)
+        if not isinstance(w, CoEnergy):
+            raise DeviceError(
+                f"bench {bench.name!r} has a magnet with another law; the emulated one knows ideal ones. Simulate it"
+                " with ambid.simulate"
+            )
         if (pair and (w.k_a != w.k_b or w.i0_asym != 0.0)) or plant.stage != IDEAL or math.isfinite(plant.eddy_pole):
             raise DeviceError(
                 f"bench {bench.name!r} has unequal magnets, an eddy pole or a lossy stage; the emulated one knows none"
