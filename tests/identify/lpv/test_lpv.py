@@ -239,6 +239,15 @@ def test_too_short_for_the_numbers_asked_for():
     json.dumps(few.details, allow_nan=False)
 
 
+def test_short_records_are_not_given_a_model_that_looks_back_over_all_of_them():
+    several = [record(k, 40) for k in range(8)]
+    fit = lpv(several, {"schedule": "p"})
+    assert fit.model.lag + 20 <= 40
+    assert judged(fit, several).fit
+    with pytest.raises(EstimationError, match="record 1 has 40 samples; 50 are needed"):
+        lpv(several, {"schedule": "p", "form": "output", "error_form": "ma"})
+
+
 def test_a_scheduling_input_alone_is_told_of():
     data = record(0, 400)
     alone = replace(data, u=data.u[:, 1:], inputs=("p",), units={"p": "m", "y": "m"})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.identify.blackbox.data import IOData
 from ambid.identify.lpv.beginning import beginning, settling
 from ambid.identify.lpv.choice import information, slowest_mode, slowest_that_does, time_constants
 from ambid.identify.lpv.estimate import lpv
@@ -15,7 +16,7 @@ from ambid.identify.lpv.start import padded
 from tests.identify.lpv.plants import record
 
 
-def shape_of(form="output", ar=2, ma=1, degree=1, error_degree=0, basis="legendre"):
+def shape_of(form="output", ar=2, ma=1, degree=1, error_degree=0, basis="legendre", offset="scheduled"):
     return LpvShape(
         columns=(0,),
         order=2,
@@ -27,6 +28,7 @@ def shape_of(form="output", ar=2, ma=1, degree=1, error_degree=0, basis="legendr
         error_degree=error_degree,
         form=form,
         basis=basis,
+        offset=offset,
     )
 
 
@@ -51,7 +53,8 @@ def signals(n=60, seed=1):
 def by_hand(shape, theta, y, u, s):
     """The difference equations as `shape` writes them, with loops."""
     phi, psi = (basis_values(s, k + 1, shape.basis) for k in (shape.degree, shape.error_degree))
-    c = [(phi if k < shape.n_process else psi) @ theta[shape.place(k)] for k in range(len(shape.coefficients))]
+    places = [theta[shape.place(k)] for k in range(len(shape.coefficients))]
+    c = [(phi if k < shape.n_process else psi)[:, : x.size] @ x for k, x in enumerate(places)]
     a1, a2, b1, b2, offset, d1, d2, c1 = c
     x, e = y.copy(), np.zeros(y.size)
     for t in range(2, y.size):
@@ -66,8 +69,11 @@ def by_hand(shape, theta, y, u, s):
 @pytest.mark.parametrize("form", ["equation", "output"])
 @pytest.mark.parametrize("basis", ["legendre", "hats"])
 @pytest.mark.parametrize("error_degree", [0, 2])
-def test_innovations_are_those_of_the_equations(form, basis, error_degree):
-    shape = shape_of(form, degree=2, error_degree=error_degree, basis=basis)
+@pytest.mark.parametrize("offset", ["scheduled", "constant"])
+def test_innovations_are_those_of_the_equations(form, basis, error_degree, offset):
+    shape = shape_of(form, degree=2, error_degree=error_degree, basis=basis, offset=offset)
+    assert shape.n_theta == len(shape.names) == theta_of(shape).size
+    assert shape.place(shape.n_process - 1).stop == shape.n_process_theta
     y, u, s = signals()
     theta = theta_of(shape)
     found = errors(shape, part_of(shape, y, u, s), theta)
@@ -81,8 +87,9 @@ def test_innovations_are_those_of_the_equations(form, basis, error_degree):
 @pytest.mark.parametrize("form", ["equation", "output"])
 @pytest.mark.parametrize(("ar", "ma"), [(0, 0), (2, 0), (0, 1), (2, 1)])
 @pytest.mark.parametrize("error_degree", [0, 1])
-def test_derivatives_are_exact(form, ar, ma, error_degree):
-    shape = shape_of(form, ar=ar, ma=ma, degree=2, error_degree=error_degree)
+@pytest.mark.parametrize("offset", ["scheduled", "constant"])
+def test_derivatives_are_exact(form, ar, ma, error_degree, offset):
+    shape = shape_of(form, ar=ar, ma=ma, degree=2, error_degree=error_degree, offset=offset)
     y, u, s = signals()
     part, theta = part_of(shape, y, u, s), theta_of(shape)
     start = 0.3 * np.arange(1.0, shape.n_start + 1)
@@ -214,6 +221,36 @@ def test_the_output_itself_may_schedule():
     np.testing.assert_allclose(
         fit.model.scheduling(data.u, data.y)[1:], fit.model.schedule.scaled(data.y[:-1, 0]), atol=1e-14
     )
+
+
+def test_what_follows_the_last_output_has_standard_deviations_that_hold():
+    """y = 0.9 y1 - 0.1 y1^2 - 0.2 y2 + (0.5 + 0.1 y1) u1 + 0.3 + e: a_1(p) y1 with p = y1 holds all of c(p) but 0.3."""
+    found = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        u, e, y = rng.standard_normal((500, 1)), 0.1 * rng.standard_normal(500), np.zeros(500)
+        for t in range(2, 500):
+            y[t] = (
+                0.9 * y[t - 1]
+                - 0.1 * y[t - 1] ** 2
+                - 0.2 * y[t - 2]
+                + (0.5 + 0.1 * y[t - 1]) * u[t - 1, 0]
+                + 0.3
+                + e[t]
+            )
+        data = IOData(
+            u=u, y=y[:, None], dt=0.01, inputs=("u",), outputs=("y",), units={"u": "V", "y": "m"}, open_loop=True
+        )
+        fit = lpv([data], {"schedule": "y", "degree": 1, "form": "equation", "error_form": "ar", "error_order": 1})
+        assert fit.model.shape.n_offset == 1
+        for p in (0.2, 1.2):
+            at = fit.model.at(p, fit.covariance)
+            found.append([(at.a[2] - 0.2) / at.a_sd[2], (at.b[0, 0] - 0.5 - 0.1 * p) / at.b_sd[0, 0]])
+        run = fit.model.simulate(u, y[:, None])[:, 0]
+        np.testing.assert_allclose(run[fit.model.lag :], y[fit.model.lag :], atol=1.0)
+    z = np.array(found)
+    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.99
+    assert np.all((z.std(axis=0) > 0.75) & (z.std(axis=0) < 1.25))
 
 
 @pytest.mark.parametrize("basis", ["legendre", "hats"])

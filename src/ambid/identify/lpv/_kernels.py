@@ -58,14 +58,15 @@ def run(
 ) -> bool:  # fmt: skip
     """Write x, predictions g, innovations e and, with `slopes`, the derivatives J of g; False where they diverge.
 
-    `shape` = (na, nd, nc, own, m): m samples before the first x, m + nd before the first e. theta holds, for each of
-    a_1 ... a_na and the columns of W, one number for each column of phi; then for each of d_1 ... and c_1 ... one for
-    each column of psi. `start` holds what x differs from y before m (output form, own = 1), then the innovations before
-    the first. J (n_samples, n_theta + n_start): all columns with slopes = 2, those of `start` alone with 1.
+    `shape` = (na, nd, nc, own, m, K_c): m samples before the first x, m + nd before the first e. theta holds, for each
+    of a_1 ... a_na and the columns of W, one number for each column of phi, of which the ones have K_c; then for each
+    of d_1 ... and c_1 ... one for each column of psi. `start` holds what x differs from y before m (output form,
+    own = 1), then the innovations before the first. J (n_samples, n_theta + n_start): all columns with slopes = 2,
+    those of `start` alone with 1.
     """
-    na, nd, nc, own, m = shape[0], shape[1], shape[2], shape[3], shape[4]
+    na, nd, nc, own, m, K_c = shape[0], shape[1], shape[2], shape[3], shape[4], shape[5]
     n, n_w, K, Q, lag = y.size, W.shape[1], phi.shape[1], psi.shape[1], m + nd
-    n_p, n_x = (na + n_w) * K, own * na
+    n_p, n_x = (na + n_w - 1) * K + K_c, own * na
     P = n_p + (nd + nc) * Q
     width = P + n_x + nc
     a, d, c = np.empty(max(na, 1)), np.empty(max(nd, 1)), np.empty(max(nc, 1))
@@ -94,7 +95,7 @@ def run(
             s -= a[k] * (x[t - 1 - k] if own == 1 else y[t - 1 - k])
         for i in range(n_w):
             b = 0.0
-            for j in range(K):
+            for j in range(K if i < n_w - 1 else K_c):
                 b += theta[(na + i) * K + j] * phi[t, j]
             s += b * W[t, i]
         if not abs(s) < _FAR:
@@ -109,7 +110,7 @@ def run(
                     for j in range(K):
                         dx[now, k * K + j] = z * phi[t, j]
                 for i in range(n_w):
-                    for j in range(K):
+                    for j in range(K if i < n_w - 1 else K_c):
                         dx[now, (na + i) * K + j] = W[t, i] * phi[t, j]
             if own == 1:
                 for k in range(na):
@@ -155,7 +156,7 @@ def run(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def free_run(
-    y: Array, W: Array, s: Array, K: int, hats: int, theta: Array, na: int, first: int, share: float,
+    y: Array, W: Array, s: Array, K: int, K_c: int, hats: int, theta: Array, na: int, first: int, share: float,
     middle: float, half: float,
 ) -> None:  # fmt: skip
     """Write the free run into y from sample `first` on; NaN from a divergence on.
@@ -172,7 +173,7 @@ def free_run(
                 p = 0.0
                 for k in range(na):
                     p -= theta[k * K + j] * y[t - 1 - k]
-                for i in range(n_w):
+                for i in range(n_w if j < K_c else n_w - 1):
                     p += theta[(na + i) * K + j] * W[t, i]
                 x += p * phi[j]
             if not abs(x) < _FAR:

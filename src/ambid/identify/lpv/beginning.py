@@ -34,6 +34,20 @@ def settling(shape: LpvShape) -> int:
     return _EACH * shape.n_start
 
 
+def looks_back(shape: LpvShape) -> int:
+    """Return the samples of the past that a prediction needs, those of the beginning included.
+
+    Parameters
+    ----------
+    shape : LpvShape
+
+    Returns
+    -------
+    int
+    """
+    return shape.lag + settling(shape)
+
+
 def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False) -> tuple[Array, Array] | None:
     """Estimate what was before a record.
 
@@ -54,7 +68,7 @@ def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False
         Instead of both, where the predictor diverges.
     """
     k, P = shape.n_start, shape.n_theta
-    last = shape.lag + settling(shape)
+    last = looks_back(shape)
     if not k or part.y.size < last:
         return np.zeros(k), np.zeros((k, P))
     head = replace(part, y=part.y[:last], W=part.W[:last], phi=part.phi[:last], psi=part.psi[:last])

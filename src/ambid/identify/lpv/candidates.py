@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
+from ambid.identify.lpv.beginning import looks_back
 from ambid.identify.lpv.choice import error_orders, information, slowest_mode, slowest_that_does, time_constants
 from ambid.identify.lpv.problem import LpvProblem
 from ambid.identify.lpv.schedule import Schedule, schedule_over
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 
 _DEGREES = (0, 1, 2, 3)
 _USUAL = 8.0  # iterations, half of what a search takes
+_FEWEST = 20  # predictions that the shortest record has to leave for a form to be tried
 _ENOUGH = 0.5  # gain of a candidate's criterion by an iteration below which it is judged
 
 
@@ -320,6 +322,25 @@ def _from_best(
     return searched(work, shape, start, s.iterations, tick, stage)
 
 
+def wanted_shapes(s: LpvSettings, base: LpvShape) -> list[LpvShape]:
+    """Return a shape with the forms and error models that are asked for.
+
+    Parameters
+    ----------
+    s : LpvSettings
+    base : LpvShape
+
+    Returns
+    -------
+    list of LpvShape
+    """
+    return [
+        replace(base, form=form, ar=ar, ma=ma)
+        for form in (("equation", "output") if s.form == "auto" else (s.form,))
+        for ar, ma in error_orders(s.error_form, s.error_order)
+    ]
+
+
 def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> Candidate:
     """Fit the forms and error models that are asked for.
 
@@ -338,11 +359,8 @@ def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> C
     Candidate
         The best.
     """
-    wanted = [
-        replace(best.shape, form=form, ar=ar, ma=ma)
-        for form in (("equation", "output") if s.form == "auto" else (s.form,))
-        for ar, ma in error_orders(s.error_form, s.error_order)
-    ]
+    shortest = min(x.n_samples for x in work.records)
+    wanted = [x for x in wanted_shapes(s, best.shape) if looks_back(x) + _FEWEST <= shortest]
     steps = [  # on the way to both, each alone: from there the search does not end in a poor optimum
         replace(x, ar=ar, ma=ma)
         for x in wanted
@@ -373,7 +391,7 @@ def by_form(s: LpvSettings, work: Work, best: Candidate, tick: Tick | None) -> C
 
 
 def _process(x: Candidate) -> Array:
-    return x.theta[: x.shape.n_process * (x.shape.degree + 1)]
+    return x.theta[: x.shape.n_process_theta]
 
 
 def _named(shape: LpvShape) -> str:

@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.lpv.candidates import Work, by_degree, by_form, chosen_level, other_degrees, searched
+from ambid.identify.lpv.beginning import looks_back
+from ambid.identify.lpv.candidates import (
+    Work,
+    by_degree,
+    by_form,
+    chosen_level,
+    other_degrees,
+    searched,
+    wanted_shapes,
+)
 from ambid.identify.lpv.result import finished
-from ambid.identify.lpv.schedule import schedule_over
+from ambid.identify.lpv.schedule import Schedule, schedule_over
 from ambid.identify.lpv.settings import LpvSettings, lpv_settings
 from ambid.identify.lpv.shape import LpvShape
 from ambid.identify.lpv.start import least_squares
@@ -87,9 +96,11 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
 
 def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
     """A model by least squares: something to hand over when the very next thing is an interruption."""
+    tau = 0.0 if s.column >= 0 else (s.time_constant if s.time_constant is not None else 50.0 * records[0].dt)
+    last = Schedule(name=s.schedule, column=s.column, time_constant=tau, low=0.0, high=0.0).share(records[0].dt) == 1.0
     shape = LpvShape(
         columns=s.columns, order=s.order, nb=s.nb, nk=s.nk, ar=0, ma=0, degree=s.degree or 0,
-        error_degree=s.error_degree, form="equation", basis=s.basis,
+        error_degree=s.error_degree, form="equation", basis=s.basis, offset="constant" if last else "scheduled",
     )  # fmt: skip
     first = shape.first + s.error_order
     for r, x in enumerate(records):  # before it is said that a scheduling column does not excite
@@ -97,9 +108,8 @@ def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
             scaled_records("lpv", records, lag=first)
         if r == 0 and s.column >= 0:
             schedule_over(records, s.schedule, s.column, 0.0)
-    data = scaled_records("lpv", records, lag=first)
+    data = scaled_records("lpv", records, lag=max(first, min(looks_back(x) for x in wanted_shapes(s, shape))))
     _long_enough(s, shape, sum(x.n_samples - first for x in records))
-    tau = 0.0 if s.column >= 0 else (s.time_constant if s.time_constant is not None else 50.0 * records[0].dt)
     work = Work(
         data=data,
         records=records,

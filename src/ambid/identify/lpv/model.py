@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.lpv.beginning import beginning, settling
+from ambid.identify.lpv.beginning import beginning, looks_back, settling
 from ambid.identify.lpv.frozen import Frozen, frozen
 from ambid.identify.lpv.schedule import BASES, Schedule, basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors, part_of
@@ -69,7 +69,7 @@ class LpvModel:
     @property
     def lag(self) -> int:
         """Samples of the past that a prediction needs."""
-        return self.shape.lag + settling(self.shape)
+        return looks_back(self.shape)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -165,6 +165,7 @@ class LpvModel:
             of.lagged_inputs(us),
             np.ascontiguousarray(s),
             of.degree + 1,
+            of.n_offset,
             BASES.index(of.basis),
             self.theta / self.unit,
             of.order,
@@ -249,14 +250,15 @@ class LpvModel:
 
 def _read(found: Mapping[str, Any]) -> dict[str, Any]:
     """What the model is made with, checked."""
-    m, words = int(found["n_inputs"]), ("form", "basis")
+    m, words = int(found["n_inputs"]), ("form", "basis", "offset")
     sizes: dict[str, Any] = {k: int(v) for k, v in found["shape"].items() if k not in ("columns", *words)}
     columns = tuple(int(k) for k in found["shape"]["columns"])
     texts: dict[str, Any] = {k: str(found["shape"][k]) for k in words}
     shape = LpvShape(columns=columns, **sizes, **texts)
     schedule = Schedule(**found["schedule"])
-    if shape.basis not in BASES or shape.form not in ("equation", "output") or not schedule.high > schedule.low:
-        raise ValueError("form, basis or range of the schedule make no sense")
+    known = {"basis": BASES, "form": ("equation", "output"), "offset": ("scheduled", "constant")}
+    if any(getattr(shape, k) not in v for k, v in known.items()) or not schedule.high > schedule.low:
+        raise ValueError("form, basis, offset or range of the schedule make no sense")
     if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes.values()) < 0:
         raise ValueError("columns or orders make no sense")
     n = {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": 1, "y_scale": 1}

@@ -39,6 +39,8 @@ class LpvShape:
     form : {"equation", "output"}
         Whether v enters the difference equation or the output.
     basis : {"legendre", "hats"}
+    offset : {"scheduled", "constant"}
+        Whether c is a function of p. Where p is the last output itself c(p) says nothing that a_1(p) y(t - 1) does not.
     """
 
     columns: tuple[int, ...]
@@ -51,6 +53,7 @@ class LpvShape:
     error_degree: int
     form: str
     basis: str
+    offset: str = "scheduled"
 
     @property
     def first(self) -> int:
@@ -68,9 +71,19 @@ class LpvShape:
         return self.order + len(self.columns) * self.nb + 1
 
     @property
+    def n_offset(self) -> int:
+        """Functions of p in the constant."""
+        return 1 if self.offset == "constant" else self.degree + 1
+
+    @property
+    def n_process_theta(self) -> int:
+        """Number of parameters of A, B and the constant, which are the first ones."""
+        return (self.n_process - 1) * (self.degree + 1) + self.n_offset
+
+    @property
     def n_theta(self) -> int:
         """Number of parameters."""
-        return self.n_process * (self.degree + 1) + (self.ar + self.ma) * (self.error_degree + 1)
+        return self.n_process_theta + (self.ar + self.ma) * (self.error_degree + 1)
 
     @property
     def n_start(self) -> int:
@@ -88,11 +101,11 @@ class LpvShape:
     @property
     def names(self) -> tuple[str, ...]:
         """Of the parameters: coefficient and number of the function of p."""
-        return tuple(
-            f"{x}[{j}]"
-            for k, x in enumerate(self.coefficients)
-            for j in range((self.degree if k < self.n_process else self.error_degree) + 1)
-        )
+        found = []
+        for k, x in enumerate(self.coefficients):
+            where = self.place(k)
+            found += [f"{x}[{j}]" for j in range(where.stop - where.start)]
+        return tuple(found)
 
     def place(self, coefficient: int) -> slice:
         """Return where the parameters of a coefficient stand in theta.
@@ -106,10 +119,10 @@ class LpvShape:
         -------
         slice
         """
-        K, Q, n = self.degree + 1, self.error_degree + 1, self.n_process
+        K, Q, n, last = self.degree + 1, self.error_degree + 1, self.n_process, self.n_process_theta
         if coefficient < n:
-            return slice(coefficient * K, (coefficient + 1) * K)
-        return slice(n * K + (coefficient - n) * Q, n * K + (coefficient - n + 1) * Q)
+            return slice(coefficient * K, min((coefficient + 1) * K, last))
+        return slice(last + (coefficient - n) * Q, last + (coefficient - n + 1) * Q)
 
     def lagged_inputs(self, u: Array) -> Array:
         """Return the inputs that each sample depends on, and a column of ones.
@@ -137,9 +150,10 @@ class LpvShape:
 
         Returns
         -------
-        ndarray of int, shape (5,)
+        ndarray of int, shape (6,)
         """
-        return np.array([self.order, self.ar, self.ma, int(self.form == "output"), self.first], dtype=np.int64)
+        own = int(self.form == "output")
+        return np.array([self.order, self.ar, self.ma, own, self.first, self.n_offset], dtype=np.int64)
 
 
 def stable_process(shape: LpvShape, theta: Array) -> bool:

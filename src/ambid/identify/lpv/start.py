@@ -41,7 +41,7 @@ def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> tuple[A
     cost : float
         Sum of squared errors.
     """
-    n = shape.n_process * (shape.degree + 1)
+    n = shape.n_process_theta
     found, cost = _solved([_process_rows(shape, p, p.y, first) for p in parts], [p.y[first:] for p in parts])
     theta = np.zeros(shape.n_theta)
     theta[:n] = found
@@ -122,7 +122,7 @@ def by_long_regression(shape: LpvShape, parts: Sequence[Part], first: int) -> Ar
         for i in range(inputs):  # the first lag of each input, put back further
             newest = p.W[:, i * shape.nb, None]
             by += [newest[begin - k : end - k] * p.phi[begin:] for k in range(shape.nb + lags)]
-        rows.append(np.hstack([*by, p.phi[begin:]]))
+        rows.append(np.hstack([*by, p.phi[begin:, : shape.n_offset]]))
         targets.append(p.y[begin:])
     long = _solved(rows, targets)[0]
     again, goal = [], []
@@ -187,8 +187,8 @@ def _process_rows(shape: LpvShape, part: Part, z: Array, first: int) -> Array:
     n = part.y.size
     phi = part.phi[first:]
     by = [-z[first - k : n - k, None] * phi for k in range(1, shape.order + 1)]
-    by += [part.W[first:, i, None] * phi for i in range(part.W.shape[1])]
-    return np.hstack(by)
+    by += [part.W[first:, i, None] * phi for i in range(part.W.shape[1] - 1)]
+    return np.hstack([*by, phi[:, : shape.n_offset]])
 
 
 def _solved(rows: Sequence[Array], targets: Sequence[Array]) -> tuple[Array, float]:
