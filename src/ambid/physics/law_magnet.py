@@ -174,4 +174,4 @@ class LawMagnet:
         w, dw = np.zeros(len(ORDERS)), np.zeros((len(SLOPED), len(MAGNET_NUMBERS)))
         q, exponential = self.law.vector(self.values), self.law.gap == "exponential"
         coenergy_derivatives(float(x) - self.x_offset, float(i), q, exponential, self.law.pair, w, dw)
-        return w
+        return w.tolist()

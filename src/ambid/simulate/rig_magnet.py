@@ -203,20 +203,19 @@ def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
     Returns
     -------
     Mapping[str, float]
-        SI: those of the law and g; of the others those that are not zero.
+        SI: those of the law and g, of the others those that are not zero; and R, without what a drop adds to it.
     """
     magnet, stage, w = plant.magnet, plant.stage, plant.magnet.coenergy
-    found: dict[str, float] = {}
     if isinstance(magnet, LawMagnet):
-        found |= {"L_leak": 0.0, **magnet.values, "x_offset": magnet.x_offset}
+        found = {"L_leak": 0.0, **magnet.values, "x_offset": magnet.x_offset}
         kept = {*magnet.law.names[:2], "L_leak", "g"}
     elif isinstance(w, CoEnergy) and (w.k_a == 0.0 or w.s_a == w.s_b):
-        found |= law_numbers(w)
+        found = law_numbers(w)
         kept = {"k", "s", "L_leak", "g"}
     else:
-        return found
+        return {}
     found |= {"a": plant.eddy_pole if math.isfinite(plant.eddy_pole) else 0.0, "v_offset": stage.offset}
     found |= {"v_drop": stage.v_drop, "i_drop": stage.i_drop if stage.v_drop else 0.0}
     found["g"] = plant.gravity
     names = [spec.name for spec in BEARING_NUMBERS if spec.name in found]
-    return {n: found[n] for n in names if found[n] != 0.0 or n in kept}
+    return {"R": plant.R, **{n: found[n] for n in names if found[n] != 0.0 or n in kept}}
