@@ -60,5 +60,7 @@ def sandwiched(problem: NarxProblem, theta: Array) -> Array | None:
     ndarray, shape (n_theta, n_theta), or None
         None where the data and the prior together leave a direction open.
     """
-    scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in problem.sample_rows(theta)]
-    return sandwich(problem.triangle(theta)[:, :-1], scores, np.diag(problem._precision() ** 2))[0]
+    rows = problem.sample_rows(theta)
+    scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
+    prior = np.diag(problem._precision() ** 2)
+    return sandwich(problem.triangle(theta)[:, :-1], scores, prior, [r[:, :, :-1] for r in rows])[0]

@@ -12,7 +12,7 @@ from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import Orthogonal, Ridge, units
 from ambid.identify.networks.search import information_inverse
 from ambid.identify.networks.segments import StateProblem
-from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance
+from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance, widening
 from ambid.identify.nonlinear.progress import Tick
 
 Array = NDArray[np.float64]
@@ -94,19 +94,23 @@ def _projection(state: State, problem: StateProblem) -> Array:
     rows = {r: [k for k, (row, _) in enumerate(layout.entries) if row == r] for r in layout.rows}
     X, _ = problem.errors(state.vector)
     m = layout.matrices(state.theta)
-    scores, inverse = [], np.zeros((layout.n_theta, layout.n_theta))
+    scores, slopes, roots = [], [], np.zeros((layout.n_theta, layout.n_theta))
     for x, shot in zip(X, problem.shots, strict=True):
         z = np.hstack([x[:-1], shot.u])
         G = units(z[:, :-1], m.W1, m.b1, layout.anchored)[0] @ m.W2.T
-        own = np.zeros((z.shape[0], layout.n_theta))
+        own = np.zeros((z.shape[0], len(rows), layout.n_theta))
+        left = np.empty((z.shape[0], len(rows)))
         for j, at in enumerate(rows.values()):
-            Z = z[:, [layout.entries[k][1] for k in at]]
-            own[:, at] = Z * (layout.rates[j] * G[:, j])[:, None]
-            inverse[np.ix_(at, at)] += Z.T @ Z
-        scores.append(own)
-    for at in rows.values():
-        inverse[np.ix_(at, at)] = np.linalg.pinv(inverse[np.ix_(at, at)], hermitian=True)
-    found: Array = inverse @ score_covariance(scores, _LONG) @ inverse
+            own[:, j, at] = z[:, [layout.entries[k][1] for k in at]]
+            left[:, j] = layout.rates[j] * G[:, j]
+        scores.append(left)
+        slopes.append(own)
+    for j, at in enumerate(rows.values()):
+        Z = np.concatenate([s[:, j, at] for s in slopes])
+        roots[np.ix_(at, at)] = np.linalg.pinv(np.linalg.qr(Z, mode="r"))
+    slopes = [s @ roots for s in slopes]
+    pulls = [np.einsum("tjk,tj->tk", s, e) for s, e in zip(slopes, scores, strict=True)]
+    found: Array = roots @ (score_covariance(pulls, _LONG, slopes) * widening(pulls, _LONG)) @ roots.T
     return found
 
 
@@ -118,7 +122,7 @@ def _sandwich(problem: StateProblem, v: Array) -> Array:
         if isinstance(p, Ridge):  # what keeps the network orthogonal is no knowledge that could be wrong
             J = p.rows(v[: problem.layout.n_theta])[0]
             prior[: J.shape[1], : J.shape[1]] += J.T @ J
-    found = sandwich(problem.triangle(v)[:, :-1], scores, prior)[0]
+    found = sandwich(problem.triangle(v)[:, :-1], scores, prior, [r[:, :, :-1] for r in rows])[0]
     assert found is not None
     return found
 

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.nn_train import State, added_gain, added_network, descended, trained, white
+from ambid.identify.networks.nn_hidden import added_network
+from ambid.identify.networks.nn_train import State, added_gain, descended, trained, white
 from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.shooting import shooting
 from ambid.identify.networks.start import Start, start_free

@@ -1,4 +1,4 @@
-"""The stages of training a state-space network: weights and first states by Levenberg-Marquardt, gain, hidden layer."""
+"""The stages of training a state-space network: weights and first states by Levenberg-Marquardt, then gain."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.layout import Layout
 from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.residual import STIFF, Orthogonal, Ridge, orthogonal_to_physics
+from ambid.identify.networks.residual import Orthogonal, Ridge
 from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import Penalty, StateProblem, largest_pole, shots
 from ambid.identify.networks.start import carried_to_continuous, widened
@@ -314,64 +314,6 @@ def descended(state: State, data: Scaled, iterations: int) -> tuple[tuple[Learni
             both = A * size[:n, None] / size[:n], B * size[:n, None] / size[n:]
         found[name] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
     return curves, found
-
-
-def added_network(
-    state: State,
-    data: Scaled,
-    neurons: int,
-    prior: float,
-    anchored: bool,
-    *,
-    seed: list[int],
-    iterations: int,
-    tick: Tick | None,
-) -> Trained:
-    """Add a hidden layer to the physics and train both.
-
-    Parameters
-    ----------
-    state : State
-        With or without a hidden layer, which is begun anew.
-    data : Scaled
-    neurons : int
-    prior : float
-        Deviation of the hidden layer's weights before the data.
-    anchored : bool
-        Else orthogonal to what the free weights explain.
-    seed : list of int
-    iterations : int
-    tick : callable or None
-
-    Returns
-    -------
-    (State, LearningCurve, converged) or None
-    """
-    bare, bare_theta = widened(state.layout, state.theta, neurons=0)
-    layout, theta = widened(bare, bare_theta, neurons=neurons, anchored=anchored)
-    rng = np.random.default_rng(seed)
-    d, k = layout.n + layout.n_inputs, layout.n_directions
-    theta[k : k + neurons * d] = rng.standard_normal(neurons * d) / np.sqrt(d)
-    theta[k + neurons * d : k + neurons * (d + 1)] = rng.standard_normal(neurons)
-    ridge = Ridge(layout=layout, prior=prior)
-    new = replace(state, layout=layout, theta=theta, penalties=(ridge,))
-    if anchored:
-        return trained(new, data, stage="hidden layer", iterations=iterations, tick=tick)
-    found: Trained = None
-    for k, stiff in enumerate(STIFF):  # where the network goes, and its errors, are known only afterwards
-        bound = _orthogonal(state if found is None else found[0], layout, data, stiff)
-        new = replace(new if found is None else found[0], penalties=(ridge, bound))
-        own = part_of(tick, k / len(STIFF), (k + 1) / len(STIFF))
-        found = trained(new, data, stage="hidden layer", iterations=iterations, tick=own) or found
-    return found
-
-
-def _orthogonal(state: State, layout: Layout, data: Scaled, stiff: float) -> Orthogonal:
-    """The penalty at the states that a network goes through."""
-    problem = state.problem(data)
-    X, E = problem.errors(state.vector)
-    noise = np.full(layout.n, float(np.sqrt(np.mean(np.concatenate(E) ** 2))))
-    return orthogonal_to_physics(layout, [x[:-1] for x in X], [s.u[:, :-1] for s in problem.shots], noise, stiff)
 
 
 def white(state: State, data: Scaled) -> bool:
