@@ -95,6 +95,23 @@ def test_a_linear_plant_gets_degree_zero_more_often_than_not():
     assert sum(d == 0 for d in chosen) >= 5
 
 
+def test_a_close_choice_of_the_degree_is_told(usual):
+    told = []
+    for seed in range(8):
+        fit = lpv([record(seed, 300)], {"schedule": "p"})
+        of = fit.model.shape
+        values = {
+            x["degree"]: x["aicc"]
+            for x in fit.details["tried"]
+            if (x["form"], x["ar"], x["ma"]) == (of.form, of.ar, of.ma)
+        }
+        near = sum(v is not None and abs(v - values[of.degree]) < 2.0 for v in values.values()) > 1
+        told.append(any("is a close call" in w for w in fit.warnings))
+        assert told[-1] == near
+    assert 0 < sum(told) < 8
+    assert not any("close call" in w for w in usual[1].warnings)  # the degree was named
+
+
 def test_frozen_models_are_those_of_the_coefficients(usual):
     fit = usual[1]
     at = fit.model.at(0.3, fit.covariance)

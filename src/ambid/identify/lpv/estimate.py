@@ -46,7 +46,8 @@ UNSTABLE = (
 def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Identify a linear model whose coefficients follow a scheduling signal, with an error model (thesis sec. 1.6).
 
-    Consistent under feedback as long as the error model holds the true one.
+    Consistent under feedback as long as the error model holds the true one. Standard deviations take degree, form and
+    set point for given: chosen on a few hundred samples, 95 % intervals hold the truth about 92 times in 100.
 
     Parameters
     ----------

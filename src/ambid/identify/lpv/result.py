@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _POINTS = 9  # of the table over the range of p
+_CLOSE = 2.0  # difference of Akaike's criterion that says nothing (Burnham and Anderson 2002, sec. 2.6)
 
 
 def finished(records: Sequence[IOData], used: Mapping[str, object], work: Work, *, seed: int) -> NonlinearFit:
@@ -157,4 +158,23 @@ def _cautions(records: Sequence[IOData], work: Work) -> list[str]:
             f"no coefficient depends on the scheduling signal {work.schedule.name!r} (degree 0"
             f"{'' if not work.tried or len(work.tried) < 2 else ', by the criterion'}): this is a linear model"
         )
-    return found
+    return found + _close_calls(work)
+
+
+def _close_calls(work: Work) -> list[str]:
+    """Other degrees that the data hardly tell from the chosen one, everything else alike."""
+    of = work.shape
+    alike = {
+        str(x["degree"]): x["aicc"]
+        for x in work.tried
+        if (x["form"], x["ar"], x["ma"]) == (of.form, of.ar, of.ma) and isinstance(x["aicc"], float)
+    }
+    own = alike.pop(str(of.degree), None)
+    close = [k for k, value in alike.items() if own is not None and abs(value - own) < _CLOSE]
+    if not close:
+        return []
+    return [
+        f"degree {of.degree} is a close call: degree {' and '.join(close)} would explain the data about as "
+        "well. The standard deviations take the degree for given and are too small by that choice. Name it if you know "
+        "it"
+    ]
