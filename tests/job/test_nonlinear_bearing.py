@@ -130,12 +130,15 @@ def test_what_is_asked_wrongly_is_refused(balls, rig):
 
 def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, rig):
     x, u = balls[0]["position"], balls[0]["voltage"]
-    for part, told in ((1.0, 0), (0.999, 1), (0.5, 2)):  # of the samples that lie below the upper stop
-        stop = float(np.quantile(x, part)) + (1e-3 if part == 1.0 else 0.0)
-        taken = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, stop))), Reading())
-        assert len(taken.warnings) == told
-        assert (taken.record.knock is not None) == (told > 0)
+    free = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.max()) + 1e-3))), Reading())
+    assert free.warnings == ()
+    assert free.record.knock is None
+    taken = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(np.quantile(x, 0.5))))), Reading())
+    assert "counts as unknown" in taken.warnings[0]
     assert "lies on a stop" in taken.warnings[1]
+    assert np.count_nonzero(taken.record.cut) == taken.record.u.size - taken.record.kept.shape[0] > 0
+    with pytest.raises(EstimationError, match="nowhere free for 100 samples"):
+        taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.min())))), Reading())
     high = float(np.quantile(u, 0.9))
     taken = taken_record(balls[0], replace(rig, limits=Limits(voltage=(0.0, high))), Reading())
     assert taken.record.u.max() == high

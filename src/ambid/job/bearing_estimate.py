@@ -59,8 +59,8 @@ def judged(
         n: dict(zip((LEVELS[j] for j in problem.levels(r)), np.exp(fit.vector[place]).tolist(), strict=True))
         for r, (n, place) in enumerate(zip(names, problem.noise_slices, strict=True))
     }
-    points = np.concatenate([r.y for r in problem.records])
-    moving = np.concatenate([r.y for r in problem.records if not r.held])
+    points = np.concatenate([r.kept for r in problem.records])
+    moving = np.concatenate([r.kept for r in problem.records if not r.held])
     changed = tuple(w for t in taken for w in t.warnings)
     return NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
@@ -130,7 +130,7 @@ def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str])
 
     found: dict[str, dict[str, OutputFit]] = {}
     for name, record, test in zip(names, fit.problem.records, tests, strict=True):
-        spread = record.y.std(axis=0).tolist()
+        spread = record.kept.std(axis=0).tolist()
         found[name] = {
             role: OutputFit(one_step=1.0 - sd / spread[c], simulation=None, innovation_sd=sd)
             for c, (role, sd) in enumerate(zip(_ROLES, test.innovation_sd, strict=True))
@@ -204,17 +204,18 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
     """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
-    import numpy as np
-
     from ambid.identify.estimate import Check
+    from ambid.identify.nonlinear_bearing.weight import weight_carried
 
     law, values = fit.problem.law, fit.problem.values(fit.vector)
     weight = values["m"] * values["g"]
     if law.pair or weight == 0.0:
         return {}
-    means = np.array([r.y.mean(axis=0) for r in fit.problem.records if not r.held])
-    force = law.table(means[:, 0] - values["x_offset"], means[:, 1] - values["i_offset"], values)[0][:, 0]
-    off = float(np.max(np.abs(force / weight + 1.0)))
+    shares = [weight_carried(law, values, r) for r in fit.problem.records if not r.held]
+    carried = [c for c in shares if c is not None]
+    if not carried:
+        return {}
+    off = max(abs(c - 1.0) for c in carried)
     detail = f"the magnet's mean force differs from the weight by at most {off:.1%} on any record"
     return {"carries_its_weight": Check(passed=off < 0.1, detail=detail, values={"largest": off})}
 

@@ -179,7 +179,7 @@ def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[Ma
     if kind == "auto" and known.gap == "exponential":
         kind = "single"
     if kind == "auto" and records:
-        low, high = min(r.y[:, 1].min() for r in records), max(r.y[:, 1].max() for r in records)
+        low, high = min(r.kept[:, 1].min() for r in records), max(r.kept[:, 1].max() for r in records)
         kind = "pair" if low < -_REVERSED * high else "single"
     rise, pair = bool(known.rise), kind == "pair"
     gaps: tuple[Literal["hyperbolic", "exponential"], ...] = ("hyperbolic", "exponential")
@@ -216,7 +216,7 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
     """
     import numpy as np
 
-    from ambid.identify.nonlinear_bearing.contact import LYING, touching
+    from ambid.identify.nonlinear_bearing.contact import touching
     from ambid.identify.nonlinear_bearing.problem import BearingRecord
     from ambid.job.physical import load
 
@@ -247,17 +247,7 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
     _check_moves(taken)
     if rig.limits is not None:
         taken = touching(taken, rig.limits.position)
-        if taken.knock is not None:
-            at = int(np.count_nonzero(taken.knock))
-            told.append(
-                f"{name}: the rotor is at a stop (loop.limits.position) for {at} samples; the force there counts "
-                "as unknown"
-            )
-            if at > LYING * taken.u.size:
-                told.append(
-                    f"{name}: the rotor lies on a stop in {at / taken.u.size:.0%} of the record; numbers are off by "
-                    "more than their deviations then. Cut the record to where the rotor moves freely"
-                )
+        told += _stops_told(taken)
     remembered = {
         "samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
         "file": bench.provenance.get("file"), "held": held, "history": [str(step) for step in bench.history],
@@ -266,6 +256,30 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
 
 
 _LEAST = 100  # samples
+
+
+def _stops_told(record: BearingRecord) -> list[str]:
+    """Say where the rotor touched its stops and where it lay on them; refuse where too little is left."""
+    import numpy as np
+
+    told = list[str]()
+    if record.knock is not None and record.knock.any():
+        told.append(
+            f"{record.name}: the rotor is at a stop (loop.limits.position) for {np.count_nonzero(record.knock)} "
+            "samples; the force there counts as unknown"
+        )
+    if record.cut is not None:
+        lies, left = float(np.mean(record.cut)), int(np.count_nonzero(~record.cut))
+        if max((end - first for first, end in record.parts), default=0) < _LEAST:
+            raise EstimationError(
+                f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.0%} of the record, and is "
+                f"nowhere free for {_LEAST} samples. Correct the limits, or record with the rotor levitated"
+            )
+        told.append(
+            f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.1%} of the record; that was cut "
+            f"out, and {left} samples in {len(record.parts)} stretches remain"
+        )
+    return told
 
 
 def _check_moves(record: BearingRecord) -> None:

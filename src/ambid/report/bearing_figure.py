@@ -203,7 +203,8 @@ def _map(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
     scale, unit = prefixed(float(np.max(np.abs(e.coil_hull[:, 0]))), "m")
     for k, t in enumerate(evidence.traces):
         every = max(1, t.measured.shape[0] // _CLOUD)
-        x, i = t.measured[::every, 0] / scale, t.measured[::every, 1]
+        used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
+        x, i = used[:, 0] / scale, used[:, 1]
         where.plot(x, i, "." if not t.held else "|", color=f"C{k % 10}", markersize=2.5, alpha=0.5)
         where.plot([], [], "o" if not t.held else "|", color=f"C{k % 10}", markersize=5, label=t.name)
     for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
@@ -283,6 +284,6 @@ def _missed(axes: Axes, t: BearingTrace, c: int) -> None:
     curve(axes, t.time_s, e, MEASURED, None)
     for side in (-NORMAL_99, NORMAL_99):
         axes.axhline(side, color=BOUND, linewidth=0.8, linestyle="--")
-    reach = max(1.3 * NORMAL_99, float(np.quantile(np.abs(e), 0.999)))
+    reach = max(1.3 * NORMAL_99, float(np.nanquantile(np.abs(e), 0.999)))
     axes.set_ylim(-1.15 * reach, 1.15 * reach)
-    note(axes, f"{100 * float(np.mean(np.abs(e) > NORMAL_99)):.2g} % outside")
+    note(axes, f"{100 * float(np.mean(np.abs(e[np.isfinite(e)]) > NORMAL_99)):.2g} % outside")

@@ -14,6 +14,7 @@ from ambid.identify.nonlinear_bearing.likelihood import BearingFit, run
 from ambid.identify.nonlinear_bearing.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.identify.nonlinear_bearing.residual_test import whiteness
 from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+from ambid.identify.nonlinear_bearing.weight import weight_carried
 from ambid.validate.prediction import fit_of
 
 Array = NDArray[np.float64]
@@ -40,7 +41,8 @@ class BearingReplay:
         Sample at which row 0 of the arrays stands.
     measured, predicted, innovations, sd : ndarray, shape (n_used, 2)
         Position and current: measured, predicted from all samples before, their difference, and the standard deviation
-        that the predictor expects of it; of a held rotor the position is not predicted (NaN).
+        that the predictor expects of it; NaN for what is not predicted: the position of a held rotor, and samples that
+        were left out.
     """
 
     fit: BearingFit
@@ -177,10 +179,12 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
         As `replay`.
     """
     found = replay(estimate, record)
-    rms = np.sqrt(np.mean(found.innovations**2, axis=0))
+    sound = np.all(np.isfinite(found.innovations), axis=1)
+    errors, measured = found.innovations[sound], found.measured[sound]
+    rms = np.sqrt(np.mean(errors**2, axis=0))
     before = [estimate.fit[found.noise_of][role].innovation_sd for role in _ROLES]
-    one_step, ratio = fit_of(found.innovations, found.measured), rms / np.array(before)
-    outside = 1.0 - float(np.mean(estimate.covers(record.y)))
+    one_step, ratio = fit_of(errors, measured), rms / np.array(before)
+    outside = 1.0 - float(np.mean(estimate.covers(record.kept)))
     test = whiteness(found.fit, 0)
     checks = {
         "residuals_white": Check(
@@ -226,7 +230,7 @@ def _consistent(ratio: Array, noise_of: str) -> Check:
 
 
 def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:
-    low, high = record.y.min(axis=0), record.y.max(axis=0)
+    low, high = record.kept.min(axis=0), record.kept.max(axis=0)
     seen = estimate.range
     detail = f"{100 * outside:.2g} % of the record lies outside the positions and currents that the estimate has seen"
     if outside > _OUTSIDE:
@@ -243,7 +247,9 @@ def _carries(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[
     weight = estimate.values["m"] * estimate.values["g"]
     if estimate.law.pair or weight == 0.0:
         return {}
-    at = estimate.curves(record.y[:, 0], record.y[:, 1])
-    off = -float(np.mean(at.force.value)) / weight - 1.0
+    carried = weight_carried(estimate.law, estimate.values, record)
+    if carried is None:
+        return {}
+    off = carried - 1.0
     detail = f"the magnet's mean force is {abs(off):.1%} {'above' if off > 0 else 'below'} the weight on this record"
     return {"carries_its_weight": Check(passed=abs(off) < _WEIGHT, detail=detail, values={"relative": off})}

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.nonlinear_bearing.contact import touching
 from ambid.identify.nonlinear_bearing.estimate import estimate_bearing
 from ambid.identify.nonlinear_bearing.likelihood import search
 from ambid.identify.nonlinear_bearing.residual_test import whiteness
@@ -149,21 +148,3 @@ def test_a_drop_that_is_left_out_shows(lossy):
     fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=False, delay=1.0)
     assert whiteness(fit, 0).p < 1e-6
     assert fit.problem.values(fit.vector)["R"] > 1.8  # it is taken for a resistance
-
-
-def test_a_touch_of_a_stop_is_a_force_that_is_not_known():
-    b, exact, gap = bench(), truth(bench()), 0.432e-3
-    done = moved(b, Motion(swing=0.45, swing_hz=2.0, volts=8.0, hold=3), 6000, 1)
-    assert done.first_contact is not None
-    record = as_seen(done)
-    aware = touching(record, (-0.9 * gap, 0.9 * gap))
-    assert record.knock is None
-    assert 0 < np.count_nonzero(aware.knock) < 600
-    assert touching(record, (-np.inf, np.inf)) is record
-    estimated = {"k", "s", "L_leak", "m", "R", "x_offset", "v_offset"}
-    blind, fit = (
-        search(p, p.start()) for p in (problem_of([r], exact, EQUAL, estimated, NOISE, 1.0) for r in (record, aware))
-    )
-    # without it the predictor is thrown through a pole face, or the numbers are off by many deviations
-    assert blind.status == "failed" or blind.criterion > fit.criterion + 100
-    right(fit, exact, {"k": 0.01, "s": 0.01, "m": 0.02, "R": 0.01})

@@ -127,8 +127,7 @@ def _remembered(tick: Tick | None) -> Tick:
 
 def _short(record: BearingRecord) -> BearingRecord:
     """The first part of a record: enough to choose a law and to come near."""
-    n = _STRETCH if not record.held else record.u.size
-    return replace(record, u=record.u[:n], loose=record.loose[:n], y=record.y[:n], valid=record.valid[:n])
+    return record if record.held else record.first(_STRETCH)
 
 
 def _first(

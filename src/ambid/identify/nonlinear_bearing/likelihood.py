@@ -23,6 +23,7 @@ _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
 _SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
 _SEARCHING = "identify"
+_ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
 _LONGEST = 1.0  # step of a logarithm at once
 
 
@@ -126,18 +127,22 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
     place, levels = problem.noise_slices[r], problem.levels(r)
     columns += [place.start + levels.index(j) if j in levels else -1 for j in range(5)]
     noise2, flags = problem.noise2(vector, r), problem.flags(r)
-    z, P = _initial(problem, r)
     n = record.u.size
     e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
     rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
-    steps = _steps(problem, r)
-    done = predict(
-        record.u, record.loose**2, _knocks(problem, r), record.y, record.valid & np.array([not record.held, True]),
-        problem.skip, whole, theta, np.array(active, dtype=np.int64), chain, noise2, flags, 1.0 / record.rate_hz,
-        steps, z, P, slopes, e, s, rows,
-    )  # fmt: skip
-    if not done:
-        return None
+    steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
+    valid, numbers = record.valid & np.array([not record.held, True]), np.array(active, dtype=np.int64)
+    for first, end in record.parts:
+        begin = max(first + (_ABOUT if first else 0), problem.skip)
+        if end - begin < _ABOUT:
+            continue
+        z, P = _initial(problem, r, begin)
+        done = predict(
+            record.u[:end], loose[:end], knocks[:end], record.y[:end], valid[:end], begin, whole, theta, numbers,
+            chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes, e, s, rows,
+        )  # fmt: skip
+        if not done:
+            return None
     return Innovations(e=e, s=s, rows=rows if slopes else np.zeros((0, 0)), columns=np.array(columns))
 
 
@@ -160,28 +165,31 @@ def _steps(problem: BearingProblem, r: int) -> int:
     return int(2 ** round(np.log2(wanted)))
 
 
-def _initial(problem: BearingProblem, r: int) -> tuple[Array, Array]:
-    """State before the first sample used, and its covariance, which is generous and does not hang on the vector."""
+def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]:
+    """State before sample `begin`, and its covariance, which is generous and does not hang on the vector."""
     record, flags = problem.records[r], problem.flags(r)
     rate, n = record.rate_hz, 3 + int(flags[2]) + int(flags[3])
     noise, begun = np.exp(problem.noise_center[r]), {n.name: n.value for n in problem.numbers}
-    first = record.y[max(problem.skip - 4, 0) : problem.skip + 4]
+    first = record.y[max(begin - _ABOUT, 0) : begin + _ABOUT]
     x = record.y[:, 0].mean() if record.held else first[:, 0].mean()
     z, P = np.zeros(n), np.zeros((n, n))
     z[0], z[2] = x - begun["x_offset"], first[:, 1].mean() - begun["i_offset"]
     moved = max(float(np.ptp(first[:, 0])), noise[0])
     if not record.held:
-        z[1] = (record.y[problem.skip + 3, 0] - record.y[problem.skip - 4, 0]) * rate / 7.0
+        z[1] = (first[-1, 0] - first[0, 0]) * rate / (len(first) - 1)
         P[0, 0], P[1, 1] = (3.0 * moved) ** 2, (moved * rate) ** 2
     P[2, 2] = (3.0 * max(float(np.ptp(first[:, 1])), noise[1])) ** 2
     # an offset that moves takes the state with it: the start must not hold it where the search began
-    free, spread = {n.name for n in problem.estimated}, record.y.std(axis=0)
+    free, spread = {n.name for n in problem.estimated}, record.kept.std(axis=0)
     for name, place, c in (("x_offset", 0, 0), ("i_offset", 2, 1)):
         if name in free and not (record.held and c == 0):
             P[place, place] += float(spread[c]) ** 2
     if flags[2]:  # the force behind the eddy pole starts at that of the weight
         z[3] = -begun["m"] * begun["g"]
         P[3, 3] = (0.3 * z[3]) ** 2 + (10.0 * noise[2]) ** 2
+        if begin > problem.skip:  # after a stretch that was left out, the force need not be about that
+            z[3] = problem.law.table(z[:1], z[2:3], begun)[0][0, 0]
+            P[3, 3] += z[3] ** 2
     if flags[3]:
         P[-1, -1] = (10.0 * noise[2]) ** 2
     return z, P

@@ -8,7 +8,7 @@ record (position, current, force, voltage, drift; of a held rotor current and vo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,9 @@ class BearingRecord:
     knock : ndarray, shape (n_samples,), m/s^2, or None
         Standard deviation of an acceleration of unknown origin during each sample, such as at a stop (see `touching`);
         None: of none.
+    cut : ndarray, shape (n_samples,), bool, or None
+        Samples that are left out, such as those of a rotor that lies on a stop; the predictor begins anew after them.
+        None: none.
     """
 
     name: str
@@ -71,6 +74,43 @@ class BearingRecord:
     valid: NDArray[np.bool_]
     held: bool = False
     knock: Array | None = None
+    cut: NDArray[np.bool_] | None = None
+
+    @property
+    def parts(self) -> tuple[tuple[int, int], ...]:
+        """First sample, and that after the last, of each stretch that is used."""
+        if self.cut is None:
+            return ((0, self.u.size),)
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], self.cut, [True]])))
+        return tuple(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+    @property
+    def kept(self) -> Array:
+        """Position and current of the samples that are used, in shape (n_kept, 2)."""
+        return self.y if self.cut is None else self.y[~self.cut]
+
+    def first(self, count: int) -> BearingRecord:
+        """Return the beginning of the record.
+
+        Parameters
+        ----------
+        count : int
+            Samples in it that are used.
+
+        Returns
+        -------
+        BearingRecord
+        """
+        n = count if self.cut is None else int(np.searchsorted(np.cumsum(~self.cut), count)) + 1
+        return replace(
+            self,
+            u=self.u[:n],
+            loose=self.loose[:n],
+            y=self.y[:n],
+            valid=self.valid[:n],
+            knock=None if self.knock is None else self.knock[:n],
+            cut=None if self.cut is None else self.cut[:n],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

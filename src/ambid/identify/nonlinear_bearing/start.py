@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 _FIXED = frozenset({"c", "g", "a", "i_offset", "v_drop", "i_drop"})  # unless they are named
 _ROUND = 0.02  # of the largest current: over which the drop of a stage changes its sign, where nothing is said
 _STRETCH = 8192  # samples for the linear estimate
+_SHORTEST = 500  # samples of one of its parts
 _WINDOW_S = 0.1  # over which forces are taken to balance
 _FORCE, _VOLTAGE = (1e-3, 1e-2, 1e-1), (0.03, 0.3)  # noise levels tried, over what the sensors would show as such
 
@@ -74,32 +75,47 @@ def linear_start(
     EstimationError
         If the linear model finds no predictor either.
     """
-    model, last = OneAxis(), min(record.u.size, _STRETCH)
-    if not np.all(record.valid[:last]):
-        broken = np.flatnonzero(~np.all(record.valid, axis=1))
-        edges = np.concatenate([[-1], broken, [record.u.size]])
-        longest = int(np.argmax(np.diff(edges)))
-        first, last = int(edges[longest]) + 1, int(min(edges[longest + 1], edges[longest] + 1 + _STRETCH))
-    else:
-        first = 0
-    part = Signals(u=record.u[first:last, None], y=record.y[first:last], rate_hz=record.rate_hz)
+    model, found = OneAxis(), list[float]()
     parameters = [
         known.get(p.name, Parameter(name=p.name, unit=p.unit, role="fixed", value=0.0))
         if p.name in ("m", "R", "c")
         else Parameter(name=p.name, unit=p.unit)
         for p in model.parameters
     ]
-    fit = greybox(model, part, parameters, delay="auto" if delay is None else delay, noise="levels")
-    if fit.status == "failed":
+    for first, last in _stretches(record):
+        part = Signals(u=record.u[first:last, None], y=record.y[first:last], rate_hz=record.rate_hz)
+        try:
+            fit = greybox(model, part, parameters, delay="auto" if delay is None else delay, noise="levels")
+        except ValueError:  # SciPy's, where a search steps to the edge of what has a predictor
+            continue
+        if fit.status == "failed":
+            continue
+        values = fit.problem.parameters(fit.vector)
+        if (values["k_i"] > 0) == law.pair:
+            return LinearStart(values=values, delay=fit.problem.delay_samples(fit.vector))
+        found.append(values["k_i"])
+    if not found:
         raise EstimationError(f"record {record.name}: no linear model to start from. Check columns and signs")
-    values = fit.problem.parameters(fit.vector)
     sign = "positive: with a pair the force grows with the current" if law.pair else "negative: position is the gap"
-    if (values["k_i"] > 0) != law.pair:
-        raise EstimationError(
-            f"record {record.name}: the linear model finds k_i = {values['k_i']:.3g} N/A; it must be {sign}, and "
-            "grows away from a single magnet. Turn the sign of position or current in the rig, or choose the magnet"
-        )
-    return LinearStart(values=values, delay=fit.problem.delay_samples(fit.vector))
+    raise EstimationError(
+        f"record {record.name}: the linear model finds k_i = {found[0]:.3g} N/A; it must be {sign}, and "
+        "grows away from a single magnet. Turn the sign of position or current in the rig, or choose the magnet"
+    )
+
+
+def _stretches(record: BearingRecord) -> list[tuple[int, int]]:
+    """Where a linear model is looked for: the longest sound part; parts of that, where it moves too far for one."""
+    broken = np.flatnonzero(~np.all(record.valid, axis=1))
+    edges = np.concatenate([[-1], broken, [record.u.size]])
+    longest = int(np.argmax(np.diff(edges)))
+    first = int(edges[longest]) + 1
+    last = int(min(edges[longest + 1], first + _STRETCH))
+    found = [(first, last)]
+    for share in (2, 4):
+        size = (last - first) // share
+        if size >= _SHORTEST:
+            found += [(first + k * size, first + (k + 1) * size) for k in (0, share - 1)]
+    return found
 
 
 def balance(records: Sequence[BearingRecord], law: MagnetLaw, weight: float) -> tuple[float, float]:
@@ -165,7 +181,7 @@ def start_numbers(
         In the order of the law's names and `BODY`.
     """
     lin, free = linear.values, [r for r in records if not r.held]
-    position, current = np.concatenate([r.y for r in free]).T
+    position, current = np.concatenate([r.kept for r in free]).T
     mass = known["m"].value if "m" in known and known["m"].value is not None else lin["m"]
     gravity = known["g"].value if "g" in known and known["g"].value is not None else 0.0 if law.pair else 9.81
     guess = {**lin, "m": mass, "g": gravity, "a": 2.0 * np.pi * 200.0, "sigma": 0.05 / np.max(current**2)}
@@ -240,7 +256,8 @@ def with_noise(problem: BearingProblem, values: Mapping[str, float]) -> BearingP
     """
     centre = np.zeros((len(problem.records), 5))
     for r, record in enumerate(problem.records):
-        floor = np.log(noise_floor(record.y))
+        first, end = max(record.parts, key=lambda part: part[1] - part[0])
+        floor = np.log(noise_floor(record.y[first:end]))
         alone = replace(problem, records=(record,), noise_center=centre[r : r + 1])
         best = np.inf
         for f in _FORCE if not record.held else _FORCE[:1]:
