@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -170,6 +172,43 @@ def test_two_outputs_and_two_inputs_over_two_records() -> None:
     assert len(fit.details["prior_by_output"]) == 2
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_errors_of_outputs_that_hang_together_are_so_in_the_covariance(rho: float) -> None:
+    rng = np.random.default_rng(7)
+    u, y = rng.standard_normal((500, 2)), np.zeros((500, 2))
+    e = 0.2 * rng.standard_normal((500, 2)) @ np.linalg.cholesky(np.array([[1.0, rho], [rho, 1.0]])).T
+    for t in range(1, 500):
+        y[t] = [0.5, 0.7] * y[t - 1] + u[t - 1] + e[t]
+    fit = rbf([data(u, y)], {"ny": 1, "nu": 1, "neurons": 0})
+    model = network(fit)
+    ys, us = (y - model.y_level) / model.y_scale, (u - model.u_level) / model.u_scale
+    z = np.hstack([model.shape.lags.regressors(ys, us), np.ones((499, 1))])
+    noise = fit.noise_covariance / model.y_scale[:, None] / model.y_scale
+    exact = np.kron(noise, np.linalg.inv(z.T @ z))  # least squares, output by output
+    order = np.array([0, 1, 2, 3, 8, 4, 5, 6, 7, 9])  # the two constants come last
+    assert fit.covariance is not None
+    np.testing.assert_allclose(fit.covariance[np.ix_(order, order)], exact, rtol=0.01, atol=1e-3 * exact.max())
+
+
+def test_shared_centres_have_deviations_that_hold_for_errors_that_hang_together() -> None:
+    """Two outputs, one bump: units are common, and so each of their numbers sees both errors."""
+    s, rho, z = shape(2, 1, ny=0, nu=1, neurons=1, linear=False), 0.95, []
+    truth = np.array([0.2, -0.1, 1.0, 1.0, 0.3, np.log(0.7)])
+    u = np.linspace(-2.5, 2.5, 200)[:, None]
+    clean = s.values(truth, u[:-1])
+    for seed in range(60):
+        e = np.random.default_rng(seed).standard_normal((199, 2)) @ np.linalg.cholesky([[1.0, rho], [rho, 1.0]]).T
+        y = np.vstack([np.zeros((1, 2)), clean + 0.1 * e])
+        problem = problem_at(s, ((y, u),), truth, np.full(2, 1e3), truth, everything=True, noise=np.full(2, 0.01))
+        problem = replace(problem, precision=np.full(truth.size, 1e-3))
+        theta = search(problem, truth, stage="", most=30).theta
+        P, *_ = laplace(problem, theta)
+        assert P is not None
+        z.append((theta - truth) / np.sqrt(np.diag(P)))
+    assert np.all(np.std(z, axis=0) < 1.26)  # the centre's was 1.4
+    assert np.all(np.std(z, axis=0) > 0.78)
+
+
 def test_it_does_about_as_well_as_a_neural_network() -> None:
     record, _ = bumpy(800, 9, 0.1)
     other, clean = bumpy(800, 10, 0.1)
@@ -190,6 +229,29 @@ def test_feedback_is_warned_of_and_nothing_to_predict_from_refused() -> None:
         rbf([record], {"ny": 0, "nu": 0})
     with pytest.raises(EstimationError, match="gaussian"):
         rbf([record], {"unit": "gausian"})
+
+
+@pytest.mark.parametrize(
+    ("told", "word"),
+    [
+        ({"training": "recursive", "rate": 1.0}, "below 1"),
+        ({"training": "descent", "rate": 0.0}, "does not move"),
+        ({"held_out": 0.0}, "held_out"),
+        ({"held_out": 0.0, "ny": 1, "nu": 1, "neurons": 3, "seen": "all"}, "width"),
+    ],
+)
+def test_settings_that_make_each_other_void_are_refused(told: dict[str, object], word: str) -> None:
+    record, _ = bumpy(100, 11, 0.1)
+    with pytest.raises(EstimationError, match=word):
+        rbf([record], told)  # type: ignore[arg-type]
+    rbf([record], {"held_out": 0.0, "ny": 1, "nu": 1, "neurons": 3, "seen": "all", "width": 1.4})
+    rbf([record], {"held_out": 0.0, "ny": 1, "nu": 1, "choice": "bic"})
+
+
+def test_a_model_that_follows_the_noise_says_so() -> None:
+    record, _ = bumpy(62, 14, 0.1)
+    assert any("follows the noise" in w for w in rbf([record], {"ny": 20, "nu": 20, "neurons": 0}).warnings)
+    assert not any("follows the noise" in w for w in rbf([record], {"ny": 1, "nu": 1, "neurons": 0}).warnings)
 
 
 def test_units_that_have_no_place_are_left_out_and_told() -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+_CROWDED = 0.8  # part of the errors that numbers may take up
 _NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
 
 
@@ -55,7 +56,7 @@ def finished(records: Sequence[IOData], s: HybridSettings, data: Scaled, work: W
         return failed_fit("hybrid", records, used, seed, DIVERGED, work.timing_s)
     covariance, noise, effective, inflated = laplace(problem, theta)
     unit = units_of(shape, data.y_scale, data.u_scale)
-    warnings = [*work.warnings, *_cautions(records, s, data, work, inflated)]
+    warnings = [*work.warnings, *_cautions(records, s, data, work, inflated, effective / problem.n_errors)]
     if covariance is None:
         warnings.append("no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons")
     net = shape.network
@@ -124,12 +125,19 @@ def laplace(problem: HybridProblem, theta: Array) -> tuple[Array | None, Array, 
     return P, noise, effective, inflated
 
 
-def _cautions(records: Sequence[IOData], s: HybridSettings, data: Scaled, work: Work, inflated: Array) -> list[str]:
+def _cautions(
+    records: Sequence[IOData], s: HybridSettings, data: Scaled, work: Work, inflated: Array, taken: float
+) -> list[str]:
     shape, found = work.shape, []
     if s.ne == 0 and records[0].n_inputs and not all(x.open_loop for x in records):
         found.append(
             "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: "
             "raise ne, or say --open-loop if there was no feedback"
+        )
+    if taken > _CROWDED:
+        found.append(
+            f"the data determine {taken:.0%} as many numbers as there are errors: the model follows the noise, and "
+            "standard deviations are not to be trusted. Fewer neurons or terms, or a longer record"
         )
     radius = shape.noise_radius(work.theta)
     if not shape.deep and radius > _NEAR:

@@ -183,7 +183,7 @@ def _seen(ny: int, nu: int, parts: Parts) -> tuple[str, ...]:
 def _scores(told: Told, parts: Parts, ny: int, nu: int, counts: Sequence[int], width: float, seed: int) -> list[Tried]:
     by_criterion = told.choice != "held_out"
     shape = shape_of(told, parts, ny, nu, 0)
-    training, held = (parts, ()) if by_criterion else split(parts, told.share or 0.2, shape.lags.lag)
+    training, held = (parts, ()) if by_criterion else split(parts, told.share, shape.lags.lag)
     placing = Placing(told, shape, training, seed, most=max(counts))
     out: list[Tried] = []
     for count in counts:

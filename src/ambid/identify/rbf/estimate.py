@@ -162,6 +162,7 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     nothing = {"outputs": s.get("ny") == 0, "inputs": s.get("nu") == 0 or not records or not records[0].n_inputs}
     if nothing.get(str(s.get("seen")), False):
         raise EstimationError(f"rbf: units are to see {s['seen']} alone, and there are none. Say seen = all")
+    _consistent(s)
     began = perf_counter()
     data = scaled_records("rbf", records, lag=max(s.get("ny") or 1, s["nk"] + (s.get("nu") or 1) - 1))
     told = _told(s)
@@ -179,6 +180,24 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     used["seen"] = work.seen
     used["prior"] = float(np.exp(np.mean(np.log(work.prior))))
     return finished(records, used, data, work, seed=seed)
+
+
+def _consistent(s: Mapping[str, Any]) -> None:
+    """Refuse settings of which one makes the other void."""
+    rate, training = float(s["rate"]), s["training"]
+    if training == "recursive" and not rate < 1.0:
+        raise EstimationError(
+            f"rbf: rate is {rate:g}; recursive training takes the least gain by it, which must be below 1. "
+            "Say 0 to count all samples alike"
+        )
+    if training == "descent" and not rate > 0.0:
+        raise EstimationError("rbf: rate is 0, with which steepest descent does not move. Raise it")
+    is_open = any(s.get(k) is None for k in ("ny", "nu", "neurons", "width", "seen"))
+    if is_open and s["choice"] == "held_out" and not s["held_out"] > 0:
+        raise EstimationError(
+            "rbf: held_out is 0, and what is left open is to be chosen by held-out errors. Raise it, say choice = bic, "
+            "or give ny, nu, neurons, width and seen"
+        )
 
 
 def _told(s: Mapping[str, Any]) -> Told:

@@ -142,6 +142,28 @@ class RbfProblem:
             found[k].append(np.einsum("tok,to->tk", block[:, :, :-1], block[:, :, -1]))
         return [np.concatenate(x) for x in found]
 
+    def across(self, theta: Array, noise: Array) -> Array:
+        """Return what the information of the scores has beyond that of the slopes where outputs' errors hang together.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_active,)
+        noise : ndarray, shape (n_outputs, n_outputs), scaled
+            Covariance of the errors.
+
+        Returns
+        -------
+        ndarray, shape (n_active, n_active)
+            Zero where it is diagonal.
+        """
+        extra = noise * self.weight[:, None] * self.weight
+        np.fill_diagonal(extra, 0.0)
+        out = np.zeros((self.n_active, self.n_active))
+        for _, block in self._blocks(theta) if np.any(extra) else ():
+            J = block[:, :, :-1]
+            out += np.tensordot(J, np.matmul(extra, J), axes=([0, 1], [0, 1]))
+        return (out + out.T) / 2.0
+
     def _blocks(self, v: Array) -> Iterator[tuple[int, Array]]:
         """Yield weighted slopes and errors, shape (n, n_outputs, n_active + 1), with the number of their part."""
         s, theta, lag, active = self.shape, self.whole(v), self.shape.lags.lag, slice(0, self.n_active)

@@ -30,6 +30,7 @@ GIVEN_UNITS = (
     "standard deviations are those of the weights of these units: what the choice of the units adds is not "
     "in them, and intervals of 95 % for the function may hold in as few as 70 % of places"
 )
+_CROWDED = 0.8  # part of the errors that numbers may take up
 DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
 
 
@@ -83,7 +84,7 @@ def finished(
         seed=seed,
         status=work.status,
         curves=tuple(work.curves),
-        warnings=(*work.warnings, *warnings, *_cautions(records, data, work)),
+        warnings=(*work.warnings, *warnings, *_cautions(records, data, work, effective / problem.n_errors)),
         timing_s=dict(work.timing_s),
         details={
             "effective_parameters": effective,
@@ -109,7 +110,7 @@ def laplace(problem: RbfProblem, v: Array) -> tuple[Array | None, Array, float, 
     Returns
     -------
     covariance : ndarray, shape (n_active, n_active), or None
-        None where the data and the prior together leave a direction open.
+        None where the data and the prior together leave a direction open. Errors of outputs may hang together.
     noise : ndarray, shape (n_outputs, n_outputs), scaled
         Covariance of the errors.
     effective : float
@@ -128,6 +129,8 @@ def laplace(problem: RbfProblem, v: Array) -> tuple[Array | None, Array, float, 
             break
         effective = float(v.size - np.sum(np.diag(P) * problem.precision[: v.size] ** 2))
         noise = errors.T @ errors / max(n - effective / p, 1.0)
+    if P is not None and p > 1:
+        P = P + P @ replace(problem, weight=1.0 / np.sqrt(np.maximum(np.diag(noise), 1e-14))).across(v, noise) @ P
     return P, noise, effective, condition
 
 
@@ -170,8 +173,13 @@ def _covariance(work: Work, problem: RbfProblem, P: Array | None, how: str) -> t
     return whole, origin, [] if work.everything or not work.shape.neurons else [GIVEN_UNITS]
 
 
-def _cautions(records: Sequence[IOData], data: Scaled, work: Work) -> list[str]:
+def _cautions(records: Sequence[IOData], data: Scaled, work: Work, taken: float) -> list[str]:
     found = []
+    if taken > _CROWDED:
+        found.append(
+            f"the data determine {taken:.0%} as many numbers as there are errors: the model follows the noise, and "
+            "standard deviations are not to be trusted. Fewer units or lags, or a longer record"
+        )
     if records[0].n_inputs and not all(x.open_loop for x in records):
         what = "the free run" if work.free else "one-step errors"
         found.append(
