@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -137,7 +138,7 @@ def command(
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
         outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"))
-        respond, rate_hz, limits, point = (
+        respond, by_role, rate_hz, limits, point = (
             _of_preset(preset, rate, seed, closed, nonlinear, position)
             if preset
             else _of_rig(Path(rig), rate, seed, closed, nonlinear, position)
@@ -146,7 +147,7 @@ def command(
         shape = _repeated(
             lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
         )
-        peak = _largest(respond, shape, limits, point) if amplitude is None else amplitude
+        peak = _largest(by_role, shape, limits, point) if amplitude is None else amplitude
         done = respond(peak * shape)
         if log_excitation:
             logged = Channel(name="excitation", unit="V", values=peak * shape)
@@ -176,7 +177,7 @@ def _of_preset(
     def respond(u: Array) -> Simulation:
         return simulate_preset(preset, u, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
 
-    return respond, rate_hz, preset.limits, preset.operating_point
+    return respond, respond, rate_hz, preset.limits, preset.operating_point
 
 
 def _of_rig(
@@ -193,10 +194,16 @@ def _of_rig(
     if rate_hz is None:
         raise AmbidError(f"rig {path} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
 
-    def respond(u: Array) -> Simulation:
-        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed, nonlinear=nonlinear)
+    def respond(u: Array, columns: bool = True) -> Simulation:
+        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed, nonlinear=nonlinear, columns=columns)
 
-    return respond, rate_hz, rig.limits, parts_of_rig(rig, closed, nonlinear=nonlinear)[2]
+    return (
+        respond,
+        partial(respond, columns=False),
+        rate_hz,
+        rig.limits,
+        parts_of_rig(rig, closed, nonlinear=nonlinear)[2],
+    )
 
 
 def _largest(respond: Respond, shape: Array, limits: Limits | None, point: OperatingPoint | None) -> float:

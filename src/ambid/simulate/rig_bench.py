@@ -38,6 +38,7 @@ def simulate_rig(
     setpoint: ArrayLike | None = None,
     nonlinear: bool = False,
     substeps: int | None = None,
+    columns: bool = True,
 ) -> Simulation:
     """Simulate the linear model of a rig about its operating point, or the nonlinear plant of its ``[magnet]``.
 
@@ -62,11 +63,13 @@ def simulate_rig(
         Simulate the nonlinear plant instead of the linear one.
     substeps : int, optional
         Runge-Kutta steps in each sample (nonlinear only); default what the plant's rates ask for.
+    columns : bool
+        Log in the rig's columns, uncalibrated, so that the rig reads the record back; else by role, in SI.
 
     Returns
     -------
     Simulation
-        Its record has the rig's columns, uncalibrated, so that the rig reads it back.
+        The record and what happened.
 
     Raises
     ------
@@ -91,6 +94,8 @@ def simulate_rig(
         substeps=substeps or 1,
         current_offset=current_offset(rig) if nonlinear else 0.0,
     )
+    if not columns:
+        return done
     wanted = np.broadcast_to(
         np.asarray(point.position if setpoint is None else setpoint, dtype=np.float64), done.record.n_samples
     )
