@@ -254,6 +254,17 @@ def test_a_model_that_follows_the_noise_says_so() -> None:
     assert not any("follows the noise" in w for w in rbf([record], {"ny": 1, "nu": 1, "neurons": 0}).warnings)
 
 
+def test_numbers_that_the_data_do_not_tell_apart_are_named() -> None:
+    rng = np.random.default_rng(3)
+    u, y = np.where(np.arange(300) % 2, 1.0, -1.0), np.zeros(300)
+    for t in range(1, 300):
+        y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.2 * rng.standard_normal()
+    told = {"ny": 1, "neurons": 3, "seen": "outputs", "width": 1.4}
+    (found,) = [w for w in rbf([data(u, y)], {**told, "nu": 2}).warnings if "apart" in w]
+    assert "y: u(t-1), y: u(t-2)." in found
+    assert not any("apart" in w for w in rbf([data(u, y)], {**told, "nu": 1}).warnings)
+
+
 def test_units_that_have_no_place_are_left_out_and_told() -> None:
     record, _ = bumpy(120, 13, 0.1)
     for centres in ("ols", "kmeans"):

@@ -95,3 +95,17 @@ def test_intervals_of_the_weights_cover_the_truth() -> None:
         scores.append(away)
     assert 0.92 <= inside / 900 <= 0.975  # 0.95 with a deviation of about 0.01
     assert np.all(np.abs(np.mean(scores, axis=0)) < 0.35)  # the prior draws weights inward by less than their spread
+
+
+def test_regressors_that_are_the_same_cost_nothing() -> None:
+    """An input that turns its sign every sample: its second lag is the first, and no direction is lost to it."""
+    z, theta, y = made(60, 4)
+    z[:, 1] = np.where(np.arange(60) % 2, 1.0, -1.0)
+    s, wide = shape(neurons=12), shape(nu=2, neurons=12, metric=np.eye(3)[:2])
+    theta = theta[s.n_weights :]
+    one = fitted_weights(s, np.concatenate([np.zeros(s.n_weights), theta]), z, y, None)
+    twice = np.hstack([z, -z[:, 1:]])
+    same = fitted_weights(wide, np.concatenate([np.zeros(wide.n_weights), theta]), twice, y, None)
+    np.testing.assert_allclose(wide.values(same.theta, twice), s.values(one.theta, z), atol=1e-9)
+    np.testing.assert_allclose(same.noise, one.noise, rtol=1e-9)
+    np.testing.assert_allclose(same.effective, one.effective, rtol=1e-9)

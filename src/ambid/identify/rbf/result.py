@@ -30,6 +30,7 @@ GIVEN_UNITS = (
     "standard deviations are those of the weights of these units: what the choice of the units adds is not "
     "in them, and intervals of 95 % for the function may hold in as few as 70 % of places"
 )
+_HELD = 0.01  # part of the variance before the data that is left of a number of the linear part
 _CROWDED = 0.8  # part of the errors that numbers may take up
 DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
 
@@ -60,6 +61,8 @@ def finished(
         return failed_fit("rbf", records, used, seed, DIVERGED, work.timing_s)
     P, noise, effective, condition = laplace(problem, theta[: problem.n_active])
     covariance, origin, warnings = _covariance(work, problem, P, str(used["uncertainty"]))
+    if covariance is not None:
+        warnings += _open(problem, covariance)
     regressors = np.concatenate([shape.lags.regressors(y, u) for y, u in data.parts])
     model = RbfNetwork(
         dt=records[0].dt,
@@ -171,6 +174,19 @@ def _covariance(work: Work, problem: RbfProblem, P: Array | None, how: str) -> t
     whole = np.zeros((work.theta.size, work.theta.size))
     whole[: P.shape[0], : P.shape[0]] = P
     return whole, origin, [] if work.everything or not work.shape.neurons else [GIVEN_UNITS]
+
+
+def _open(problem: RbfProblem, covariance: Array) -> list[str]:
+    """Name the numbers of the linear part that only the prior holds, which is next to none."""
+    held = np.diag(covariance)[: problem.n_active] * problem.precision[: problem.n_active] ** 2
+    n_line = sum(problem.shape.sizes[:2])
+    names = [name for name, x in zip(problem.shape.names[:n_line], held, strict=False) if x > _HELD]
+    if not names:
+        return []
+    return [
+        f"the data do not tell these numbers apart, their values mean nothing: {', '.join(names)}. Fewer lags, or a "
+        "richer excitation"
+    ]
 
 
 def _cautions(records: Sequence[IOData], data: Scaled, work: Work, taken: float) -> list[str]:

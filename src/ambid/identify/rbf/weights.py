@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 _BLOCK = 4096
 _GRID = 10.0 ** np.arange(-15.0, 4.0, 0.25)  # of sigma^2 / alpha^2, in squared singular values
+_BLIND = 1e-12  # part of the largest singular value of the linear part below which a direction is not there
 _FLOOR = 1e-14  # least variance of errors, scaled
 
 
@@ -74,16 +75,17 @@ def fitted_weights(shape: RbfShape, theta: Array, z: Array, y: Array, prior: flo
     if not np.all(np.isfinite(small)):
         raise np.linalg.LinAlgError("regressors are not finite")
     R[: small.shape[0]] = small
-    U, s, Vt = np.linalg.svd(R[d : d + h, d : d + h])
-    g = U.T @ R[d : d + h, d + h :]
-    rest = np.sum(R[d + h :, d + h :] ** 2, axis=0)
+    left, rank = _beyond(R[:, :d], R[:, d:])
+    U, s, Vt = np.linalg.svd(left[:, :h], full_matrices=False)
+    g = U.T @ left[:, h:]
+    rest = np.sum((left[:, h:] - U @ g) ** 2, axis=0)
     w, noise, alpha, effective = np.zeros((h, p)), np.empty(p), np.empty(p), np.empty(p)
     for o in range(p):
-        ratio, noise[o] = _ratio(s**2, g[:, o] ** 2, float(rest[o]), n - d, prior)
+        ratio, noise[o] = _ratio(s**2, g[:, o] ** 2, float(rest[o]), n - rank, prior)
         w[:, o] = Vt.T @ (s / (s**2 + ratio) * g[:, o])
         alpha[o] = np.sqrt(noise[o] / ratio)
-        effective[o] = d + np.sum(s**2 / (s**2 + ratio))
-    line = np.linalg.lstsq(R[:d, :d], R[:d, d + h :] - R[:d, d : d + h] @ w, rcond=1e-12)[0]
+        effective[o] = rank + np.sum(s**2 / (s**2 + ratio))
+    line = np.linalg.lstsq(R[:, :d], R[:, d + h :] - R[:, d : d + h] @ w, rcond=_BLIND)[0]
     found = np.concatenate([line[:-1].T.ravel(), line[-1], w.T.ravel(), theta[shape.n_weights :]])
     return Weights(theta=found, noise=noise, prior=alpha, effective=effective)
 
@@ -91,6 +93,15 @@ def fitted_weights(shape: RbfShape, theta: Array, z: Array, y: Array, prior: flo
 def _columns(shape: RbfShape, theta: Array, z: Array, y: Array) -> Array:
     known = [z] if shape.linear else []
     return np.hstack([*known, np.ones((z.shape[0], 1)), shape.activations(theta, z), y])
+
+
+def _beyond(known: Array, others: Array) -> tuple[Array, int]:
+    """Return what known columns, some of which may be the same, leave of others, and the rank of the known ones."""
+    U, s, _ = np.linalg.svd(known, full_matrices=False)
+    U = U[:, s > _BLIND * max(float(s[0]), 1e-300)]
+    for _ in range(2):  # twice is enough
+        others = others - U @ (U.T @ others)
+    return others, U.shape[1]
 
 
 def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float | None) -> tuple[float, float]:
