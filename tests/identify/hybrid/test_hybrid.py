@@ -376,6 +376,9 @@ def test_settings_that_make_no_sense_are_refused() -> None:
         hybrid([data], {"ny": 0, "nu": 0})
     with pytest.raises(EstimationError, match="neurons"):
         hybrid([data], {"neurons": "many"})
+    for void in ("ne", "neurons"):
+        with pytest.raises(EstimationError, match="innovations"):
+            hybrid([data], {"innovations": "network", void: 0})
     with pytest.raises(EstimationError, match="no record"):
         hybrid([], {})
     with pytest.raises(EstimationError, match="hybrid: record 1"):

@@ -109,4 +109,9 @@ def hybrid_settings(given: Mapping[str, object], *, n_inputs: int) -> HybridSett
     s = HybridSettings(**{**told, **({} if n_inputs else {"nu": 0, "nk": 1})})  # type: ignore[arg-type]
     if not s.ny and not s.nu:
         raise EstimationError("hybrid: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+    if s.innovations == "network" and 0 in (s.ne, s.neurons):
+        raise EstimationError(
+            "hybrid: innovations = network puts past innovations into the units, and ne or neurons is 0. Raise it, or "
+            "say innovations = linear"
+        )
     return s
