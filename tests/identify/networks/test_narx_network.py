@@ -9,6 +9,7 @@ from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.narx import narx
 from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.networks.narx_train import NarxProblem
 
 
 def data(u: np.ndarray, y: np.ndarray) -> IOData:
@@ -44,6 +45,35 @@ def test_slopes_are_those_of_a_complex_step(p: int, m: int, nk: int) -> None:
         moved = theta.astype(complex)
         moved[k] += 1e-30j
         np.testing.assert_allclose(J[:, :, k], shape.values(moved, z).imag / 1e-30, rtol=1e-12, atol=1e-14)
+
+
+def test_the_linear_numbers_are_at_their_best_for_the_units() -> None:
+    shape = NarxShape(n_outputs=2, n_inputs=1, ny=2, nu=1, nk=1, neurons=3)
+    rng = np.random.default_rng(2)
+    parts = tuple((rng.standard_normal((n, 2)), rng.standard_normal((n, 1))) for n in (50, 5000))
+    problem = NarxProblem(shape=shape, parts=parts, weight=np.array([1.5, 0.3]), prior=0.2)
+    theta = rng.standard_normal(shape.n_theta)
+    best, n = problem.solved(theta), problem.n_linear
+    np.testing.assert_array_equal(best[n:], theta[n:])
+    R = problem.triangle(best)
+    slope = R[:, :-1].T @ R[:, -1]
+    assert np.max(np.abs(slope[:n])) < 1e-9 * np.max(np.abs(slope[n:]))
+
+
+def test_training_does_not_creep_along_valleys() -> None:
+    # with the linear part among the numbers that are searched for: 60 iterations, and still stalled
+    ended = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        u, y, e = np.zeros(2000), np.zeros(2000), rng.standard_normal(2000)
+        for t in range(2, 2000):
+            u[t] = 0.9 * u[t - 1] + 0.4 * e[t]
+            y[t] = 1.6 * y[t - 1] - 0.7 * y[t - 2] + 0.1 * u[t - 1] - 0.03 * y[t - 1] ** 3
+        fit = narx([data(u, y + 1e-3 * rng.standard_normal(2000))], {"ny": 2, "nu": 2, "neurons": 6}, seed=seed)
+        assert fit.curves[0].training.size < 30
+        assert np.sqrt(fit.noise_covariance[0, 0]) < 2.1e-3
+        ended.append(fit.status)
+    assert ended.count("converged") >= 2
 
 
 def test_slopes_of_the_free_run() -> None:

@@ -189,13 +189,13 @@ def _hull(z: Array) -> Array | None:
 
 def _spread(x: Array, mean: Array, scale: Array) -> Array:
     """Choose regressors farthest first (Gonzalez 1985), beginning with the one nearest to the middle."""
-    z = x / scale
-    at = int(np.argmin(np.linalg.norm(z - mean / scale, axis=1)))
-    away = np.full(z.shape[0], np.inf)
+    z = np.ascontiguousarray((x / scale).T)  # samples last: sums over few regressors are slow otherwise
+    at = int(np.argmin(np.linalg.norm(z - (mean / scale)[:, None], axis=0)))
+    away = np.full(z.shape[1], np.inf)
     chosen = []
-    for _ in range(min(_MARKS, z.shape[0])):
+    for _ in range(min(_MARKS, z.shape[1])):
         chosen.append(at)
-        away = np.minimum(away, np.sum((z - z[at]) ** 2, axis=1))
+        away = np.minimum(away, np.sum((z - z[:, at, None]) ** 2, axis=0))
         at = int(np.argmax(away))
         if not away[at] > 0:
             break

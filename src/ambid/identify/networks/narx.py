@@ -53,6 +53,7 @@ _DEFAULTS: Mapping[str, object] = {
     "focus": "prediction",
     "uncertainty": "auto",
 }
+_ENOUGH = 1e-2  # gain that ends a search: a step of 0.1 standard deviations
 _FIRST = 12  # iterations of every start; only the best goes on
 
 
@@ -198,6 +199,8 @@ def _train(s: Mapping[str, object], shape: NarxShape, data: Scaled, work: Work, 
             held_out=watch,
             slack=0.0,
             tick=part_of(first, k / starts, (k + 1) / starts),
+            solved=problem.solved,
+            n_linear=problem.n_linear,
         )
         error = min(found.held_out) if held else found.cost
         if error < best_error:
@@ -205,15 +208,19 @@ def _train(s: Mapping[str, object], shape: NarxShape, data: Scaled, work: Work, 
             _keep(work, shape, best)
     problem = problem_at(shape, training, best, prior)
     found = search(
-        problem, best, stage="training", most=most, held_out=watch, tick=second, keep=lambda t: _keep(work, shape, t)
-    )
+        problem, best, stage="training", most=most, held_out=watch, tick=second, keep=lambda t: _keep(work, shape, t),
+        solved=problem.solved, n_linear=problem.n_linear, enough=_ENOUGH,
+    )  # fmt: skip
     _keep(work, shape, found.theta)
     _note(work, found, problem.n_errors, float(np.sqrt(np.mean(problem.weight**2))), "prediction")
     work.stopped_early = found.stopped_early
     work.held_out = held_out_error(shape, held, found.theta) if held else float("nan")
     if held and not found.stopped_early:  # nothing is overfitted: the held-out part may teach as well
         problem = problem_at(shape, data.parts, found.theta, prior)
-        found = search(problem, found.theta, stage="all data", most=most, tick=third)
+        found = search(
+            problem, found.theta, stage="all data", most=most, tick=third, solved=problem.solved,
+            n_linear=problem.n_linear, enough=_ENOUGH,
+        )  # fmt: skip
         _keep(work, shape, found.theta)
     work.status = "converged" if found.converged else "stalled"
     if not found.converged and len(found.costs) > most:  # a valley of networks that differ little: no fault of the data

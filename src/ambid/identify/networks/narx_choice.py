@@ -154,8 +154,9 @@ def _compared(shape: NarxShape, parts: Parts, share: float, prior: float, seed: 
     start = random_start(shape, linear_start(shape, training), np.random.default_rng(seed))
     problem = problem_at(shape, training, start, prior)
     found = search(
-        problem, start, stage="", most=_ITERATIONS, held_out=lambda t: held_out_error(shape, held, t), slack=0.0
-    )
+        problem, start, stage="", most=_ITERATIONS, held_out=lambda t: held_out_error(shape, held, t), slack=0.0,
+        solved=problem.solved, n_linear=problem.n_linear,
+    )  # fmt: skip
     return min(found.held_out)
 
 

@@ -124,6 +124,43 @@ class NarxProblem:
                     [(J * w[:, None]).reshape(-1, s.n_theta), (left[part] * w).reshape(-1, 1)]
                 )  # fmt: skip
 
+    @property
+    def n_linear(self) -> int:
+        """Leading numbers that one-step errors are linear in: L, c, W2; 0 for a free run."""
+        return 0 if self.free else sum(self.shape.sizes[:3])
+
+    def solved(self, theta: Array) -> Array:
+        """Return the weights with L, c and W2 at their best for these hidden units; of one-step errors alone.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        ndarray, shape (n_theta,)
+            As given where the units are not finite.
+        """
+        s = self.shape
+        _, _, _, W1, b1 = s.parts(theta)
+        blocks = []
+        for z, target in self.rows():
+            for k in range(0, z.shape[0], _BLOCK):
+                part = z[k : k + _BLOCK]
+                known = [part, np.ones((part.shape[0], 1)), np.tanh(part @ W1.T + b1)]
+                blocks.append(np.hstack([*known, target[k : k + _BLOCK]]))
+        R, p, d = triangle_of(blocks), s.n_outputs, s.n_regressors
+        if not np.all(np.isfinite(R)):
+            return theta
+        width = R.shape[1] - p
+        pull = np.full(width, 1.0 / self.prior)
+        pull[: d + 1] /= _LINEAR_PRIOR
+        found = np.empty((width, p))
+        for o in range(p):
+            rows = np.concatenate([R[:, :width], np.diag(pull / self.weight[o])])
+            found[:, o] = np.linalg.lstsq(rows, np.concatenate([R[:, width + o], np.zeros(width)]), rcond=1e-15)[0]
+        return np.concatenate([found[:d].T.ravel(), found[d], found[d + 1 :].T.ravel(), theta[self.n_linear :]])
+
     def sample_rows(self, theta: Array) -> list[Array]:
         """Return slopes and errors of every sample, of unit variance.
 

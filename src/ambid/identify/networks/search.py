@@ -111,6 +111,8 @@ def search(
     slack: float = 0.02,
     tick: Tick | None = None,
     keep: Callable[[Array], None] | None = None,
+    solved: Callable[[Array], Array] | None = None,
+    n_linear: int = 0,
 ) -> Found:
     """Search for the least sum of squares.
 
@@ -138,12 +140,19 @@ def search(
         Called before each iteration, with the share of this search that is over.
     keep : callable, optional
         Given each better vector, shape (n_theta,).
+    solved : callable, optional
+        Given a vector, return it with its first `n_linear` numbers at their best for the others: rows are linear in
+        them, and the search goes over the others alone (variable projection; Golub and Pereyra 1973, with Kaufman's
+        slopes).
+    n_linear : int, optional
 
     Returns
     -------
     Found
     """
     began, converged = perf_counter(), False
+    if solved is not None:
+        theta = solved(theta)
     cost = problem.cost(theta)
     seconds, costs = [0.0], [cost]
     held = [held_out(theta)] if held_out is not None else []
@@ -153,7 +162,7 @@ def search(
             tick(stage, max(k / most, guessed(k, _USUAL)))
         if not np.isfinite(cost):
             break
-        trial, trial_cost, damping, over = _step(problem, theta, cost, damping)
+        trial, trial_cost, damping, over = _step(problem, theta, cost, damping, solved, n_linear)
         if trial is None:
             converged = over
             break
@@ -185,11 +194,21 @@ def search(
     )
 
 
-def _step(problem: Problem, theta: Array, cost: float, damping: float) -> tuple[Array | None, float, float, bool]:
+def _step(
+    problem: Problem,
+    theta: Array,
+    cost: float,
+    damping: float,
+    solved: Callable[[Array], Array] | None,
+    n_linear: int,
+) -> tuple[Array | None, float, float, bool]:
     """Return a better vector (None without one), its cost, the next damping, and whether there is nothing to gain."""
     R = problem.triangle(theta)
     if not np.all(np.isfinite(R)):
         return None, cost, damping, False
+    R = R[n_linear:, n_linear:]  # slopes less what the linear numbers take over
+    if R.shape[1] < 2:
+        return None, cost, damping, True
     scale = np.linalg.norm(R[:, :-1], axis=0)
     scale = np.where(scale > 1e-150, scale, 1.0)
     U, s, Vt = np.linalg.svd(R[:, :-1] / scale, full_matrices=False)
@@ -199,8 +218,10 @@ def _step(problem: Problem, theta: Array, cost: float, damping: float) -> tuple[
     if to_gain <= 1e-13 * cost:
         return None, cost, damping, True
     while damping < 1e9:
-        step = (Vt.T @ (np.where(live, s / (s**2 + damping), 0.0) * along)) / scale
-        trial = theta + step
+        trial = theta.copy()
+        trial[n_linear:] += (Vt.T @ (np.where(live, s / (s**2 + damping), 0.0) * along)) / scale
+        if solved is not None:
+            trial = solved(trial)
         found = problem.cost(trial)
         if found < cost:
             return trial, found, max(damping / 10.0, 1e-14), False
