@@ -125,6 +125,8 @@ def command(
         from ambid.report.text import estimate_text
 
         typer.echo(estimate_text(estimate, paint=painter()))
+    if estimate.global_search is not None and estimate.global_search["interrupted"]:
+        raise typer.Exit(130)
     if strict and not (estimate.passed and (estimate.validation is None or estimate.validation["passed"])):
         raise typer.Exit(FAILED_CHECK)
 

@@ -180,6 +180,10 @@ class Estimate:
         Singular values of the scaled information matrix and the weakest direction.
     rig : Mapping[str, object]
         Name and channels of the rig, so that another record can be judged alike.
+    global_search : Mapping[str, object] or None
+        What a global search did where the ordinary starts failed: ``why``, ``evaluations``, ``seconds``,
+        ``criterion_before`` and ``criterion_after`` (per sample; None where there was none), ``taken``,
+        ``interrupted``. None: it was not needed.
     """
 
     status: Literal["converged", "stalled", "failed"]
@@ -200,6 +204,7 @@ class Estimate:
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    global_search: Mapping[str, object] | None = None
 
     def parameter(self, name: str) -> EstimatedParameter:
         """Return one parameter by name.

@@ -86,6 +86,7 @@ def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
         "warnings": list(estimate.warnings),
         "timing_s": dict(estimate.timing_s),
         "rig": dict(estimate.rig),
+        "global_search": None if estimate.global_search is None else dict(estimate.global_search),
     }
     return {name: plain_json(value) for name, value in document.items()}
 
@@ -225,4 +226,5 @@ def _from_json(d: Mapping[str, Any]) -> Estimate:
         timing_s=d["timing_s"],
         information=d["information"],
         rig=d["rig"],
+        global_search=d.get("global_search"),
     )  # fmt: skip

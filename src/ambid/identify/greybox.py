@@ -3,7 +3,7 @@
 Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for
 stable and unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole
 samples and then as a real number; noise is described by disturbance and sensor levels, or by a free predictor gain
-where the data ask for it.
+where the data ask for it. Where the starts lead nowhere, a global search gives others (`ambid.identify.global_start`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
+from ambid.identify.global_start import Rescue
 from ambid.identify.innovations import stable
 from ambid.identify.likelihood import Fit, score_statistic, search
 from ambid.identify.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.identify.predictor import assemble
 from ambid.identify.problem import PredictorProblem
+from ambid.identify.rescue import EVALUATIONS, reason, rescued
 from ambid.identify.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -37,6 +39,9 @@ def greybox(
     delay: Delay = "auto",
     noise: Literal["auto", "levels", "gain"] = "auto",
     tick: Callable[[], None] | None = None,
+    evaluations: int = EVALUATIONS,
+    seed: int = 0,
+    workers: int = 1,
 ) -> Fit:
     """Estimate the physical parameters of `model` from one record.
 
@@ -55,11 +60,20 @@ def greybox(
         likelihood rises by more than they cost (BIC).
     tick : callable, optional
         Called after each evaluation; may raise to interrupt.
+    evaluations : int, optional
+        Of the likelihood in a global search, at most; 0 for none. It is made only where the ordinary starts fail: none
+        makes a plant, no search converges, or a linear regression on the past explains much of what the best leaves.
+    seed : int, optional
+        Of the global search: equal seeds give equal results.
+    workers : int, optional
+        Threads of the global search; the result does not hang on them, and the time hardly (most of an evaluation is a
+        small Riccati equation, which does not leave Python's lock).
 
     Returns
     -------
     Fit
-        The best found; its status says whether the search converged.
+        The best found; its status says whether the search converged. `global_search` says whether there was one, and
+        what it gained. A KeyboardInterrupt of `tick` within the global search ends in the best so far, ``"stalled"``.
 
     Raises
     ------
@@ -68,7 +82,8 @@ def greybox(
     """
     _check(model, signals, parameters, delay)
     with one_thread():
-        return _greybox(model, signals, parameters, delay, noise, tick)
+        rescue = Rescue(evaluations=evaluations, seed=seed, workers=workers)
+        return _greybox(model, signals, parameters, delay, noise, tick, rescue)
 
 
 def _greybox(
@@ -78,11 +93,37 @@ def _greybox(
     delay: Delay,
     noise: Literal["auto", "levels", "gain"],
     tick: Callable[[], None] | None,
+    rescue: Rescue,
 ) -> Fit:
-    """Starts, then delay as a real number, then a free gain, each only where the data pay for it."""
+    """Ordinary starts, and others where those fail."""
     begun = perf_counter()
-    candidates = starts(model, signals, parameters, delay, tick=tick)
+
+    def followed(candidates: Sequence[Candidate]) -> Fit:
+        return _followed(candidates, tick, noise, search_delay=delay == "auto")
+
+    try:
+        candidates = starts(model, signals, parameters, delay, tick=tick)
+    except EstimationError as failure:
+        fit = rescued(None, str(failure), model, signals, parameters, delay, rescue, followed, tick)
+        if fit is None:
+            raise
+        return fit
     start_s = perf_counter() - begun
+    fit = followed(candidates)
+    why = reason(fit) if rescue.evaluations else ""
+    if why:
+        fit = rescued(fit, why, model, signals, parameters, delay, rescue, followed, tick) or fit
+    return replace(fit, start_s=start_s)
+
+
+def _followed(
+    candidates: Sequence[Candidate],
+    tick: Callable[[], None] | None,
+    noise: Literal["auto", "levels", "gain"],
+    *,
+    search_delay: bool,
+) -> Fit:
+    """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay."""
     fit: Fit | None = None
     for candidate in candidates:
         found = _searched(candidate, tick, with_disturbances=noise != "auto")
@@ -90,13 +131,11 @@ def _greybox(
         if found.status == "converged":
             break
     assert fit is not None
-    if delay == "auto":
+    if search_delay:
         fit = _with_fraction(fit, tick)
         if noise == "auto":
             fit = _without_disturbances(fit, tick)
-    if noise != "levels":
-        fit = _with_gain(fit, tick, force=noise == "gain")
-    return replace(fit, start_s=start_s)
+    return _with_gain(fit, tick, force=noise == "gain") if noise != "levels" else fit
 
 
 def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:

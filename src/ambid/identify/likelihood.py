@@ -6,7 +6,7 @@ to SciPy's trust-region optimiser with exact Jacobians; the weights are the inno
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -47,6 +47,8 @@ class Fit:
     evaluations : int
     start_s : float
         Time that finding start values took before this search, s.
+    global_search : Mapping[str, object] or None
+        What a global search did where the ordinary starts failed, see `ambid.identify.rescue.rescued`.
     """
 
     problem: PredictorProblem
@@ -59,6 +61,7 @@ class Fit:
     status: Status
     evaluations: int
     start_s: float = 0.0
+    global_search: Mapping[str, object] | None = None
 
 
 def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:

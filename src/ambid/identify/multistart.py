@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 Delay = float | Literal["auto"]
 
 MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
-_FARTHEST = 24  # samples: the search goes no farther
+FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
@@ -107,7 +107,7 @@ def starts(
     """
     delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
     scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
-    while delay == "auto" and scored and scored[0].problem.delay == delays[-1] < _FARTHEST:
+    while delay == "auto" and scored and scored[0].problem.delay == delays[-1] < FARTHEST:
         delays = [float(d) for d in range(int(delays[-1]) - 1, int(delays[-1]) + MAX_DELAY + 1)]
         scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
     if not scored:
@@ -121,16 +121,27 @@ def starts(
         close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
         if close and not any(candidate.like(r) for r in racers):
             racers.append(candidate)
-    return sorted((_raced(c, tick) for c in racers[:_RACE]), key=lambda c: c.criterion)
+    return sorted((raced(c, tick) for c in racers[:_RACE]), key=lambda c: c.criterion)
 
 
-def _raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
-    """Search a little way on a short stretch, and keep what does best on the whole record."""
+def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
+    """Search a little way on a short stretch, and keep what does best on the whole record.
+
+    Parameters
+    ----------
+    candidate : Candidate
+    tick : callable or None
+        Called after each evaluation.
+
+    Returns
+    -------
+    Candidate
+    """
     problem, vector = candidate.problem, candidate.vector
-    stretch = _busiest(problem.u, _SHORT)
+    stretch = busiest(problem.u, _SHORT)
     part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-    fit = search(part, _on(part, vector), rounds=3, tick=tick)
-    moved = _on(problem, fit.vector)
+    fit = search(part, at_first_sample(part, vector), rounds=3, tick=tick)
+    moved = at_first_sample(problem, fit.vector)
     # noise levels move slowly on a logarithmic scale: look again where they stand best
     work = Workspace(problem)
     both = (moved, with_linear_part(problem, moved, work), vector)
@@ -167,22 +178,32 @@ def _coarse(
     delays: Sequence[float],
 ) -> list[tuple[float, PredictorProblem, dict[str, float]]]:
     """Criterion on the busiest stretch, problem and start values of each band and delay, best first."""
-    stretch, floor, spread = _busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
+    stretch, floor, spread = busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
     noise = dict(zip(model.outputs, floor.tolist(), strict=True))
     found: list[tuple[float, PredictorProblem, dict[str, float]]] = []
     for d in delays:
         work: Workspace | None = None
-        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, _fixed(parameters))
+        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, fixed_values(parameters))
         for values, sizes in _possible(model, list(from_data), parameters):
             scales = scales_for(model, values, spread, floor, centred.rate_hz)
-            problem = _problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
+            problem = candidate_problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
             part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
             work = work or Workspace(part)  # the scaled data are the same for all candidates of a delay
             found.append((evaluate(part, _vector(part, values), work)[0], problem, values))
     return sorted(found, key=lambda c: c[0])
 
 
-def _fixed(parameters: Sequence[Parameter]) -> dict[str, float]:
+def fixed_values(parameters: Sequence[Parameter]) -> dict[str, float]:
+    """Return the values of those that are fixed.
+
+    Parameters
+    ----------
+    parameters : Sequence of Parameter
+
+    Returns
+    -------
+    dict of str to float, SI
+    """
     return {p.name: p.value for p in parameters if p.value is not None and p.role == "fixed"}
 
 
@@ -191,15 +212,25 @@ def _possible(
 ) -> Iterator[tuple[dict[str, float], dict[str, float]]]:
     """Yield start values that make a plant, and sizes: from the data, and with the values given (which may be zero)."""
     given = {p.name: p.value for p in parameters if p.value is not None}
-    bases = (from_data or [given])[:3] if given != _fixed(parameters) else []
+    bases = (from_data or [given])[:3] if given != fixed_values(parameters) else []
     for values, sizes in [*((v, v) for v in from_data), *(({**v, **given}, v) for v in bases)]:
         finite = all(np.isfinite(v) for v in values.values())
         if finite and len(values) == len(model.parameters) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0:
             yield values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
 
 
-def _busiest(u: Array, length: int) -> slice:
-    """The stretch of at most `length` samples in which the inputs move most."""
+def busiest(u: Array, length: int) -> slice:
+    """Return the stretch of at most `length` samples in which the inputs move most.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_samples, n_inputs)
+    length : int
+
+    Returns
+    -------
+    slice
+    """
     n = u.shape[0]
     if n <= length:
         return slice(0, n)
@@ -208,7 +239,7 @@ def _busiest(u: Array, length: int) -> slice:
     return slice(first, first + length)
 
 
-def _problem(
+def candidate_problem(
     model: LinearModel,
     signals: Signals,
     parameters: Sequence[Parameter],
@@ -217,7 +248,26 @@ def _problem(
     delay: float,
     skip: int,
 ) -> PredictorProblem:
-    """Set up the problem of one candidate."""
+    """Set up the problem of one candidate.
+
+    Parameters
+    ----------
+    model : LinearModel
+    signals : Signals
+        Means taken off.
+    parameters : Sequence of Parameter
+    sizes : Mapping[str, float]
+        Of the parameters, not negative, SI.
+    scales : Scales
+    delay : float
+        Samples.
+    skip : int
+        Samples left out at the start.
+
+    Returns
+    -------
+    PredictorProblem
+    """
     estimated = [p for p in parameters if p.role != "fixed"]
     reference = model.references(sizes)
     return PredictorProblem(
@@ -242,11 +292,21 @@ def _vector(problem: PredictorProblem, values: Mapping[str, float]) -> Array:
     """Write start values as a vector; nothing is known of offsets."""
     vector = np.zeros(problem.size)
     vector[problem.slices["physical"]] = np.array([values[k] for k in problem.estimated]) / problem.magnitude
-    return _on(problem, _with_level(problem, vector, _LEVELS[0]))
+    return at_first_sample(problem, _with_level(problem, vector, _LEVELS[0]))
 
 
-def _on(problem: PredictorProblem, vector: Array) -> Array:
-    """Return a copy whose initial state is that of the problem's data: its outputs at the first sample."""
+def at_first_sample(problem: PredictorProblem, vector: Array) -> Array:
+    """Return a copy whose initial state is that of the problem's data: its outputs at the first sample.
+
+    Parameters
+    ----------
+    problem : PredictorProblem
+    vector : ndarray, shape (size,)
+
+    Returns
+    -------
+    ndarray, shape (size,)
+    """
     out, model = vector.copy(), problem.model
     first, initial = problem.y[problem.skip], problem.slices["initial"].start
     for j, state in enumerate(model.states):

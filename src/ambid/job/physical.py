@@ -86,6 +86,8 @@ def identify(
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     clock.lap("fit")
     clock.split("fit", "initial", fit.start_s)
+    if fit.global_search is not None:
+        clock.split("fit", "global_search", float(str(fit.global_search["seconds"])))
     say("check")
     with one_thread():
         estimate = judged(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
@@ -146,7 +148,7 @@ def judged(
     checks |= assumption_checks(fit, known, delay_how)
     checks |= physical_checks(fit, known, bench, robust=robust)
     y, error = problem.y[problem.skip :], simulation_error(fit)
-    return estimate_of(
+    estimate = estimate_of(
         fit,
         known,
         rig.parameters,
@@ -166,6 +168,7 @@ def judged(
         },
         rig=_remembered(rig),
     )
+    return replace(estimate, global_search=fit.global_search)
 
 
 def _remembered(rig: Rig) -> dict[str, object]:
@@ -176,7 +179,11 @@ def _remembered(rig: Rig) -> dict[str, object]:
 
 def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
+    from ambid.identify.rescue import told
+
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
+    if fit.global_search is not None:
+        found.append(told(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
