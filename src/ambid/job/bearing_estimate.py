@@ -228,6 +228,21 @@ def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
+def _unseen(fit: BearingFit) -> list[str]:
+    """What no record can show, however well it is explained: the scale of the position, and whose an offset is."""
+    free, values = {n.name for n in fit.problem.estimated if n.prior_sd == float("inf")}, fit.problem.values(fit.vector)
+    found = []
+    scaled = ("k", "s") if fit.problem.law.gap == "hyperbolic" else ("zeta",)
+    if "m" in free and values["g"] == 0.0 and set(scaled) <= free:
+        found.append(
+            "a wrong gain of the position sensor cannot be seen while m is free: 1 % too much makes m 2 %, k_x 2 % and "
+            "k_i 1 % too small, and s and k 1 % too large. Fix m where it is weighed: the residuals then show it"
+        )
+    if "i0_asym" in free and "i_offset" not in free:
+        found.append("i0_asym may as well be an offset of the current sensor: the records do not tell them apart")
+    return found
+
+
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
@@ -237,6 +252,7 @@ def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> 
             "the model explains the records only in part: standard deviations are robust ones (scatter over the "
             "records), and cannot cover a bias that is the same everywhere"
         )
+    found += _unseen(fit)
     if fit.problem.drift:
         found.append("a slowly walking force takes up what the law leaves over; forces at rest count for less then")
     return tuple(found)

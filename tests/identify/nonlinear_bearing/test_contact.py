@@ -86,6 +86,7 @@ def test_the_impulse_of_the_force_is_that_of_the_weight_and_the_momentum(rests):
     for record in (thrown, replace(thrown, cut=np.arange(thrown.u.size) > 500)):
         assert weight_carried(LAW, TRUTH, record) == pytest.approx(1.0, abs=0.01)
         assert weight_carried(LAW, {**TRUTH, "k": 1.2 * TRUTH["k"]}, record) == pytest.approx(1.2, abs=0.02)
+    assert type(weight_carried(LAW, TRUTH, thrown)) is float  # a file takes no number of NumPy's
     # at the means of position and current the force is another, as it is not linear
     x, i = thrown.kept.mean(axis=0)
     assert abs(LAW.table(np.array([x]), np.array([i]), TRUTH)[0][0, 0] / 0.4905 + 1.0) > 0.02

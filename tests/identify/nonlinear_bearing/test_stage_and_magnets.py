@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.identify.nonlinear_bearing.estimate import estimate_bearing
-from ambid.identify.nonlinear_bearing.likelihood import search
+from ambid.identify.nonlinear_bearing.likelihood import criterion, search
 from ambid.identify.nonlinear_bearing.residual_test import whiteness
 from ambid.identify.nonlinear_bearing.uncertainty import uncertainty
 from ambid.identify.uncertainty import WEAK
@@ -148,3 +148,12 @@ def test_a_drop_that_is_left_out_shows(lossy):
     fit = estimate_bearing([record], KNOWN, laws=[EQUAL], extend=False, delay=1.0)
     assert whiteness(fit, 0).p < 1e-6
     assert fit.problem.values(fit.vector)["R"] > 1.8  # it is taken for a resistance
+
+
+def test_a_drop_that_changes_its_sign_within_a_sample_is_integrated_through_it():
+    b = bench(stage=PowerStage(v_drop=4.0, i_drop=0.01))
+    record, free = seen(b, 1500), {"k", "s", "m", "R", "v_drop", "i_drop"}
+    problem = problem_of([record], truth(b), EQUAL, free, NOISE, 1.0)
+    finer = replace(problem, substeps=8)
+    # steps of a whole sample would be wrong by hundreds
+    assert criterion(problem, problem.start()) == pytest.approx(criterion(finer, finer.start()), abs=3.0)

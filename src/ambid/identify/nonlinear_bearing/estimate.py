@@ -26,6 +26,9 @@ _NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole 
 _SHORT = 12  # iterations with which a whole delay is tried
 _TRIED = 15  # iterations with which laws are compared
 _LONG = 30  # iterations with which a richer law is
+_HINT = 1e-3  # of the leakage: how much it rises where only its promise is asked
+_KNEES = (0.4, 1.0, 3.0)  # times the knee at which a search begins
+_LIKELY = 0.5  # share of its price that a rising leakage must promise to be searched
 _STRETCH = 4000  # samples of each record on which laws are compared
 
 
@@ -180,9 +183,28 @@ def _extended(
     )  # fmt: skip
     if "L_rise" in new:
         numbers = tuple(replace(n, value=values["L_rise"]) if n.name == "L_rise" else n for n in numbers)
-    problem = replace(fit.problem, law=law, numbers=numbers)
+    problem, price = replace(fit.problem, law=law, numbers=numbers), len(new) * float(np.log(fit.problem.n_used))
+    if "L_rise" in new and fit.status == "converged" and not _rises(fit, problem, _LIKELY * price):
+        return fit
     found = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
-    return found if fit.criterion - found.criterion > len(new) * np.log(fit.problem.n_used) else fit
+    return found if fit.criterion - found.criterion > price else fit
+
+
+def _rises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:
+    """Whether a hint of a rising leakage promises enough, at any of a few knees (score test: a search takes longer)."""
+    names, start = [n.name for n in problem.estimated], _carried(fit, problem)
+    if not {"L_leak", "L_rise"} <= set(names):
+        return True
+    leak = fit.problem.values(fit.vector)["L_leak"]
+    start[names.index("L_leak")], start[names.index("L_rise")] = np.log(leak), np.log(_HINT * leak)
+    for share in _KNEES if "i_knee" in names else (1.0,):
+        beside = start.copy()
+        if "i_knee" in names:
+            beside[names.index("i_knee")] += np.log(share)
+        at = linearise(problem, beside)
+        if at is None or promise(at) > least:
+            return True
+    return False
 
 
 def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:

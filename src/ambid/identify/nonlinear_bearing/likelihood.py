@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.nonlinear.progress import Tick
-from ambid.identify.nonlinear_bearing.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem
+from ambid.identify.nonlinear_bearing.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
 
 Array = NDArray[np.float64]
 Status = Literal["converged", "stalled", "failed"]
@@ -159,10 +159,19 @@ def _knocks(problem: BearingProblem, r: int) -> Array:
 
 
 def _steps(problem: BearingProblem, r: int) -> int:
-    """Steps in a sample, a power of two: more where a slow record joins a fast one, and for an eddy pole."""
-    slow = 0.25 * max(problem.delays) / problem.records[r].rate_hz
-    wanted = problem.substeps * max(slow, EDDY_STEPS if problem.flags(r)[2] else 1.0, 1.0)
+    """Steps in a sample, a power of two: more where a slow record joins a fast one, for an eddy pole, for a drop."""
+    record = problem.records[r]
+    slow = 0.25 * max(problem.delays) / record.rate_hz
+    wanted = problem.substeps * max(slow, EDDY_STEPS if problem.flags(r)[2] else 1.0, _through(problem, record), 1.0)
     return int(2 ** round(np.log2(wanted)))
+
+
+def _through(problem: BearingProblem, record: BearingRecord) -> float:
+    """Steps in a sample that a stage's drop wants, two while the current runs through its width, and at most eight."""
+    drop, width = (next(n for n in problem.numbers if n.name == name) for name in ("v_drop", "i_drop"))
+    if not (drop.estimated or drop.value) or not record.kept[:, 1].min() < width.value > -record.kept[:, 1].max():
+        return 1.0
+    return min(2.0 * float(np.sqrt(np.mean(np.diff(record.kept[:, 1]) ** 2))) / width.value, 8.0)
 
 
 def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]:

@@ -49,4 +49,4 @@ def weight_carried(law: MagnetLaw, values: Mapping[str, float], record: BearingR
         rubbed = values.get("c", 0.0) * float(part[-1, 0] - part[0, 0]) * record.rate_hz
         found += float(np.sum(law.force(x, i, values))) - rubbed
         wanted += values["m"] * ((after - before) * record.rate_hz - values["g"] * part.shape[0])
-    return found / wanted if wanted else None
+    return float(found / wanted) if wanted else None
