@@ -156,3 +156,30 @@ def test_settings_as_they_are_written() -> None:
     assert read("ny=2, nu=2/3,prior=0.5,criterion=bic,neurons=auto,x=1e-3") == {
         "ny": 2, "nu": (2, 3), "prior": 0.5, "criterion": "bic", "x": 1e-3,
     }  # fmt: skip
+
+
+def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
+    words = ("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0")
+    for more, said in (
+        (("./r0.csv",), "record r0.csv is given twice; it would count twice. Leave one out"),
+        (("--validate", "r0.csv"), "--validate r0.csv is fitted to as well"),
+        (("--validate", "r0.csv", "--to", "3", "--validate-from", "2"), "--validate r0.csv is fitted to as well"),
+    ):
+        found = ambid(*words, *more)
+        assert (found.code, said in found.err) == (2, True), found.err
+    found = ambid(*words, "--to", "3", "--validate", "r0.csv", "--validate-from", "3")
+    assert found.code == 0, found.err
+
+
+@pytest.mark.parametrize(("place", "value"), [(("units",), []), (("model", "cloud", "marks", 0, 1), float("nan"))])
+def test_a_damaged_fit_is_refused_in_one_line(at, ambid, place, value) -> None:
+    out = at / "fit.json"
+    assert ambid("fit", "r0.csv", "--structure", "narx", *WORDS, "--settings", "iterations=1", "--json", out).code == 0
+    document = inside = json.loads(out.read_text())
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = value
+    out.write_text(json.dumps(document), encoding="utf-8")
+    found = ambid("validate", out, "r1.csv")
+    assert found.code == 2, found.err
+    assert "is not a whole fit" in found.err

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -153,3 +154,58 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
     assert document["status"] == "stalled"
     assert any("did not converge" in w for w in document["warnings"])
     assert "– stalled" in found.out.splitlines()[0]
+
+
+def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
+    copy = at / "copy.csv"
+    copy.write_bytes(Path("r1.csv").read_bytes())
+    words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear")
+    for more, said in (
+        ((copy,), "r1.csv and copy.csv hold the same samples; they would count twice. Leave one out"),
+        (("--held", copy), "r1.csv and copy.csv hold the same samples"),
+        (("--validate", copy), "copy.csv, to judge on, holds samples that the estimate is fitted to"),
+        (("--off-below", "1e300"), "every voltage is at or below off_below"),
+    ):
+        found = ambid(*words, *more)
+        assert found.code == 2, found.out + found.err
+        assert said in found.err
+        assert found.err.count("\n") == 1
+
+
+def test_a_second_ctrl_c_writes_nothing_even_if_the_search_took_it_for_the_first(at, ambid, monkeypatch) -> None:
+    def takes_all(taken, *, tick):
+        for _ in range(2):
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                tick("search")
+            except KeyboardInterrupt:
+                pass  # as a search does, which then goes on with its best
+
+    monkeypatch.setattr("ambid.job.nonlinear_bearing.identify_taken", takes_all)
+    found = ambid("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--json", at / "ball.json")
+    assert found.code == 130, found.out + found.err
+    assert found.err == "ambid: interrupted; nothing was written\n"
+    assert not list(at.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("fit_by_record", "r1.csv", "current", "innovation_sd"), {}),
+        (("fit_by_record", "r1.csv", "current", "innovation_sd"), "x"),
+        (("fit_by_record", "r1.csv"), {}),
+        (("noise", "r1.csv"), {}),
+        (("rig",), None),
+    ],
+)
+def test_a_damaged_estimate_is_refused_in_one_line(at, ambid, place, value) -> None:
+    document = json.loads(by_hand({"ball.csv": seen(1)}).dumps())
+    names = list(document["noise"])
+    inside = document
+    for key in place[:-1]:
+        inside = inside[names[0] if key == "r1.csv" else key]
+    inside[names[0] if place[-1] == "r1.csv" else place[-1]] = value
+    (at / "damaged.json").write_text(json.dumps(document), encoding="utf-8")
+    found = ambid("validate", at / "damaged.json", "r1.csv")
+    assert found.code == 2, found.err
+    assert "is not a whole estimate" in found.err

@@ -144,3 +144,28 @@ def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, ri
     assert taken.record.u.max() == high
     assert taken.record.u.size == u.size  # none thrown away
     assert "the limit was taken" in taken.warnings[0]
+
+
+def test_one_signal_in_two_channels_is_refused_and_a_held_rotor_that_moves_is_told(balls, rig):
+    from ambid.job.bearing_checks import checked_together
+    from ambid.job.bearing_records import Reading, bearing_rig, taken_record
+
+    bench = bearing_rig(rig)
+    free = taken_record(balls[0], bench, Reading())
+    twice = replace(free.record, y=np.column_stack([1e-4 * free.record.y[:, 1] + 0.01, free.record.y[:, 1]]))
+    with pytest.raises(EstimationError, match="position and current are one signal but for scale and offset"):
+        checked_together([replace(free, record=twice)], None)
+    rocking = taken_record(balls[1], bench, Reading(), held=True)
+    (moving, told) = checked_together([free, rocking], None)
+    assert not moving.warnings
+    assert "said to be held, but its position scatters by" in told.warnings[-1]
+
+
+def test_a_failed_search_is_refused_in_words(balls, rig, monkeypatch):
+    from types import SimpleNamespace
+
+    monkeypatch.setattr(
+        "ambid.identify.nonlinear_bearing.estimate.estimate_bearing", lambda *_, **__: SimpleNamespace(status="failed")
+    )
+    with pytest.raises(EstimationError, match="the search led to numbers without a predictor"):
+        identify_nonlinear(balls, rig)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from ambid.cli.interrupts import Stop, interruptible, signals
-from ambid.cli.options import FAILED_CHECK, json_path
+from ambid.cli.options import FAILED_CHECK, json_path, refuse_twice
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 from ambid.errors import EstimationError, nearest
@@ -80,6 +81,8 @@ def fit_records(
     with Outputs(*records, second, rig) as files:
         files.claim(json_path(json), "--json")
         files.claim(plot, "--plot", (".png", ".svg", ".pdf"))
+        refuse_twice(records)
+        _check_second(records, part, second, second_part)
         wanted = settings_of(settings)
         with signals(stop.take), progress("fit") as show:
             found = fit_nonlinear(
@@ -100,6 +103,7 @@ def fit_records(
                 seed=seed,
                 tick=interruptible(show, stop),
             )
+            stop.torn()
             if plot is not None and found.model is not None:
                 show("draw")
                 _draw(found, records, second, files, plot, inputs, outputs, part, second_part, rate, gaps, rig)
@@ -114,6 +118,19 @@ def fit_records(
         raise typer.Exit(stop.code)
     if found.status == "failed" or (strict and not found.passed):
         raise typer.Exit(FAILED_CHECK)
+
+
+def _check_second(records: Sequence[Path], part: Part, second: Path | None, second_part: Part) -> None:
+    """Refuse to judge on samples that are fitted to; another part of a record is another record."""
+    if second is None or second.resolve() not in {x.resolve() for x in records}:
+        return
+    (a, b), (c, d) = part, second_part
+    begin, end = max(a or -inf, c or -inf), min(inf if b is None else b, inf if d is None else d)
+    if not begin >= end:
+        raise EstimationError(
+            f"--validate {second} is fitted to as well: errors there say nothing about other records. Give another, or "
+            "parts that do not overlap (--from, --to, --validate-from, --validate-to)"
+        )
 
 
 def settings_of(text: str) -> Settings:

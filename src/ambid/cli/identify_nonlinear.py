@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from ambid.cli.interrupts import Stop, interruptible, signals
-from ambid.cli.options import FAILED_CHECK, json_path
+from ambid.cli.options import FAILED_CHECK, json_path, refuse_twice
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError
@@ -140,6 +140,7 @@ def identify_records(
                 how=Reading(from_s=part[0], to_s=part[1], rate_hz=rate, gaps=gaps), tick=tick,
             )  # fmt: skip
             estimate = identify_taken(taken, tick=tick)
+            stop.torn()
             if plot or report:
                 show("draw")
                 _draw(estimate, taken.taken, outputs, plot, report)
@@ -160,11 +161,7 @@ def _check(records: Sequence[Path], wishes: Wishes) -> None:
     """Refuse what would count data twice, and numbers that are none."""
     if wishes.off_below is not None and not isfinite(wishes.off_below):
         raise AmbidError(f"--off-below is {wishes.off_below}; it is a voltage in V. Give a number")
-    seen = set[Path]()
-    for path in (*records, *wishes.held):
-        if path.resolve() in seen:
-            raise AmbidError(f"record {path} is given twice; it would count twice. Leave one out")
-        seen.add(path.resolve())
+    refuse_twice([*records, *wishes.held])
 
 
 def _draw(

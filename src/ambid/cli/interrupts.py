@@ -92,6 +92,17 @@ class Stop:
         """
         return self.number is not None
 
+    def torn(self) -> None:
+        """Interrupt at once if there was a second signal: a search may have taken its interruption for the first one's.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            After a second signal.
+        """
+        if self._torn:
+            raise KeyboardInterrupt
+
     @property
     def code(self) -> int:
         """Exit code: 0 without a signal, else 128 and its number."""
@@ -111,13 +122,15 @@ def interruptible(show: Tick, stop: Stop) -> Tick:
     Returns
     -------
     Tick
-        Raises KeyboardInterrupt at the first call after the wish, but not in the stage ``"check"``.
+        Raises KeyboardInterrupt at the first call after the wish, but not in the stage ``"check"``; after a second
+        signal, at every call.
     """
     told = False
 
     def tick(stage: str, done: float | None = None, /) -> None:
         nonlocal told
         show(stage, done)
+        stop.torn()
         if stop.wished() and not told and stage != "check":
             told = True
             raise KeyboardInterrupt

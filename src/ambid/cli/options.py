@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -143,3 +143,22 @@ def preset_of(name: str) -> Preset | None:
     if name in preset_names() or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
         return preset(name)
     return None
+
+
+def refuse_twice(records: Sequence[Path]) -> None:
+    """Refuse to count data twice: standard deviations would come out too small.
+
+    Parameters
+    ----------
+    records : sequence of Path
+
+    Raises
+    ------
+    AmbidError
+        Naming the first record that is given twice.
+    """
+    seen = set[Path]()
+    for path in records:
+        if path.resolve() in seen:
+            raise AmbidError(f"record {path} is given twice; it would count twice. Leave one out")
+        seen.add(path.resolve())

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from ambid.errors import EstimationError
 from ambid.job._progress import Tick, silent
+from ambid.job.bearing_checks import checked_together
 from ambid.job.bearing_estimate import judged
 from ambid.job.bearing_records import Magnet, Reading, TakenRecord, bearing_rig, known_numbers, laws_of, taken_record
 from ambid.physics.parameters import Parameter
@@ -180,7 +181,8 @@ def read_records(
             f"{second.record.name}, to judge on, is sampled at {second.record.rate_hz:g} Hz, the records at {known}; "
             "they have to agree. Resample it, or leave --validate out"
         )
-    return BearingJob(rig=bench, taken=tuple(taken), second=second, read_s=time.perf_counter() - begun)
+    checked = checked_together(taken, second)
+    return BearingJob(rig=bench, taken=checked, second=second, read_s=time.perf_counter() - begun)
 
 
 def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBearingEstimate:
@@ -213,6 +215,11 @@ def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBea
         delay=None if wanted == "auto" else float(wanted), extend=extend, eddy=bench.magnet.eddy,
         drift=bench.magnet.drift, tick=say,
     )  # fmt: skip
+    if fit.status == "failed":
+        raise EstimationError(
+            "the search led to numbers without a predictor for these records; no law explains them. Check columns, "
+            "signs and units"
+        )
     fitted = time.perf_counter()
     say("check")
     estimate = judged(fit, uncertainty(fit), job.taken, delay_given=wanted != "auto")

@@ -110,6 +110,8 @@ class Cloud:
             If something is missing or of another shape.
         """
         marks = np.array(found["marks"], dtype=np.float64).reshape(-1, n)
+        if not np.all(np.isfinite(marks)):
+            raise ValueError("a mark of the cloud is no finite number")
         return cls(
             mean=np.array(found["mean"], dtype=np.float64).reshape(n),
             whitening=np.array(found["whitening"], dtype=np.float64).reshape(n, n),

@@ -142,6 +142,8 @@ def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
     model = None if d["model"] is None else model_from_json(d["model"])
     if (model is None) != (d["status"] == "failed"):
         raise ValueError("a failed fit has no model, every other has one")
+    if not isinstance(d["units"], Mapping):
+        raise ValueError("the units are not by column")
     noise = _numbers(d["noise_covariance"])
     covariance = None if d["covariance"] is None else _numbers(d["covariance"]["matrix"])
     if noise.shape != (len(outputs),) * 2:

@@ -272,8 +272,14 @@ def _consistent(e: NonlinearBearingEstimate) -> None:
     if len(e.noise) != len(e.records) or list(e.fit) != list(e.noise):
         raise ValueError("noise, fits and records are not of the same number")
     for levels in e.noise.values():
-        if set(levels) - set(LEVELS) or not all(0 < x < math.inf for x in levels.values()):
+        if not levels or set(levels) - set(LEVELS) or not all(0 < x < math.inf for x in levels.values()):
             raise ValueError("the noise levels are not those of a predictor")
+    for record, of in zip(e.records, e.fit.values(), strict=True):
+        sizes = [f.innovation_sd for f in of.values()]
+        if set(of) != (set(_ROLES) - ({"position"} if record["held"] else set())) or not all(x > 0 for x in sizes):
+            raise ValueError("the fits are not those of position and current")
+    if not isinstance(e.rig, Mapping):
+        raise ValueError("the rig is none")
     hulls = (e.hull, e.coil_hull)
     if (
         any(h.ndim != 2 or h.shape[1] != 2 for h in hulls)
