@@ -83,7 +83,7 @@ def test_what_it_found_is_the_truth(finished):
 def test_what_it_says_has_digits_and_units_for_people(finished):
     _, done, _, _ = finished
     said = {s.name: s.findings for s in done.steps}
-    assert said["self-test"][1] == "supply 5 V, position 921 and current 510.8 counts"
+    assert said["self-test"][1] == "supply 5 V, position 921 and current 511.7 counts"
     assert re.fullmatch(r"position at rest 1 mm, noise \d\.\d\d um rms", said["rest"][0])
     assert re.fullmatch(r"current -?[\d.]+ [mu]A, \d+\.\d+ mA rms", said["levitate"][1])
     assert re.fullmatch(r"voltage -?[\d.]+ [mu]?V, \d{3} mV rms", said["levitate"][2])
@@ -193,7 +193,7 @@ def test_a_noisy_sensor_stops_it_at_rest(tmp_path):
 
 def test_current_with_the_output_off_stops_it_at_rest(tmp_path):
     device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 150))
-    stopped_at("rest", ran(tmp_path, device), "364 mA", "output off", "channels.current")
+    stopped_at("rest", ran(tmp_path, device), "366 mA", "output off", "channels.current")
 
 
 def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
@@ -287,7 +287,7 @@ def test_a_line_that_is_lost_stops_it_with_that_reason_and_keeps_the_record(tmp_
 
 
 def test_a_fixed_value_that_is_wrong_stops_it(tmp_path):
-    rig = prototype(('R   = { unit = "ohm" }', 'R = { value = 9.0, unit = "ohm", role = "fixed" }'))
+    rig = prototype(('R   = { value = 6.0, unit = "ohm" }', 'R = { value = 9.0, unit = "ohm", role = "fixed" }'))
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig, wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "speaks against R = 9 ohm", "Check that value, or free it")
     assert "estimate.json" in files(tmp_path)
