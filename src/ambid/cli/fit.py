@@ -95,7 +95,13 @@ def command(
     json: JsonFile = None,
     plot: Annotated[
         Path | None,
-        typer.Option("--plot", metavar="FILE.png", help="Draw signals, residuals, Bode and poles.", show_default=False),
+        typer.Option(
+            "--plot",
+            metavar="FILE.png",
+            help="Draw signals, residuals, Bode and poles; of a nonlinear structure signals, errors, coefficients and"
+            " learning curves.",
+            show_default=False,
+        ),
     ] = None,
     stabilisation: Annotated[
         Path | None,

@@ -28,7 +28,12 @@ Records = Annotated[
 ]
 PlotFile = Annotated[
     Path | None,
-    typer.Option("--plot", metavar="FILE.png", help="Draw signals, residuals, Bode and poles.", show_default=False),
+    typer.Option(
+        "--plot",
+        metavar="FILE.png",
+        help="Draw signals, residuals, Bode and poles; with --nonlinear curves with bands, and every record.",
+        show_default=False,
+    ),
 ]
 ReportFile = Annotated[
     Path | None,

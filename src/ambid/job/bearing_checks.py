@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ambid.identify.nonlinear_bearing.problem import BearingRecord
 
 _SAME = 1e-9  # part of a channel's spread that another one leaves over, at or below which both are the same signal
-_ROCKS = 0.1  # spread of a held position over that of the moving ones from which it is told
+_ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
 
 
 def checked_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
