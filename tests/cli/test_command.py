@@ -31,7 +31,7 @@ USAGE = {
     "no duration": (["simulate", "thesis", "-o", "x.csv", "--duration", "0"], "must be 1 to 1e8"),
     "nonlinear rig": (
         ["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--nonlinear"],
-        "only presets are nonlinear",
+        "has no [magnet]; a nonlinear simulation needs one",
     ),
     "rig without rate": (["simulate", "rig.toml", "-o", "x.csv"], "Give --rate HZ"),
     "rig without values": (["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--amplitude", "1"], "no value"),
