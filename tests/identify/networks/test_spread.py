@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.narx import narx
 from ambid.identify.networks.nn import nn
+from ambid.identify.networks.nn_spread import disagreement
+from ambid.identify.networks.nn_train import State
 from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance
 from ambid.identify.nonlinear.fit import NonlinearFit
 from tests.identify.networks.test_narx_network import data
-from tests.identify.networks.test_state_network import sampled
+from tests.identify.networks.test_state_network import one_axis, sampled
 
 
 def coloured(n: int, seed: int, size: float, pole: float = 0.9) -> np.ndarray:
@@ -177,3 +181,37 @@ def covered(fit: NonlinearFit, U: np.ndarray, Y: np.ndarray) -> np.ndarray:
     J = np.stack([(p - m) / 2e-5 for p, m in both], axis=1)
     off = fit.model.simulate(U, Y)[5::6, 0] - Y[5::6, 0]
     return np.asarray(np.abs(off) < 1.96 * np.sqrt(np.einsum("tp,pq,tq->t", J, fit.covariance, J)))
+
+
+@pytest.mark.parametrize("residual", ["anchored", "orthogonal"])
+def test_intervals_of_a_free_run_of_physics_with_a_network_cover_the_truth(residual: str) -> None:
+    def plant(u: np.ndarray) -> np.ndarray:
+        x = np.zeros(u.size)
+        for t in range(1, u.size):
+            x[t] = 0.8 * x[t - 1] + 0.5 * np.tanh(1.5 * u[t - 1])
+        return x
+
+    u0, inside = 0.75 * np.random.default_rng(99).standard_normal(60), []
+    for seed in range(12):
+        u = coloured(600, seed, 0.6, 0.6)
+        y = plant(u) + 0.05 * np.random.default_rng(seed).standard_normal(600)
+        told = {"states": 1, "delay": 0, "descent": 0, "neurons": 3, "starts": 1, "residual": residual}
+        fit = nn([data(u, y)], told, seed=seed)
+        assert fit.covariance_from == "laplace"
+        inside.append(covered(fit, u0[:, None], plant(u0)[:, None]))
+        assert any(("operating point" if residual == "anchored" else "another record") in w for w in fit.warnings)
+    assert np.mean(inside) > 0.88, np.mean(inside)  # 0.945 and 1.0 over 20 records
+
+
+def test_starts_that_fit_as_well_with_other_weights_widen() -> None:
+    layout = one_axis(1, anchored=True, gain=False)
+    theta = np.random.default_rng(0).standard_normal(layout.n_theta)
+    one = State(layout=layout, theta=theta, x0=np.zeros((1, 3)), noise=0.01 * np.eye(2), n_rows=100)
+    other = replace(one, theta=theta + 0.3 * np.eye(theta.size)[0], noise=0.0101 * np.eye(2))
+    worse = replace(other, noise=0.011 * np.eye(2))
+    covariance = 0.01 * np.diag(layout.unit**2)
+    extra, told = disagreement(one, [one, other, worse], covariance)
+    assert extra[0, 0] == pytest.approx((0.3 * layout.unit[0]) ** 2)
+    assert np.count_nonzero(extra) == 1
+    assert "a21 by 3.0" in told[0]
+    assert disagreement(one, [one, worse], covariance)[1] == ()

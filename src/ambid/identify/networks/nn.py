@@ -253,7 +253,7 @@ def _rescued(
             said + f"improved the errors from {_size(before)} to {_size(after)} of the outputs' deviations"
         )
     work.state, work.base, work.status = after, second.base, second.status
-    work.data, work.delay = second.data, second.delay
+    work.data, work.delay, work.rivals = second.data, second.delay, second.rivals
     work.curves += second.curves
     return ""
 

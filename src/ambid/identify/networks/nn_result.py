@@ -62,7 +62,7 @@ def finished(
         reason = "the network does not stay finite on the records that it was trained on: check the columns"
         return failed_fit("nn", records, used, seed, reason, work.timing_s)
     began = perf_counter()
-    spread = spread_of(state, data, str(used["uncertainty"]), seed, tick)
+    spread = spread_of(state, data, str(used["uncertainty"]), seed, tick, work.rivals)
     covariance, condition = spread.covariance, spread.condition
     work.timing_s["standard deviations"] = perf_counter() - began
     warnings = [*work.warnings, *_cautions(records, state), *spread.warnings]

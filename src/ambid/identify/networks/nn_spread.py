@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,18 @@ from ambid.identify.nonlinear.progress import Tick
 Array = NDArray[np.float64]
 
 
+_AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
 _LONG = 1.0 / 16.0  # of a record, as a block: where it goes hangs together for as long as its slowest motion lasts
+
+
+_PROJECTED = (
+    "A and B are the best linear approximation over this record, and their deviations count that another record would "
+    "go elsewhere; those of predictions, in which the network makes up for that, come out too large"
+)
+_ANCHORED = (
+    "A and B are the slope that the network gives at the operating point; what its units cannot follow of the plant is "
+    "not in their standard deviations. Compare a fit with more neurons, or with a smaller swing"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +54,9 @@ class Spread:
     warnings: tuple[str, ...] = ()
 
 
-def spread_of(state: State, data: Scaled, how: str, seed: int, tick: Tick | None) -> Spread:
+def spread_of(
+    state: State, data: Scaled, how: str, seed: int, tick: Tick | None, rivals: Sequence[State] = ()
+) -> Spread:
     """Return the spread of trained weights.
 
     Parameters
@@ -54,6 +68,8 @@ def spread_of(state: State, data: Scaled, how: str, seed: int, tick: Tick | None
         white, else the sandwich.
     seed : int
     tick : callable or None
+    rivals : sequence of State, optional
+        What other starts of a hidden layer came to.
 
     Returns
     -------
@@ -79,9 +95,53 @@ def spread_of(state: State, data: Scaled, how: str, seed: int, tick: Tick | None
         P, origin = bootstrapped(problem.sample_rows(v), _penalty_rows(problem, v), seed, tick), "bootstrap"
     unit, k = state.layout.unit, state.theta.size
     P = P[:k, :k]
+    said: tuple[str, ...] = ()
     if any(isinstance(p, Orthogonal) for p in state.penalties):
         P = P + _projection(state, problem)
-    return Spread(covariance=P * unit[:, None] * unit, origin=origin, condition=condition)
+        said = (_PROJECTED,)
+    elif state.layout.neurons:
+        said = (_ANCHORED,)
+    covariance = P * unit[:, None] * unit
+    extra, more = disagreement(state, rivals, covariance)
+    return Spread(covariance=covariance + extra, origin=origin, condition=condition, warnings=(*said, *more))
+
+
+def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return what starts that fit about as well disagree by, to be added to the covariance, and what to say of it.
+
+    A hidden layer of few units only comes near to what the plant does: where other starts end with errors as small but
+    other A and B, the likelihood alone is too sure of them.
+
+    Parameters
+    ----------
+    state : State
+        The network that was taken.
+    rivals : sequence of State
+        Of other starts, with the same weights of physics.
+    covariance : ndarray, shape (n_theta, n_theta)
+        In the units of the model's weights.
+
+    Returns
+    -------
+    extra : ndarray, shape (n_theta, n_theta)
+    warnings : tuple of str
+    """
+    k = len(state.layout.entries)
+    unit, extra = state.layout.unit[:k], np.zeros_like(covariance)
+    close = [r for r in rivals if r.score < state.score + _AS_GOOD * state.layout.p and r.layout.neurons]
+    if len(close) < 2:
+        return extra, ()
+    apart = np.array([(r.theta[:k] - state.theta[:k]) * unit for r in close])
+    extra[:k, :k] = apart.T @ apart / (len(close) - 1.0)
+    ratio = np.sqrt(np.diag(extra)[:k] / np.maximum(np.diag(covariance)[:k], 1e-300))
+    if not np.max(ratio) > 1.0:
+        return extra, ()
+    worst = int(np.argmax(ratio))
+    return extra, (
+        f"starts of the hidden layer that fit about as well disagree about {state.layout.names[worst]} by "
+        f"{ratio[worst]:.1f} of the deviations that the likelihood gives; standard deviations count that. More neurons "
+        "or starts, or a smaller swing, settle it",
+    )
 
 
 def _projection(state: State, problem: StateProblem) -> Array:

@@ -46,6 +46,8 @@ class Work:
     data : Scaled
         Each output beside the input that acts at its time.
     delay : int
+    rivals : list of State
+        What every start of a hidden layer came to.
     """
 
     state: State | None = None
@@ -57,6 +59,7 @@ class Work:
     base: State | None = None
     data: Scaled = field(default_factory=_nothing)
     delay: int = 0
+    rivals: list[State] = field(default_factory=list)
 
 
 def trained_start(start: Start, data: Scaled) -> State | None:
@@ -117,6 +120,7 @@ def identify(s: Mapping[str, Any], data: Scaled, work: Work, seed: int, tick: Ti
                 tick=part_of(hidden, k / starts, (k + 1) / starts),
             )  # fmt: skip
             _take(work, found)
+            work.rivals += [found[0]] if found else []
     _gain(s, data, work, first, most, gain)
     work.timing_s["training"] = perf_counter() - began
 

@@ -141,9 +141,9 @@ def search(
     keep : callable, optional
         Given each better vector, shape (n_theta,).
     solved : callable, optional
-        Given a vector, return it with its first `n_linear` numbers at their best for the others: rows are linear in
-        them, and the search goes over the others alone (variable projection; Golub and Pereyra 1973, with Kaufman's
-        slopes).
+        Given a vector, shape (n_theta,), return it with its first `n_linear` numbers at their best for the others.
+        Rows are linear in them, and the search goes over the others alone (variable projection; Golub and Pereyra
+        1973, with Kaufman's slopes).
     n_linear : int, optional
 
     Returns
