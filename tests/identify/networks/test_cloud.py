@@ -40,11 +40,12 @@ def test_directions_that_do_not_move_are_very_narrow() -> None:
 def drawn(d: int, n: int, kind: str, seed: int) -> np.ndarray:
     """Regressors in d dimensions, of very different sizes, that hang together."""
     rng, mixed = np.random.default_rng(seed), np.random.default_rng(d)
-    x = rng.standard_normal((n, d)) if kind == "normal" else rng.uniform(-1.0, 1.0, (n, d))
+    draw = {"normal": rng.standard_normal, "skewed": rng.standard_exponential}.get(kind)
+    x = draw((n, d)) if draw else rng.uniform(-1.0, 1.0, (n, d))
     return np.asarray(x @ mixed.standard_normal((d, d)) * 10.0 ** mixed.integers(-3, 4, d) + 3.0)
 
 
-@pytest.mark.parametrize("kind", ["normal", "uniform"])
+@pytest.mark.parametrize("kind", ["normal", "uniform", "skewed"])
 @pytest.mark.parametrize("d", range(2, 9))
 def test_outside_the_hull_is_novel_and_the_dense_part_is_not(d: int, kind: str) -> None:
     x = drawn(d, 3000, kind, 1)
