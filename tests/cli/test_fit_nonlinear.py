@@ -183,3 +183,24 @@ def test_a_damaged_fit_is_refused_in_one_line(at, ambid, place, value) -> None:
     found = ambid("validate", out, "r1.csv")
     assert found.code == 2, found.err
     assert "is not a whole fit" in found.err
+
+
+def test_strict_looks_at_the_second_record(at, ambid) -> None:
+    rng = np.random.default_rng(7)
+    u, y = rng.uniform(-1, 1, 300), rng.standard_normal(300)
+    table = np.column_stack([np.arange(300) / 100, u, y])
+    np.savetxt(at / "noise.csv", table, delimiter=",", header="time [s],u [V],y [m]", comments="")
+    fit = at / "held.json"
+    told = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0,degree=2", "--json", fit,
+                 "--validate", at / "noise.csv", "--strict")  # fmt: skip
+    assert told.code == 3
+    assert "it does not hold on the second record: one-step errors of y are " in told.out
+    judged = ambid("validate", fit, at / "noise.csv", "--strict")
+    assert judged.code == 3
+    assert "times as large as at identification" in judged.out
+    assert json.loads(ambid("validate", fit, at / "noise.csv", "--json", "-").out)["passed"] is False
+    assert ambid("validate", fit, "r2.csv", "--strict").code == 0
+    linear = at / "linear.json"
+    ambid("fit", "r0.csv", "--structure", "arx", *WORDS, "--orders", "na=2,nb=2,nk=1", "--json", linear)
+    assert ambid("validate", linear, "r2.csv", "--strict").code == 0
+    assert ambid("validate", linear, at / "noise.csv", "--strict").code == 3

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, SecondRecord, fixed_of, orders_of
-from ambid.cli.fit_nonlinear import fit_records, one_record, only_one, refuse_linear_only
+from ambid.cli.fit_nonlinear import against_second, fit_records, one_record, only_one, refuse_linear_only
 from ambid.cli.options import FAILED_CHECK, From, Gaps, JsonFile, Rate, RigFile, Strict, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
@@ -211,7 +211,10 @@ def command(
             from ambid.report.sensitivity import sensitivity_text
 
             typer.echo("\n" + sensitivity_text(matter, paint=painter()))
-    if strict and not (found.passed and (physical is None or physical.passed)):
+    against = against_second(found)
+    if json != "-" and against:
+        typer.echo("\n".join(against))
+    if strict and (against or not (found.passed and (physical is None or physical.passed))):
         raise typer.Exit(FAILED_CHECK)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -17,6 +17,7 @@ from ambid.errors import EstimationError, nearest
 
 if TYPE_CHECKING:
     from ambid.identify.blackbox.data import IOData
+    from ambid.identify.blackbox.fit import BlackBoxFit
     from ambid.identify.nonlinear.fit import NonlinearFit, Settings
 
 Part = tuple[float | None, float | None]
@@ -116,8 +117,29 @@ def fit_records(
         typer.echo(nonlinear_text(found, paint=painter()))
     if stop.wished():
         raise typer.Exit(stop.code)
-    if found.status == "failed" or (strict and not found.passed):
+    against = against_second(found)
+    if json != "-" and against:
+        typer.echo("\n".join(against))
+    if found.status == "failed" or (strict and (against or not found.passed)):
         raise typer.Exit(FAILED_CHECK)
+
+
+def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
+    """Say why a fit does not hold on the second record, where there is one.
+
+    Parameters
+    ----------
+    found : BlackBoxFit or NonlinearFit
+
+    Returns
+    -------
+    list of str
+        A line for each reason; empty where it holds, or was not judged there.
+    """
+    from ambid.validate.second_fit import objections
+
+    judged: Any = found.validation
+    return [] if judged is None else [f"it does not hold on the second record: {x}" for x in objections(found, judged)]
 
 
 def _check_second(records: Sequence[Path], part: Part, second: Path | None, second_part: Part) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -56,7 +57,7 @@ def command(
                 if rig is not None:
                     raise EstimationError(f"{estimate.name} is a black-box fit, which knows no rig. Leave --rig out")
                 found, lines = _judged_fit(known, record, (from_s, to_s), rate, gaps)
-                model, passed = known.structure, True
+                model, passed = known.structure, bool(found["passed"])
             else:
                 bench = _rig_of(known, estimate, rig)
                 if isinstance(known, NonlinearBearingEstimate):
@@ -113,17 +114,23 @@ def _judged_fit(
     from ambid.job.blackbox import same_bench
     from ambid.report.fit_text import validation_lines
     from ambid.validate.blackbox.judge import validation
+    from ambid.validate.second_fit import objections
 
+    found: Mapping[str, Any]
     data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)
     same_bench(known.units, known.dt, data)
     if not isinstance(known, BlackBoxFit):
         from ambid.report.nonlinear_text import second_record_lines
         from ambid.validate.nonlinear import validation as nonlinear_validation
 
-        judged = nonlinear_validation(known, data)
-        return {"samples": data.n_samples, "fit": plain_json(judged)}, second_record_lines(judged)
-    found = validation(known, data)
-    return {"samples": data.n_samples, "fit": plain_json(found)}, validation_lines(found)
+        found = nonlinear_validation(known, data)
+        lines = second_record_lines(found)
+    else:
+        found = validation(known, data)
+        lines = validation_lines(found)
+    against = objections(known, found)
+    said = {"samples": data.n_samples, "fit": plain_json(found), "passed": not against, "objections": list(against)}
+    return said, lines + [f"it does not hold there: {x}" for x in against]
 
 
 def _rig_of(estimate: Estimate | NonlinearBearingEstimate, path: Path, rig: Path | None) -> Rig:
