@@ -40,6 +40,9 @@ def test_the_text_holds_all_and_keeps_its_width(estimate):
     (row,) = [x.split() for x in text.splitlines() if x.startswith("held.csv ")]
     assert row[1] == "held"
     assert "– stalled" in bearing_text(replace(estimate, status="stalled")).splitlines()[0]
+    unfinished = bearing_text(replace(estimate, status="stalled"))
+    assert "UNFINISHED" in unfinished
+    assert "identified" not in unfinished
 
 
 def test_values_of_the_tables_are_those_of_the_curves(estimate):

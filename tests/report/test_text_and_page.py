@@ -44,6 +44,7 @@ def test_failed_checks_and_warnings_are_shown_once(unstable):
     )
     text = estimate_text(e)
     assert "– stalled" in text.splitlines()[0]
+    assert line_of(text, "k_x").endswith("UNFINISHED")
     assert text.count("the coil gives energy out") == 1
     assert "warning: the search did not converge" in text
     assert max(map(len, text.splitlines())) <= 80

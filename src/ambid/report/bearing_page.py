@@ -60,7 +60,7 @@ def _content(evidence: BearingEvidence, made: str) -> dict[str, Any]:
         "subtitle": f"{e.rig.get('name') or 'no rig'} – {e.law}, {seconds:.4g} s in all, search {e.status}",
         "status": e.status,
         "warnings": other_warnings(e),
-        "parameters": parameter_cells(e.parameters, meaning),
+        "parameters": parameter_cells(e.parameters, meaning, finished=e.status == "converged"),
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),
         "correlations": list(zip(e.covariance_names, correlations(e.covariance), strict=True)),

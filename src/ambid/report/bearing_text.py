@@ -46,7 +46,7 @@ def bearing_text(estimate: NonlinearBearingEstimate, *, width: int = WIDTH, pain
     blocks = [
         header_lines(estimate, width=width, paint=paint),
         warning_lines(other_warnings(estimate), width=width, paint=paint),
-        parameter_lines(estimate, width=width, paint=paint),
+        parameter_lines(estimate, width=width, paint=paint, finished=estimate.status == "converged"),
         curve_lines(estimate, width=width),
         delay_lines(estimate),
         columns(fit_rows(estimate)),

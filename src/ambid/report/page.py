@@ -16,7 +16,7 @@ from ambid.identify.estimate import Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.figures import Evidence, figures, save
 from ambid.report.numbers import quantity
-from ambid.report.text import delay_lines, fit_rows, other_warnings, validation_rows, verdict
+from ambid.report.text import delay_lines, fit_rows, other_warnings, style_of, validation_rows, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,7 +87,7 @@ def _content(evidence: Evidence, made: str) -> dict[str, Any]:
         f" ({samples / rate:.4g} s), search {e.status}",
         "status": e.status,
         "warnings": other_warnings(e),
-        "parameters": parameter_cells(e.parameters, meaning),
+        "parameters": parameter_cells(e.parameters, meaning, finished=e.status == "converged"),
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),
         "correlations": list(zip(e.covariance_names, correlations(e.covariance), strict=True)),
@@ -103,7 +103,9 @@ def _content(evidence: Evidence, made: str) -> dict[str, Any]:
     }
 
 
-def parameter_cells(parameters: Sequence[EstimatedParameter], meaning: Mapping[str, str]) -> list[dict[str, str]]:
+def parameter_cells(
+    parameters: Sequence[EstimatedParameter], meaning: Mapping[str, str], *, finished: bool
+) -> list[dict[str, str]]:
     """Make the rows of the table of parameters.
 
     Parameters
@@ -111,6 +113,8 @@ def parameter_cells(parameters: Sequence[EstimatedParameter], meaning: Mapping[s
     parameters : sequence of EstimatedParameter
     meaning : Mapping[str, str]
         What each is, in a line.
+    finished : bool
+        Whether the search converged.
 
     Returns
     -------
@@ -120,11 +124,11 @@ def parameter_cells(parameters: Sequence[EstimatedParameter], meaning: Mapping[s
     rows = []
     for p in parameters:
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
-        style = "dim" if p.role == "fixed" else "good" if p.identifiable else "bad"
+        style = style_of(p, finished=finished)
         interval = f"{q.low} … {q.high}" if q.low else ""
         rows.append(
             {"name": p.name, "meaning": meaning[p.name], "text": q.text, "interval": interval, "si": q.si,
-             "verdict": verdict(p), "style": style}
+             "verdict": verdict(p, finished=finished), "style": style}
         )  # fmt: skip
     return rows
 

@@ -66,7 +66,7 @@ def estimate_text(estimate: Estimate, *, width: int = WIDTH, paint: Paint = plai
     """
     blocks = [
         [header_line(estimate, paint)],
-        parameter_lines(estimate, width=width, paint=paint),
+        parameter_lines(estimate, width=width, paint=paint, finished=estimate.status == "converged"),
         delay_lines(estimate),
         columns(fit_rows(estimate)),
         check_lines(estimate.checks, width=width, paint=paint),
@@ -102,7 +102,9 @@ def header_line(estimate: Estimate, paint: Paint = plain) -> str:
     )
 
 
-def parameter_lines(estimate: Parameters, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+def parameter_lines(
+    estimate: Parameters, *, width: int = WIDTH, paint: Paint = plain, finished: bool = True
+) -> list[str]:
     """Write the table of the parameters.
 
     Parameters
@@ -113,6 +115,8 @@ def parameter_lines(estimate: Parameters, *, width: int = WIDTH, paint: Paint = 
         Columns of the terminal; where they are too few, the column of SI values is left out.
     paint : callable
         Adds colour.
+    finished : bool
+        Whether the search converged: otherwise nothing is called identified.
 
     Returns
     -------
@@ -120,38 +124,57 @@ def parameter_lines(estimate: Parameters, *, width: int = WIDTH, paint: Paint = 
         A header and a line for each parameter.
     """
     shown = [quantity(p.value, p.sd, p.unit, ci95=p.ci95) for p in estimate.parameters]
-    rows = [_row(p, q) for p, q in zip(estimate.parameters, shown, strict=True)]
+    rows = [_row(p, q, finished) for p, q in zip(estimate.parameters, shown, strict=True)]
     rows.insert(0, ("", "value ± sd", "95 % interval", "in SI", "verdict"))
     lines = columns(rows, right=(2,))
     if max(map(len, lines)) > width:
         lines = columns([(*row[:3], row[4]) for row in rows], right=(2,))
-    styles: list[Style] = [
-        "dim" if p.role == "fixed" else "good" if p.identifiable else "bad" for p in estimate.parameters
-    ]
+    styles = [style_of(p, finished=finished) for p in estimate.parameters]
     painted = [_painted_end(line, row[-1], s, paint) for line, row, s in zip(lines[1:], rows[1:], styles, strict=True)]
     return [lines[0], *painted]
 
 
-def _row(p: EstimatedParameter, q: Quantity) -> tuple[str, ...]:
+def _row(p: EstimatedParameter, q: Quantity, finished: bool) -> tuple[str, ...]:
     interval = f"{q.low} … {q.high}" if q.low else ""
-    return p.name, q.text, interval, q.si, verdict(p)
+    return p.name, q.text, interval, q.si, verdict(p, finished=finished)
 
 
-def verdict(p: EstimatedParameter) -> str:
+def style_of(p: EstimatedParameter, *, finished: bool = True) -> Style:
+    """Return how a parameter is painted.
+
+    Parameters
+    ----------
+    p : EstimatedParameter
+    finished : bool
+        Whether the search converged.
+
+    Returns
+    -------
+    {"dim", "good", "bad"}
+    """
+    return "dim" if p.role == "fixed" else "good" if p.identifiable and finished else "bad"
+
+
+def verdict(p: EstimatedParameter, *, finished: bool = True) -> str:
     """Say in a word or two where a parameter's value comes from.
 
     Parameters
     ----------
     p : EstimatedParameter
         Any.
+    finished : bool
+        Whether the search converged.
 
     Returns
     -------
     str
-        ``"identified"``, ``"NOT SHOWN"``, ``"fixed"`` or ``"prior, 87 % data"``.
+        ``"identified"``, ``"NOT SHOWN"``, ``"fixed"`` or ``"prior, 87 % data"``; ``"UNFINISHED"`` of a search that did
+        not end where it should.
     """
     if p.role == "fixed":
         return "fixed"
+    if not finished:
+        return "UNFINISHED"
     if p.role == "prior":
         share = "" if p.data_share is None else f", {100 * p.data_share:.0f} % data"
         return f"prior{share}" if p.identifiable else f"prior, NOT SHOWN{share}"

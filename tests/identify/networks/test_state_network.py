@@ -13,11 +13,13 @@ from ambid.identify.networks.layout import Layout, free_entries, one_axis_entrie
 from ambid.identify.networks.nn import nn
 from ambid.identify.networks.residual import Ridge, orthogonal_to_physics
 from ambid.identify.networks.segments import StateProblem, shots
+from ambid.identify.networks.state_model import StateNetwork
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate.bench import simulate_preset
+from tests.identify.nonlinear.systems import smooth
 
 
 def one_axis(neurons: int, *, anchored: bool, gain: bool) -> Layout:
@@ -268,3 +270,15 @@ def test_multiple_shooting_holds_an_unstable_plant() -> None:
     unstable = np.linalg.eigvals(np.array(fit.details["A"])).real.max()
     assert unstable == pytest.approx(113.7, rel=0.05)
     assert not any("biased" in w for w in fit.warnings)  # a predictor gain: consistent under feedback
+
+
+@pytest.mark.parametrize(
+    ("place", "value"), [("entries", [[0, 9]]), ("entries", [[-1, 0]]), ("heads", [5]), ("rows", [7])]
+)
+def test_a_file_whose_weights_lie_outside_the_matrices_is_refused(place: str, value: list[object]) -> None:
+    model = nn([smooth()], {"form": "free", "states": 2, "neurons": 1, "starts": 1}).model
+    assert model is not None
+    written = model.as_json()
+    written["layout"] = {**written["layout"], place: value}
+    with pytest.raises(EstimationError, match="no state network"):
+        StateNetwork.from_json(written)

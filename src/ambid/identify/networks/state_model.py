@@ -282,7 +282,10 @@ class StateNetwork:
                 anchored=bool(given["anchored"]),
             )
             m, p = layout.n_inputs, layout.p
-            if layout.form not in ("one-axis", "free") or max(layout.heads) >= layout.n:
+            places = [*layout.heads, *layout.rows, *(r for r, _ in layout.entries)]
+            columns = [c for _, c in layout.entries]
+            inside = min((*places, *columns)) >= 0 and max(places) < layout.n and max(columns) <= layout.n + m
+            if layout.form not in ("one-axis", "free") or not inside:
                 raise EstimationError("no state network: its states are not those of one. Write the file again")
             arrays: dict[str, Any] = {
                 k: finite(found[k], n, k)
