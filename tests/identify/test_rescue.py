@@ -125,6 +125,13 @@ def test_it_takes_over_where_no_start_makes_a_plant(monkeypatch: pytest.MonkeyPa
         greybox(bench.model, bench.signals, ps, evaluations=0)
 
 
+def test_a_mass_of_nothing_is_refused_as_before() -> None:
+    bench = run("bearing", 600, 3)
+    ps = [replace(p, value=0.0) if p.name == "m" else p for p in parameters(bench, fixed=("c", "m"))]
+    with pytest.raises(EstimationError, match="physical plant"):
+        greybox(bench.model, bench.signals, ps, evaluations=100)
+
+
 @pytest.mark.parametrize("name", ["thesis", "bearing", "rmit", "coil", "sprung rotor", "falling rotor"])
 def test_it_is_not_called_where_the_ordinary_starts_work(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:

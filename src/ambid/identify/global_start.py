@@ -170,6 +170,8 @@ class LikelihoodCost:
         at = {c.name: c.value(float(x)) for c, x in zip(self.coordinates, z, strict=True)}
         values = self.physical(at)
         delay = float(min(int(at["delay"]), FARTHEST)) if "delay" in at else self.delay
+        if not all(values.get(name, 1.0) > 0.0 for name in ("m", "L")):  # fixed so by the user
+            return None
         reach = np.max(np.abs(self.model.matrices(values).E) / self.scales.state[:, None], axis=0)
         if not np.all(np.isfinite(reach)) or np.any(reach <= 0.0):
             return None

@@ -246,6 +246,11 @@ def _unseen(fit: BearingFit) -> list[str]:
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
+    from ambid.identify.nonlinear_bearing.rescue import RescuedFit
+    from ambid.identify.rescue import told
+
+    if isinstance(fit, RescuedFit):
+        found.append(told(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(

@@ -15,8 +15,10 @@ import numpy as np
 
 from ambid.errors import EstimationError
 from ambid.identify.nonlinear.progress import Tick, portions
+from ambid.identify.nonlinear_bearing.global_start import EVALUATIONS
 from ambid.identify.nonlinear_bearing.likelihood import BearingFit, criterion, linearise, promise, search
 from ambid.identify.nonlinear_bearing.problem import LEVELS, BearingProblem, BearingRecord, Number
+from ambid.identify.nonlinear_bearing.rescue import rescued
 from ambid.identify.nonlinear_bearing.start import LinearStart, linear_start, start_numbers, with_noise
 from ambid.identify.threads import one_thread
 from ambid.physics.coenergy_law import MagnetLaw
@@ -42,6 +44,8 @@ def estimate_bearing(
     eddy: bool = False,
     drift: bool = False,
     tick: Tick | None = None,
+    evaluations: int = EVALUATIONS,
+    seed: int = 0,
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several records at once.
 
@@ -65,10 +69,15 @@ def estimate_bearing(
         A force that walks slowly: what the law leaves over.
     tick : Tick, optional
         Called after each evaluation; KeyboardInterrupt ends in the best so far.
+    evaluations : int, optional
+        Of the likelihood in a global search, at most; 0 for none. It is made only where the ordinary start values fail.
+    seed : int, optional
+        Of the global search.
 
     Returns
     -------
     BearingFit
+        A `RescuedFit` where there was a global search.
 
     Raises
     ------
@@ -82,18 +91,16 @@ def estimate_bearing(
     short = [_short(r) for r in records]
     few, many = (float(sum(r.u.size for r in x)) for x in (short, records))
     rich = extend and any(not law.rise or (law.pair and not law.asymmetric) for law in laws)
-    ticks = portions(_remembered(tick), [*[few] * len(laws), 2.0 * few * rich, many, many * (delay is None)])
+    again = _remembered(tick)
+    ticks = portions(again, [*[few] * len(laws), 2.0 * few * rich, many, many * (delay is None)])
     with one_thread():
         linear = linear_start(free[0], known, delay, laws[0])
         fits = [
             _first(short, known, law, linear, delay, eddy=eddy, drift=drift, tick=t)
             for law, t in zip(laws, ticks, strict=False)
         ]
-        fits = [f for f in fits if f.status != "failed"]
-        if not fits:
-            raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
         fit = min(fits, key=lambda f: f.criterion)
-        if extend:
+        if extend and fit.status != "failed":
             for name in ("asymmetric", "rise") if fit.problem.law.pair else ("rise",):
                 law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
                               asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
@@ -101,7 +108,14 @@ def estimate_bearing(
                     fit = _extended(fit, law, known, short, linear, ticks[-3])
         whole = replace(fit.problem, records=tuple(records))
         fit = search(whole, fit.vector, tick=ticks[-2])
-        return fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1])
+        fit = rescued(
+            fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
+            lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
+            search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
+        )  # fmt: skip
+    if fit.status == "failed":
+        raise EstimationError("no start value makes a predictor for these records. Check columns, signs and values")
+    return fit
 
 
 def _widened(law: MagnetLaw, known: Mapping[str, Parameter]) -> MagnetLaw:

@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.greybox import greybox
+from ambid.identify.likelihood import Fit
 from ambid.identify.multistart import Signals
 from ambid.identify.nonlinear_bearing.likelihood import criterion
 from ambid.identify.nonlinear_bearing.problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
+from ambid.identify.rescue import EVALUATIONS
 from ambid.identify.scaling import noise_floor
+from ambid.identify.uncertainty import uncertainty
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.one_axis import OneAxis
 from ambid.physics.parameters import Parameter
@@ -31,6 +34,7 @@ _ROUND = 0.02  # of the largest current: over which the drop of a stage changes 
 _STRETCH = 8192  # samples for the linear estimate
 _SHORTEST = 500  # samples of one of its parts
 _WINDOW_S = 0.1  # over which forces are taken to balance
+_SIGNIFICANT = 4.0  # standard deviations from which the sign of k_i in the linear estimate speaks against the columns
 _FORCE, _VOLTAGE = (1e-3, 1e-2, 1e-1), (0.03, 0.3)  # noise levels tried, over what the sensors would show as such
 
 
@@ -75,25 +79,39 @@ def linear_start(
     EstimationError
         If the linear model finds no predictor either.
     """
-    model, found = OneAxis(), list[float]()
+    model, found, doubtful = OneAxis(), list[float](), list[LinearStart]()
     parameters = [
         known.get(p.name, Parameter(name=p.name, unit=p.unit, role="fixed", value=0.0))
         if p.name in ("m", "R", "c")
         else Parameter(name=p.name, unit=p.unit)
         for p in model.parameters
     ]
-    for first, last in _stretches(record):
+    parts = _stretches(record)
+    for (first, last), evaluations in [*((part, 0) for part in parts), (parts[0], EVALUATIONS)]:
+        if evaluations and found:
+            break  # what was found speaks against the signs, not against the start values
         part = Signals(u=record.u[first:last, None], y=record.y[first:last], rate_hz=record.rate_hz)
         try:
-            fit = greybox(model, part, parameters, delay="auto" if delay is None else delay, noise="levels")
+            fit = greybox(model, part, parameters, delay="auto" if delay is None else delay, noise="levels",
+                          evaluations=evaluations)  # fmt: skip
         except ValueError:  # SciPy's, where a search steps to the edge of what has a predictor
+            continue
+        except EstimationError:
+            if evaluations:
+                raise
             continue
         if fit.status == "failed":
             continue
         values = fit.problem.parameters(fit.vector)
         if (values["k_i"] > 0) == law.pair:
             return LinearStart(values=values, delay=fit.problem.delay_samples(fit.vector))
-        found.append(values["k_i"])
+        if _significant(fit):
+            found.append(values["k_i"])
+        else:  # lost in the noise: no more than a size to begin with
+            turned = {**values, "k_i": -values["k_i"], "k_x": -abs(values["k_x"])}
+            doubtful.append(LinearStart(values=turned, delay=fit.problem.delay_samples(fit.vector)))
+    if doubtful:  # where the sign is turned, every part says so
+        return doubtful[0]
     if not found:
         raise EstimationError(f"record {record.name}: no linear model to start from. Check columns and signs")
     sign = "positive: with a pair the force grows with the current" if law.pair else "negative: position is the gap"
@@ -101,6 +119,15 @@ def linear_start(
         f"record {record.name}: the linear model finds k_i = {found[0]:.3g} N/A; it must be {sign}, and "
         "grows away from a single magnet. Turn the sign of position or current in the rig, or choose the magnet"
     )
+
+
+def _significant(fit: Fit) -> bool:
+    """Whether a linear estimate knows the sign of k_i."""
+    if fit.status != "converged":
+        return False
+    known, values = uncertainty(fit), fit.problem.parameters(fit.vector)
+    sd = known.standard_deviations(robust=True)[known.names.index("k_i")]
+    return bool(abs(values["k_i"]) > _SIGNIFICANT * sd)
 
 
 def _stretches(record: BearingRecord) -> list[tuple[int, int]]:

@@ -1,0 +1,124 @@
+"""What the nonlinear bearing does where its start values fail: search globally, and keep the better fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from time import perf_counter
+
+import numpy as np
+
+from ambid.identify.global_search import STAGE
+from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear_bearing.global_start import bearing_cost, failure, global_problems
+from ambid.identify.nonlinear_bearing.likelihood import BearingFit, search
+from ambid.identify.nonlinear_bearing.problem import BearingProblem, BearingRecord
+
+_TRIED = 15  # iterations from each place found
+_BETTER = 0.5  # of the criterion, its numbers paid for (BIC), by which a fit must be better
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RescuedFit(BearingFit):
+    """A fit whose ordinary start values failed.
+
+    Attributes
+    ----------
+    global_search : Mapping[str, object]
+        ``why``, ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per measured value, None
+        where there is none), ``taken``, ``interrupted``.
+    """
+
+    global_search: Mapping[str, object]
+
+
+def rescued(
+    before: BearingFit,
+    records: Sequence[BearingRecord],
+    finish: Callable[[BearingFit], BearingFit],
+    *,
+    search_delay: bool,
+    seed: int,
+    evaluations: int,
+    tick: Tick | None,
+) -> BearingFit:
+    """Return the fit, or a better one from a global search where its start values failed.
+
+    Parameters
+    ----------
+    before : BearingFit
+        Of all records, at the end of the ordinary way.
+    records : sequence of BearingRecord
+    finish : callable
+        What follows a search over all records.
+    search_delay : bool
+    seed : int
+        Equal seeds give equal results.
+    evaluations : int
+        Of the likelihood in the global search, at most; 0 for none.
+    tick : Tick or None
+        A KeyboardInterrupt ends in the best so far.
+
+    Returns
+    -------
+    BearingFit
+        A `RescuedFit` where there was a global search.
+    """
+    why = failure(before) if evaluations else ""
+    if not why:
+        return before
+    count, after, interrupted = 0, None, False
+
+    def told(stage: str, done: float | None = None, /) -> None:
+        nonlocal count
+        count += stage == STAGE and done is not None
+        if tick is not None:
+            tick(stage, None)
+
+    try:
+        if tick is not None:
+            tick(STAGE, None)
+    except KeyboardInterrupt:  # before it began: the fit has not failed, it was ended
+        return before
+    began, cost = perf_counter(), bearing_cost(before, search_delay=search_delay)
+    try:
+        places = global_problems(cost, seed=seed, evaluations=evaluations, tick=told)
+        fits = [search(p, p.start(), iterations=_TRIED, tick=told) for p in places]
+        fits = [f for f in fits if f.status != "failed"]
+        if fits:
+            nearest = min(fits, key=lambda f: f.criterion)
+            after = finish(search(_whole(nearest.problem, records, before.problem.skip), nearest.vector, tick=told))
+    except KeyboardInterrupt:
+        interrupted = True
+        places = cost.found()
+        if places:  # not a step further: what was found, with its information
+            whole = _whole(places[0], records, before.problem.skip)
+            after = search(whole, whole.start(), iterations=0)
+    taken = _better(after, before)
+    fit = after if taken and after is not None else before
+    report = {
+        "why": why, "evaluations": count, "seconds": perf_counter() - began, "criterion_before": _per_value(before),
+        "criterion_after": _per_value(after), "taken": taken, "interrupted": interrupted,
+    }  # fmt: skip
+    return RescuedFit(**{f.name: getattr(fit, f.name) for f in fields(BearingFit)}, global_search=report)
+
+
+def _whole(problem: BearingProblem, records: Sequence[BearingRecord], skip: int) -> BearingProblem:
+    """The problem of all records, from the sample on from which the first fit saw them, where the delay lets it."""
+    return replace(problem, records=tuple(records), skip=max(skip, int(max(problem.delays.values())) + 8))
+
+
+def _per_value(fit: BearingFit | None) -> float | None:
+    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
+
+
+def _better(after: BearingFit | None, before: BearingFit) -> bool:
+    """Whether the later fit says more of the data than its numbers cost, or as much and has converged."""
+    if after is None or after.status == "failed":
+        return False
+    if before.status == "failed":
+        return True
+    n = before.problem.n_used  # compared per value: a longer delay leaves fewer
+    gain = n * (before.criterion / n - after.criterion / after.problem.n_used)
+    gain += (before.problem.size - after.problem.size) * float(np.log(n))
+    return gain > _BETTER or (gain > -_BETTER and after.status == "converged" != before.status)
