@@ -16,8 +16,8 @@ from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax import Factor, narmax
 from ambid.identify.networks.narx import narx
 from ambid.identify.networks.narx_function import NarxShape
-from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.search import search
 from tests.identify.narmax.systems import coefficients, polynomial, record
 
 TRUTH = {"y(t-1)": 0.5, "y(t-2)": -0.2, "u(t-1)*y(t-1)": 0.3, "u(t-2)": 0.4, "e(t-1)": 0.7}

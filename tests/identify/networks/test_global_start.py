@@ -91,7 +91,7 @@ def test_an_interrupted_global_search_ends_without_a_model_or_with_the_best(nois
 
 def test_the_cost_over_shots_is_least_at_the_plant() -> None:
     from ambid.identify.networks.global_start import shot_cost
-    from ambid.identify.networks.records import scaled_records
+    from ambid.identify.nonlinear.records import scaled_records
 
     data = scaled_records("nn", [bearing(2000, 1.0, 3, quiet=0.1)], lag=40)
     cost = shot_cost(data, 1 / 20_000.0, (0, 2), "thesis")

@@ -12,8 +12,8 @@ from ambid.identify.networks.narx import narx
 from ambid.identify.networks.nn import nn
 from ambid.identify.networks.nn_spread import disagreement
 from ambid.identify.networks.nn_train import State
-from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.spread import bootstrapped, sandwich, score_covariance
 from tests.identify.networks.test_narx_network import data
 from tests.identify.networks.test_state_network import one_axis, sampled
 

@@ -10,8 +10,8 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.narx import narx
-from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.search import search
 from ambid.identify.rbf.estimate import rbf
 from ambid.identify.rbf.model import RbfNetwork
 from ambid.identify.rbf.problem import problem_at

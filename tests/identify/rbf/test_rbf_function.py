@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.identify.networks.cloud import cloud_of
+from ambid.identify.nonlinear.cloud import cloud_of
 from ambid.identify.nonlinear.model_file import model_from_json, model_to_json
 from ambid.identify.rbf.model import RbfNetwork
 from ambid.identify.rbf.shape import RbfShape

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.search import search
 from ambid.identify.rbf._kernels import descent_pass, recursive_pass
 from ambid.identify.rbf.estimate import rbf
 from ambid.identify.rbf.problem import RbfProblem, problem_at

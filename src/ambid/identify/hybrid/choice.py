@@ -12,9 +12,9 @@ from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.settings import MOST_NOISE
 from ambid.identify.hybrid.train import HybridProblem, Parts, problem_at, random_start
 from ambid.identify.narmax.selection import penalty
-from ambid.identify.networks.search import Found, search
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
+from ambid.identify.nonlinear.search import Found, search
 
 Array = NDArray[np.float64]
 Counted = tuple[NDArray[np.bool_], ...]

@@ -26,11 +26,11 @@ from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax import PolynomialNarmax, narmax
 from ambid.identify.narmax.scaled import Scaled, scaled_records
 from ambid.identify.narmax.terms import Term, lagged, products
-from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.narx_function import NarxShape
-from ambid.identify.networks.search import search
+from ambid.identify.nonlinear.failed import failed_fit
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, portions
+from ambid.identify.nonlinear.search import search
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.narmax.terms import term_from_json, term_to_json
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ class HybridNarmax:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`, of the lagged signals (see `networks.cloud`)."""
+        """As `NonlinearModel.novelty`, of the lagged signals (see `nonlinear.cloud`)."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape[0], np.nan)
         if ys.shape[0] > self.lag:

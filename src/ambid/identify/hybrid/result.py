@@ -17,10 +17,10 @@ from ambid.identify.hybrid.settings import HybridSettings
 from ambid.identify.hybrid.train import HybridProblem, problem_at, whitening
 from ambid.identify.narmax.scaled import Scaled
 from ambid.identify.narmax.terms import term_name
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import failed_fit, provenance
-from ambid.identify.networks.search import information_inverse
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.search import information_inverse
 
 if TYPE_CHECKING:
     from ambid.identify.hybrid.estimate import Work

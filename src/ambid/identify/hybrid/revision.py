@@ -19,8 +19,8 @@ from ambid.identify.hybrid.function import HybridShape
 from ambid.identify.hybrid.train import HybridProblem, problem_at
 from ambid.identify.narmax.selection import penalty
 from ambid.identify.narmax.terms import Term
-from ambid.identify.networks.search import information_inverse, search
 from ambid.identify.nonlinear.progress import Tick, guessed
+from ambid.identify.nonlinear.search import information_inverse, search
 
 Array = NDArray[np.float64]
 Keep = Callable[[HybridShape, Array], None]

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 from ambid.errors import EstimationError
 from ambid.identify.narmax.selection import CRITERIA
-from ambid.identify.networks.settings import checked
+from ambid.identify.nonlinear.settings import checked
 
 MOST_NOISE = 4  # largest order of C that is tried where it is left open
 

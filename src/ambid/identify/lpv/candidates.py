@@ -17,10 +17,10 @@ from ambid.identify.lpv.schedule import Schedule, schedule_over
 from ambid.identify.lpv.settings import LpvSettings
 from ambid.identify.lpv.shape import LpvShape, Part, part_of, stable_process
 from ambid.identify.lpv.start import by_long_regression, from_earlier, least_squares, padded, without_error_model
-from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, guessed, portions
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import search
 
 Array = NDArray[np.float64]
 

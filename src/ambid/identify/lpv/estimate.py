@@ -29,10 +29,10 @@ from ambid.identify.lpv.schedule import Schedule, schedule_over
 from ambid.identify.lpv.settings import LpvSettings, lpv_settings
 from ambid.identify.lpv.shape import LpvShape
 from ambid.identify.lpv.start import least_squares
-from ambid.identify.networks.failed import failed_fit
-from ambid.identify.networks.records import scaled_records
+from ambid.identify.nonlinear.failed import failed_fit
 from ambid.identify.nonlinear.fit import NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, portions
+from ambid.identify.nonlinear.records import scaled_records
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from ambid.identify.lpv.beginning import beginning, looks_back, settling
 from ambid.identify.lpv.frozen import Frozen, frozen
 from ambid.identify.lpv.schedule import BASES, Schedule, basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors, part_of
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]

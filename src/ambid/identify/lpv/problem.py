@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.lpv.shape import LpvShape, Part, errors, sound
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.search import triangle_of
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LpvProblem:
-    """What is searched in (a `networks.search.Problem`).
+    """What is searched in (a `nonlinear.search.Problem`).
 
     Attributes
     ----------

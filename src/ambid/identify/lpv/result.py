@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.lpv.model import LpvModel, regressors
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import provenance
-from ambid.identify.networks.search import information_inverse
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.search import information_inverse
 
 if TYPE_CHECKING:
     from ambid.identify.lpv.candidates import Work

@@ -9,7 +9,7 @@ from typing import Any
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.lpv.schedule import BASES, LEVEL, schedule_column
-from ambid.identify.networks.settings import checked
+from ambid.identify.nonlinear.settings import checked
 
 _RANGES: Mapping[str, tuple[float, float]] = {
     "order": (1, 10),

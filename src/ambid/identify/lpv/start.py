@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ambid.identify.blackbox.roots import reflected
 from ambid.identify.lpv.schedule import basis_values
 from ambid.identify.lpv.shape import LpvShape, Part, errors
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.search import triangle_of
 
 Array = NDArray[np.float64]
 

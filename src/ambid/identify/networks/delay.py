@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_train import State
-from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import search, triangle_of
 from ambid.identify.networks.segments import largest_pole
 from ambid.identify.nonlinear.progress import Tick, guessed
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import search, triangle_of
 
 Array = NDArray[np.float64]
 

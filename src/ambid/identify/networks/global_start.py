@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ambid.identify.global_search import STAGE, GlobalFound, global_search
 from ambid.identify.networks.layout import Layout, one_axis_entries
 from ambid.identify.networks.nn_train import State, added_gain
-from ambid.identify.networks.records import Scaled
 from ambid.identify.nonlinear.progress import Tick, silent
+from ambid.identify.nonlinear.records import Scaled
 from ambid.identify.scaling import noise_floor
 
 Array = NDArray[np.float64]

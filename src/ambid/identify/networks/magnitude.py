@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.magnitude_model import MagnitudeNetwork
 from ambid.identify.networks.magnitude_problem import FoldedLayout, FoldedProblem, Parts, states
 from ambid.identify.networks.magnitude_start import MOST_STATES, folded_starts
-from ambid.identify.networks.records import scaled_records
-from ambid.identify.networks.search import Found, information_inverse, search
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import failed_fit, provenance
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
+from ambid.identify.nonlinear.records import scaled_records
+from ambid.identify.nonlinear.search import Found, information_inverse, search
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.magnitude_problem import FoldedLayout, slopes, states
 from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
@@ -170,7 +170,7 @@ class MagnitudeNetwork:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """Return how far states and inputs are from those of the training (see `networks.cloud`).
+        """Return how far states and inputs are from those of the training (see `nonlinear.cloud`).
 
         Parameters
         ----------

@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.narx_choice import Tried, chosen_sizes, held_out_error, problem_at, split
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_result import finished
 from ambid.identify.networks.narx_train import linear_start, random_start
-from ambid.identify.networks.records import Scaled, scaled_records
-from ambid.identify.networks.search import Found, search
-from ambid.identify.networks.settings import checked
-from ambid.identify.networks.spread import bootstrapped
+from ambid.identify.nonlinear.failed import failed_fit
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
+from ambid.identify.nonlinear.records import Scaled, scaled_records
+from ambid.identify.nonlinear.search import Found, search
+from ambid.identify.nonlinear.settings import checked
+from ambid.identify.nonlinear.spread import bootstrapped
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_train import NarxProblem, linear_start, random_start
-from ambid.identify.networks.records import Parts
-from ambid.identify.networks.search import search
 from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear.records import Parts
+from ambid.identify.nonlinear.search import search
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.narx_function import NarxShape
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ class NeuralNarx:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`, of the regressors (see `networks.cloud`)."""
+        """As `NonlinearModel.novelty`, of the regressors (see `nonlinear.cloud`)."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.shape.regressors(ys, us))

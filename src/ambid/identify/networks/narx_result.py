@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.narx_choice import problem_at
 from ambid.identify.networks.narx_model import NeuralNarx
 from ambid.identify.networks.narx_spread import laplace, sandwiched
-from ambid.identify.networks.records import Scaled
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.records import Scaled
 
 if TYPE_CHECKING:
     from ambid.identify.networks.narx import Work

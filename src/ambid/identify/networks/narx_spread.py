@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.narx_train import NarxProblem
-from ambid.identify.networks.search import information_inverse
-from ambid.identify.networks.spread import sandwich
+from ambid.identify.nonlinear.search import information_inverse
+from ambid.identify.nonlinear.spread import sandwich
 
 Array = NDArray[np.float64]
 

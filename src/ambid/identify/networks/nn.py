@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.delay import LARGEST, found_delay, guessed_delay, late
-from ambid.identify.networks.failed import failed_fit
 from ambid.identify.networks.global_start import FAR, global_start, misfit
 from ambid.identify.networks.magnitude import nn_of_magnitude
 from ambid.identify.networks.nn_result import finished
 from ambid.identify.networks.nn_stages import Work, identify, trained_start
 from ambid.identify.networks.nn_train import Interrupted, State, added_gain
-from ambid.identify.networks.records import Scaled, scaled_records
-from ambid.identify.networks.settings import checked
 from ambid.identify.networks.start import SHORT, Start, start_free, start_one_axis
+from ambid.identify.nonlinear.failed import failed_fit
 from ambid.identify.nonlinear.fit import NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, part_of, silent
+from ambid.identify.nonlinear.records import Scaled, scaled_records
+from ambid.identify.nonlinear.settings import checked
 
 Array = NDArray[np.float64]
 

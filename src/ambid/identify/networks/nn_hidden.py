@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.layout import Layout
 from ambid.identify.networks.nn_train import State, Trained, trained
-from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import STIFF, Orthogonal, Ridge, orthogonal_to_physics
 from ambid.identify.networks.start import widened
 from ambid.identify.nonlinear.progress import Tick, part_of
+from ambid.identify.nonlinear.records import Scaled
 
 Array = NDArray[np.float64]
 

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import failed_fit, provenance
 from ambid.identify.networks.nn_spread import spread_of
 from ambid.identify.networks.nn_train import State
-from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.start import carried_to_continuous
 from ambid.identify.networks.state_model import StateNetwork
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear.records import Scaled
 
 if TYPE_CHECKING:
     from ambid.identify.networks.nn_stages import Work

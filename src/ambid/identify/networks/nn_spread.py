@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_train import State, white
-from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import Orthogonal, Ridge, units
-from ambid.identify.networks.search import information_inverse
 from ambid.identify.networks.segments import StateProblem
-from ambid.identify.networks.spread import bootstrapped, sandwich, score_covariance, widening
 from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import information_inverse
+from ambid.identify.nonlinear.spread import bootstrapped, sandwich, score_covariance, widening
 
 Array = NDArray[np.float64]
 

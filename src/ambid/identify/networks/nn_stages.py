@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_hidden import added_network
 from ambid.identify.networks.nn_train import State, added_gain, descended, trained, white
-from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.shooting import shooting
 from ambid.identify.networks.start import Start, start_free
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of, portions
+from ambid.identify.nonlinear.records import Scaled
 
 Array = NDArray[np.float64]
 

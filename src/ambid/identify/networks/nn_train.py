@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.layout import Layout
-from ambid.identify.networks.records import Scaled
 from ambid.identify.networks.residual import Orthogonal, Ridge
-from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import Penalty, StateProblem, largest_pole, shots
 from ambid.identify.networks.start import carried_to_continuous, widened
 from ambid.identify.networks.thesis_training import trained_one_step
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import search
 
 Array = NDArray[np.float64]
 Trained = tuple["State", LearningCurve, bool] | None

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.layout import Layout, Matrices
-from ambid.identify.networks.records import Parts
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.records import Parts
+from ambid.identify.nonlinear.search import triangle_of
 
 Array = NDArray[np.float64]
 

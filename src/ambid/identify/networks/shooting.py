@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.nn_train import State, Trained, added_gain, relative_error
-from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import search
 from ambid.identify.networks.segments import StateProblem
 from ambid.identify.nonlinear.fit import LearningCurve
 from ambid.identify.nonlinear.progress import Tick, part_of
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import search
 
 Array = NDArray[np.float64]
 

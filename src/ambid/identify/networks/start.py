@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.networks.layout import Layout, free_entries, one_axis_entries
-from ambid.identify.networks.records import Scaled
+from ambid.identify.nonlinear.records import Scaled
 
 Array = NDArray[np.float64]
 

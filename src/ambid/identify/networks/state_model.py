@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.layout import Layout, Matrices
 from ambid.identify.networks.narx_model import finite
 from ambid.identify.networks.segments import Shot, run, slopes
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 
 Array = NDArray[np.float64]
@@ -171,7 +171,7 @@ class StateNetwork:
         return whole
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`, of predicted states and inputs (see `networks.cloud`)."""
+        """As `NonlinearModel.novelty`, of predicted states and inputs (see `nonlinear.cloud`)."""
         out = np.full(np.asarray(u).shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.regressors(u, y))
         return out

@@ -11,8 +11,8 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.search import triangle_of
 from ambid.identify.nonlinear.fit import LearningCurve
+from ambid.identify.nonlinear.search import triangle_of
 
 Array = NDArray[np.float64]
 

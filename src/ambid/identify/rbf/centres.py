@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.search import triangle_of
 
 Array = NDArray[np.float64]
 

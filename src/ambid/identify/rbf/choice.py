@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.narmax.selection import penalty
-from ambid.identify.networks.records import Parts
 from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear.records import Parts
 from ambid.identify.rbf.placing import MIDDLE, NEURONS, Placing, Told, shape_of
 from ambid.identify.rbf.shape import RbfShape
 from ambid.identify.rbf.weights import Weights

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.failed import failed_fit
-from ambid.identify.networks.records import Scaled, scaled_records
-from ambid.identify.networks.search import Found, search
-from ambid.identify.networks.settings import checked
+from ambid.identify.nonlinear.failed import failed_fit
 from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.identify.nonlinear.progress import Tick, portions
+from ambid.identify.nonlinear.records import Scaled, scaled_records
+from ambid.identify.nonlinear.search import Found, search
+from ambid.identify.nonlinear.settings import checked
 from ambid.identify.rbf.choice import Tried, chosen, error, split
 from ambid.identify.rbf.placing import Told, rows_of, shape_of
 from ambid.identify.rbf.problem import RbfProblem, problem_at

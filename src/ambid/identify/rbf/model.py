@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.errors import EstimationError
-from ambid.identify.networks.cloud import Cloud
 from ambid.identify.networks.narx_function import NarxShape
 from ambid.identify.networks.narx_model import finite
+from ambid.identify.nonlinear.cloud import Cloud
 from ambid.identify.nonlinear.signals import scaled, with_head
 from ambid.identify.rbf.shape import RbfShape
 from ambid.identify.rbf.units import UNITS
@@ -107,7 +107,7 @@ class RbfNetwork:
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`, of the regressors (see `networks.cloud`)."""
+        """As `NonlinearModel.novelty`, of the regressors (see `nonlinear.cloud`)."""
         ys, us = scaled(self, u, y)
         out = np.full(ys.shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.shape.lags.regressors(ys, us))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.networks.narx_function import NarxShape
-from ambid.identify.networks.records import Parts
+from ambid.identify.nonlinear.records import Parts
 from ambid.identify.rbf.centres import k_means, neighbour_widths, ols_order, typical_size
 from ambid.identify.rbf.shape import RbfShape
 from ambid.identify.rbf.units import value

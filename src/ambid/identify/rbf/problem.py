@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.records import Parts
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.records import Parts
+from ambid.identify.nonlinear.search import triangle_of
 from ambid.identify.rbf.shape import RbfShape
 
 Array = NDArray[np.float64]

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.cloud import cloud_of
-from ambid.identify.networks.failed import failed_fit, provenance
-from ambid.identify.networks.records import Scaled
-from ambid.identify.networks.search import information_inverse
-from ambid.identify.networks.spread import sandwich
+from ambid.identify.nonlinear.cloud import cloud_of
+from ambid.identify.nonlinear.failed import failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.identify.nonlinear.records import Scaled
+from ambid.identify.nonlinear.search import information_inverse
+from ambid.identify.nonlinear.spread import sandwich
 from ambid.identify.rbf.choice import error
 from ambid.identify.rbf.model import RbfNetwork
 from ambid.identify.rbf.problem import RbfProblem, problem_at

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.search import triangle_of
+from ambid.identify.nonlinear.search import triangle_of
 from ambid.identify.rbf.shape import RbfShape
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.networks.search import information_inverse, triangle_of
 from ambid.identify.nonlinear.progress import Tick
+from ambid.identify.nonlinear.search import information_inverse, triangle_of
 
 Array = NDArray[np.float64]
 
