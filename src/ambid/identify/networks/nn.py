@@ -81,6 +81,11 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     In the form ``one-axis`` (position, current and perhaps velocity from a voltage) the weights are entries of thesis
     eq. 4.8. Consistent under feedback as far as the predictor gain holds the noise.
 
+    Where all starts of that form fail, there is a global search. The form ``free`` has none: its states have no fixed
+    meaning, so that every change of coordinates gives another vector of equal cost, with nothing to bound the entries
+    between, and the number of entries grows with the square of the states. Its starts come from subspace models of
+    several horizons, which need no search; several random starts serve the hidden layer.
+
     Parameters
     ----------
     records : sequence of IOData
