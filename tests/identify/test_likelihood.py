@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.identify import likelihood
 from ambid.identify.likelihood import evaluate, prior_rows, score_statistic, search, weight_of
 from ambid.identify.predictor import assemble
 from ambid.identify.sensitivity import innovations, linearise
@@ -223,6 +224,20 @@ def test_a_hopeless_model_ends_with_a_status():
     problem, vector = problem_of(bench, estimated=("m", "k_x", "k_i", "R", "L"))
     fit = search(replace(problem, model=WithoutMotionalVoltage()), vector)
     assert fit.status in ("converged", "stalled", "failed")
+
+
+def test_a_predictor_that_is_found_only_once_at_a_point_ends_no_search(monkeypatch):
+    # the search for the gain begins from the last one found, so that a second evaluation may end without any
+    seen = []
+
+    def moody(problem, vector, weight, work):
+        again = any(np.array_equal(vector, x) and np.array_equal(weight, w) for x, w in seen)
+        seen.append((vector.copy(), weight.copy()))
+        return None if again else linearise(problem, vector, weight, work)
+
+    monkeypatch.setattr(likelihood, "linearise", moody)
+    problem, vector = problem_of(run("bearing", 300, 1))
+    assert search(problem, vector, rounds=1, evaluations=3).evaluations == 4
 
 
 def test_too_few_evaluations_are_reported():

@@ -296,7 +296,7 @@ def search(
     status: Status = "stalled"
     count = 1
     for _ in range(rounds):
-        target.weight = weight_of(covariance)
+        target.reweigh(weight_of(covariance))
         if not np.all(np.isfinite(target.residual(vector))):  # innovations exist, their sensitivities overflow
             return _failed(problem, start)
         # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
@@ -348,7 +348,13 @@ class _Weighted:
         self.at = np.full(self.problem.size, np.nan)
         self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
 
+    def reweigh(self, weight: Array) -> None:
+        self.weight = weight
+        self.at = np.full(self.problem.size, np.nan)
+
     def residual(self, vector: Array) -> Array:
+        if np.array_equal(self.at, vector):  # once more would begin from another gain, and may find no predictor
+            return self.r
         prior, J_prior = prior_rows(self.problem, vector)
         result = linearise(self.problem, vector, self.weight, self.work)
         if self.tick is not None:
