@@ -68,12 +68,22 @@ def test_a_better_minimum_is_found_where_no_search_converges(noisy, before):
     told = fit.global_search
     assert told["taken"]
     assert not told["interrupted"]
-    assert told["evaluations"] <= 800
+    assert 100 < told["evaluations"] <= 800
     assert fit.criterion < before.criterion - 100.0
     assert told["criterion_after"] < told["criterion_before"]
-    assert max(shifts(fit).values()) < 3.5
+    # neither search ends, so that their deviations promise nothing (R came out 2.4 to 3.5 of them off, by seed)
+    assert fit.status == "stalled"
     error = [abs(f.problem.values(f.vector)["R"] / TRUTH["R"] - 1.0) for f in (before, fit)]
     assert error[1] < 0.5 < 1.0 < error[0]
+
+
+def test_what_is_hardly_better_is_not_taken():
+    # the delay is 1; in such noise other delays do as well, with other numbers
+    record = ball(1500, 7, swing=0.0, louder=30.0)
+    fit = estimate_bearing([record], KNOWN, laws=[LAW], extend=False)
+    assert isinstance(fit, RescuedFit)
+    assert not fit.global_search["taken"]
+    assert fit.problem.delays == {2000.0: 1.0}
 
 
 def test_a_sign_that_is_lost_in_the_noise_does_not_end_the_estimate():

@@ -11,11 +11,12 @@ import numpy as np
 from ambid.identify.global_search import STAGE
 from ambid.identify.nonlinear.progress import Tick
 from ambid.identify.nonlinear_bearing.global_start import bearing_cost, failure, global_problems
-from ambid.identify.nonlinear_bearing.likelihood import BearingFit, search
+from ambid.identify.nonlinear_bearing.likelihood import BearingFit, criterion, search
 from ambid.identify.nonlinear_bearing.problem import BearingProblem, BearingRecord
 
 _TRIED = 15  # iterations from each place found
-_BETTER = 0.5  # of the criterion, its numbers paid for (BIC), by which a fit must be better
+_CHOICE = 2.0  # numbers' worth (BIC) by which a fit must be better: in noisy records delays and places nearly tie
+_EVEN = 0.5  # of the criterion: a fit with the same delay that has converged is taken where it is no worse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +119,11 @@ def _better(after: BearingFit | None, before: BearingFit) -> bool:
         return False
     if before.status == "failed":
         return True
-    n = before.problem.n_used  # compared per value: a longer delay leaves fewer
-    gain = n * (before.criterion / n - after.criterion / after.problem.n_used)
+    same = replace(before.problem, skip=after.problem.skip)  # the samples that both have: a longer delay leaves fewer
+    n, gain = same.n_used, criterion(same, before.vector) - after.criterion
     gain += (before.problem.size - after.problem.size) * float(np.log(n))
-    return gain > _BETTER or (gain > -_BETTER and after.status == "converged" != before.status)
+    if gain > _CHOICE * np.log(n):
+        return True
+    return (
+        gain > -_EVEN and after.problem.delays == before.problem.delays and after.status == "converged" != before.status
+    )
