@@ -118,7 +118,7 @@ def test_starts_that_do_not_fit_are_refused_on_one_line(here, ambid):
                  "--orders", "na=2,nb=2,nk=1", "--json", "fit.json").code == 0  # fmt: skip
     cases = (
         (("--start", "coil.json"), ""),
-        (("--start", "fit.json"), "starts from physical parameters"),
+        (("--start", "fit.json"), "starts from linear physical parameters"),
         (("--start", "none.json"), "none.json"),
         (("--to", "0.001"), ""),
         (("--start-seconds", "9"), "leaves nothing"),
