@@ -105,7 +105,7 @@ def test_an_edited_start_and_a_record_without_a_sound_row_are_refused(ambid, ben
     known = json.loads((bench / "start.json").read_text(encoding="utf-8"))
     (bench / "e0.json").write_text(json.dumps({**known, "operating_point": None}), encoding="utf-8")
     refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e0.json"), "operating_point")
-    known["parameters"]["m"]["value"] = 1e9
+    known["parameters"]["m"]["value"] = 1e6
     (bench / "e1.json").write_text(json.dumps(known), encoding="utf-8")
     refused(ambid("track", "record.csv", "--rig", "rig.toml", "--start", "e1.json"), "to settle")
     values = columns(record_text)
