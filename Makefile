@@ -18,7 +18,7 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint types firmware peers bench docs format changelog lock clean distclean
+.PHONY: help setup demo test tests lint types firmware peers bench docs format changelog lock clean distclean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
@@ -42,8 +42,11 @@ demo: setup  ## identify the embedded record and print the estimate beside the t
 	@$(BIN)/ambid demo
 
 test: setup  ## everything that must hold: lint, types, firmware, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
-	@$(MAKE) --no-print-directory -j1 lint types
+	@$(MAKE) --no-print-directory lint
 	@sh tools/firmware_tools.sh && $(MAKE) --no-print-directory -C firmware all || [ $$? -eq 3 ]
+	@$(MAKE) --no-print-directory -j2 types tests
+
+tests: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 lint: setup  ## formatting and lint
