@@ -182,9 +182,9 @@ def _silverbox_table() -> Table:
             " and do not count; beside it in standard deviations of the output."
         ),
         remarks=(
-            "Published: 0.44 % of the deviation for a nonlinear state-space model (linear fractional, cubic) on the data that"
-            " it was trained on, the example of the package freq_statespace. About 7.7 mV is quoted for a polynomial NARX"
-            " model on the multisine; its source was not found.",
+            "Published: 0.44 % of the deviation for a nonlinear state-space model (linear fractional, cubic) on the"
+            " data that it was trained on, the example of the package freq_statespace. About 7.7 mV is quoted for a"
+            " polynomial NARX model on the multisine; its source was not found.",
         ),
         data={"cases": data},
     )
@@ -216,7 +216,10 @@ def _drives_table() -> Table:
         remarks=(
             "These are the three records with a binary input of Wigren and Schoukens (2017). The benchmark's own rule"
             " (package nonlinear_benchmarks) is for the two others, with inputs of random amplitude, of which samples"
-            " 400 to 500 are judged. 0.103 and 0.107 are quoted for two records of this plant; which ones was not found.",
+            " 400 to 500 are judged. 0.103 and 0.107 are quoted for two records of this plant; for which"
+            " ones was not found.",
+            "Defaults of the magnitude network (its prior, folds and margins) were settled while its errors on these"
+            " halves were known; the method itself does not see them.",
         ),
         data={"cases": data},
     )
