@@ -14,7 +14,7 @@ from ambid.identify.networks.narx_choice import problem_at
 from ambid.identify.networks.narx_model import NeuralNarx
 from ambid.identify.networks.narx_spread import laplace, sandwiched
 from ambid.identify.nonlinear.cloud import cloud_of
-from ambid.identify.nonlinear.failed import failed_fit, provenance
+from ambid.identify.nonlinear.failed import NO_WEIGHTS, failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.identify.nonlinear.records import Scaled
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ambid.identify.networks.narx import Work
 
 Array = NDArray[np.float64]
-
-DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
 
 
 def finished(
@@ -49,7 +47,7 @@ def finished(
     shape, theta = work.shape, work.theta
     problem = problem_at(shape, data.parts, theta, float(used["prior"]), free=work.free)  # type: ignore[arg-type]
     if not np.isfinite(problem.cost(theta)):
-        return failed_fit("narx", records, used, seed, DIVERGED, work.timing_s)
+        return failed_fit("narx", records, used, seed, NO_WEIGHTS, work.timing_s)
     covariance, noise, effective = laplace(problem, theta)
     covariance_from = "laplace"
     warnings = [*work.warnings, *_cautions(records, data, work)]

@@ -10,6 +10,9 @@ import numpy as np
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.nonlinear.fit import NonlinearFit
 
+NO_WEIGHTS = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
+"""Why the weights of a network that looks at measured signals alone come to nothing."""
+
 
 def provenance(records: Sequence[IOData]) -> dict[str, Any]:
     """Return channels, units, rate and records, by the names that `NonlinearFit` has for them.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.identify.blackbox.data import IOData
 from ambid.identify.nonlinear.cloud import cloud_of
-from ambid.identify.nonlinear.failed import failed_fit, provenance
+from ambid.identify.nonlinear.failed import NO_WEIGHTS, failed_fit, provenance
 from ambid.identify.nonlinear.fit import NonlinearFit
 from ambid.identify.nonlinear.records import Scaled
 from ambid.identify.nonlinear.search import information_inverse
@@ -32,7 +32,6 @@ GIVEN_UNITS = (
 )
 _HELD = 0.01  # part of the variance before the data that is left of a number of the linear part
 _CROWDED = 0.8  # part of the errors that numbers may take up
-DIVERGED = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
 
 
 def finished(
@@ -58,7 +57,7 @@ def finished(
     shape, theta = work.shape, work.theta
     problem = problem_at(shape, data.parts, theta, work.prior, work.start, everything=work.everything, free=work.free)
     if not np.isfinite(problem.cost(theta[: problem.n_active])):
-        return failed_fit("rbf", records, used, seed, DIVERGED, work.timing_s)
+        return failed_fit("rbf", records, used, seed, NO_WEIGHTS, work.timing_s)
     P, noise, effective, condition = laplace(problem, theta[: problem.n_active])
     covariance, origin, warnings = _covariance(work, problem, P, str(used["uncertainty"]))
     if covariance is not None:
