@@ -14,12 +14,12 @@ import numpy as np
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.acquire import acquire
 from ambid.job.physical import identify
 from ambid.job.track_live import track_live
+from ambid.recursive.lines import TrackLine
 from ambid.rig import load_rig
-from ambid.track.lines import TrackLine
 from ambid.track.stream.block import Frame
 from table import Table
 from tests.bars.identified import BAND_HZ, BENCHES

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.likelihood import search, weight_of
-from ambid.identify.multistart import Signals, starts
-from ambid.identify.problem import PredictorProblem
+from ambid.bearing.multistart import Signals, starts
+from ambid.estimation.likelihood import search, weight_of
+from ambid.estimation.problem import PredictorProblem
 from ambid.job import signals_of
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

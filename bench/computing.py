@@ -9,9 +9,9 @@ import numpy as np
 
 import scipy_baseline
 import scipy_simulation
-from ambid.identify.greybox import greybox
-from ambid.identify.likelihood import search
-from ambid.identify.sensitivity import Workspace, linearise, residual_blocks
+from ambid.bearing.greybox import greybox
+from ambid.estimation.likelihood import search
+from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
 from ambid.job import identify
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
-from ambid.identify.nonlinear.structures import nonlinear_structure
+from ambid.blackbox.data import IOData
+from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.structures import nonlinear_structure
 from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.simulate.bench import simulate_preset

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from ambid.blackbox.data import IOData
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.structures import structure as registered
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.identify.blackbox.response import Offsets
-from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.blackbox.structures import structure as registered
 
 HERE = Path(__file__).resolve().parent
 ENVIRONMENT, TRACKING = (HERE / ".venv" / name / "bin" / "python" for name in ("linear", "tracking"))

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambid.identify.narmax.candidates import candidates
-from ambid.identify.narmax.selection import Selection, select_terms
-from ambid.identify.narmax.terms import Term, lagged, products
+from ambid.nonlinear.narmax.candidates import candidates
+from ambid.nonlinear.narmax.selection import Selection, select_terms
+from ambid.nonlinear.narmax.terms import Term, lagged, products
 from peers import Array, Bench, bench
 from table import Table
 from timing import quantity

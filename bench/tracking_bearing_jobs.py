@@ -11,10 +11,10 @@ import numpy as np
 from ambid.physics.loop import Noise
 from ambid.physics.models import model
 from ambid.physics.presets import preset
-from ambid.track.fusion.fusion import SensorFusion
-from ambid.track.fusion.motion import free_motion
-from ambid.track.fusion.sensor import FusedSensor
-from ambid.track.joint import JointEkf, JointStart, JointUkf
+from ambid.recursive.fusion.fusion import SensorFusion
+from ambid.recursive.fusion.motion import free_motion
+from ambid.recursive.fusion.sensor import FusedSensor
+from ambid.recursive.joint import JointEkf, JointStart, JointUkf
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.physical.window import MovingWindow

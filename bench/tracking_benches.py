@@ -10,18 +10,18 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.physics.loop import Limits, Noise, placed_loop
 from ambid.physics.models import model
 from ambid.physics.presets import Preset, preset
 from ambid.record import Channel, Record
+from ambid.recursive.lines import Event
 from ambid.signals import multisine
 from ambid.simulate.plant import LinearPlant
 from ambid.simulate.scenario_run import scenario_blocks
 from ambid.simulate.variation import Variation
 from ambid.simulate.varying import VaryingLoop
-from ambid.track.lines import Event
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples

@@ -8,7 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ambid.track.lines import Latency
+from ambid.recursive.lines import Latency
 from ambid.track.physical.signals import Samples
 from ambid.track.reporter import Reporter
 from ambid.track.stream.engine import StreamReport, run

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from ambid.track.lines import Event
+from ambid.recursive.lines import Event
 from ambid.track.physical.numbers import tracked_numbers
 from ambid.track.supervise.supervisor import Supervisor
 from table import Table

@@ -8,7 +8,7 @@ Run: python docs/examples/coil.py
 
 from __future__ import annotations
 
-from ambid.identify.coil import coil_instrumental, coil_least_squares
+from ambid.bearing.coil import coil_instrumental, coil_least_squares
 from ambid.job import identify
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ambid.track.blocks import OnlineThreeBlocks
+from ambid.recursive.blocks import OnlineThreeBlocks
 
 COIL = (653.5, 1204.0)  # K_a, a of thesis eq. 5.4: R = a/K_a, L = 1/K_a
 OTHERS = (-30.0, 40.0, 2.0, 15.0)  # K_b, b, K_c, c, livelier than the thesis's

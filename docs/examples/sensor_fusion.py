@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.track.fusion.fusion import SensorFusion
-from ambid.track.fusion.motion import free_motion
-from ambid.track.fusion.sensor import FusedSensor
+from ambid.recursive.fusion.fusion import SensorFusion
+from ambid.recursive.fusion.motion import free_motion
+from ambid.recursive.fusion.sensor import FusedSensor
 
 RATE_HZ, SECONDS = 20_000.0, 2.0
 GAIN, NOISE = 4000.0, 2e-3  # V/m and V: 0.5 um

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

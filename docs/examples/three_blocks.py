@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from ambid.identify.blocks import ThreeBlocks, block_parameters, three_blocks
+from ambid.bearing.blocks import ThreeBlocks, block_parameters, three_blocks
 
 PRINTED = np.array([653.5, 1204.0, 0.003496, 1.752, 1.049, 0.07209])  # thesis eq. 5.4-5.6: K_a, a, K_b, b, K_c, c
 NAMES = ("R", "L", "C", "K", "k_i", "k_x")

@@ -9,78 +9,42 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from ambid.lazy import exports
+
 if TYPE_CHECKING:
     __version__: str
-    from ambid.errors import AmbidError
-    from ambid.identify.estimate import Estimate
-    from ambid.identify.estimate_file import estimate_from_json
-    from ambid.physics.models import model, model_names
-    from ambid.physics.presets import preset, preset_names
-    from ambid.record import Channel, Record, read_record, write_record
-    from ambid.rig import Rig, default_rig, load_rig, read_bench, write_rig
-    from ambid.signals import excitation
-    from ambid.simulate import simulate_preset, simulate_rig
+    from ambid.errors import AmbidError as AmbidError
+    from ambid.estimation.estimate import Estimate as Estimate
+    from ambid.estimation.estimate_file import estimate_from_json as estimate_from_json
+    from ambid.physics.models import model as model
+    from ambid.physics.models import model_names as model_names
+    from ambid.physics.presets import preset as preset
+    from ambid.physics.presets import preset_names as preset_names
+    from ambid.record import Channel as Channel
+    from ambid.record import Record as Record
+    from ambid.record import read_record as read_record
+    from ambid.record import write_record as write_record
+    from ambid.rig import Rig as Rig
+    from ambid.rig import default_rig as default_rig
+    from ambid.rig import load_rig as load_rig
+    from ambid.rig import read_bench as read_bench
+    from ambid.rig import write_rig as write_rig
+    from ambid.signals import excitation as excitation
+    from ambid.simulate import simulate_preset as simulate_preset
+    from ambid.simulate import simulate_rig as simulate_rig
 
-_HOMES = {
-    "AmbidError": "ambid.errors",
-    "Channel": "ambid.record",
-    "Estimate": "ambid.identify.estimate",
-    "Record": "ambid.record",
-    "Rig": "ambid.rig",
-    "default_rig": "ambid.rig",
-    "estimate_from_json": "ambid.identify.estimate_file",
-    "excitation": "ambid.signals",
-    "load_rig": "ambid.rig",
-    "model": "ambid.physics.models",
-    "model_names": "ambid.physics.models",
-    "preset": "ambid.physics.presets",
-    "preset_names": "ambid.physics.presets",
-    "read_bench": "ambid.rig",
-    "read_record": "ambid.record",
-    "simulate_preset": "ambid.simulate",
-    "simulate_rig": "ambid.simulate",
-    "write_record": "ambid.record",
-    "write_rig": "ambid.rig",
-}
-_ROOMS = ("errors", "identify", "job", "physics", "record", "report", "rig", "signals", "simulate", "units", "validate")
+_ROOMS = (
+    "bearing", "blackbox", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive", "report",
+    "rig", "signals", "simulate", "track", "units", "validate",
+)  # fmt: skip
 
-__all__ = [
-    "AmbidError",
-    "Channel",
-    "Estimate",
-    "Record",
-    "Rig",
-    "__version__",
-    "default_rig",
-    "estimate_from_json",
-    "excitation",
-    "load_rig",
-    "model",
-    "model_names",
-    "preset",
-    "preset_names",
-    "read_bench",
-    "read_record",
-    "simulate_preset",
-    "simulate_rig",
-    "write_record",
-    "write_rig",
-]
+_exported, __dir__, __all__ = exports(__name__)
 
 
 def __getattr__(name: str) -> object:
     """Import a public name or a room when it is first asked for."""
-    if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
     if name == "__version__":
         from importlib.metadata import version
 
         return version("ambid")
-    if name in _ROOMS:
-        return import_module(f"ambid.{name}")
-    raise AttributeError(f"module 'ambid' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """List the public names and rooms."""
-    return sorted({*globals(), *_HOMES, *_ROOMS})
+    return import_module(f"ambid.{name}") if name in _ROOMS else _exported(name)

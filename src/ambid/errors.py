@@ -46,17 +46,7 @@ class DeviceError(AmbidError):
 def nearest(word: str, known: Sequence[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known word closest to `word`, or an empty string.
 
-    Parameters
-    ----------
-    word : str
-        What was written.
-    known : Sequence[str]
-        What may be written.
-
-    Returns
-    -------
-    str
-        A sentence that begins with a space, or ``""``.
+    `word`: what was written; `known`: what may be written. Returns a sentence that begins with a space, or ``""``.
     """
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
     return f" Did you mean {close[0]!r}?" if close else ""

@@ -95,34 +95,16 @@ _SI_NAMES: dict[_Powers, str] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unit:
-    """A unit of measurement.
+    """A unit of measurement."""
 
-    Attributes
-    ----------
-    symbol : str
-        As it was written, in plain letters: ``"um"`` for ``"µm"``.
-    si : str
-        The SI unit of the same kind. Two units are of one kind exactly if their `si` are equal.
-    scale : float
-        Value in `si` of one `symbol`.
-    """
-
-    symbol: str
-    si: str
-    scale: float
+    symbol: str  # as it was written, in plain letters: ``"um"`` for ``"µm"``
+    si: str  # the SI unit of the same kind. Two units are of one kind exactly if their `si` are equal.
+    scale: float  # value in `si` of one `symbol`
 
     def same_kind(self, other: Unit) -> bool:
         """Tell whether a value in another unit can be expressed in this one.
 
-        Parameters
-        ----------
-        other : Unit
-            The other unit.
-
-        Returns
-        -------
-        bool
-            True if both have the same SI unit.
+        `other`: the other unit. Returns true if both have the same SI unit.
         """
         return self.si == other.si
 
@@ -133,15 +115,7 @@ class Unit:
     def to_si(self, x: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
         """Convert a value in this unit to SI.
 
-        Parameters
-        ----------
-        x : float or ndarray of any shape
-            In this unit.
-
-        Returns
-        -------
-        float or ndarray, of the shape of `x`
-            In `si`; `x` itself where the scale is 1, so that SI data pass bit for bit.
+        `x`: in this unit. Returns in `si`; `x` itself where the scale is 1, so that SI data pass bit for bit.
         """
         if self.scale == 1.0:
             return x
@@ -154,20 +128,8 @@ class Unit:
 def parse_unit(text: str) -> Unit:
     """Read a unit.
 
-    Parameters
-    ----------
-    text : str
-        Such as ``"mH"``, ``"µm"``, ``"N s/m"``, ``"m/s^2"``, ``"1"``, ``"%"``.
-
-    Returns
-    -------
-    Unit
-        With its SI unit and factor. ``rpm`` becomes rad/s (factor pi/30); ``Hz`` stays Hz.
-
-    Raises
-    ------
-    UnitError
-        If a symbol is not known; the message names the nearest known ones.
+    `text`: such as ``"mH"``, ``"µm"``, ``"N s/m"``, ``"m/s^2"``, ``"1"``, ``"%"``. Returns with its SI unit and factor.
+    ``rpm`` becomes rad/s (factor pi/30); ``Hz`` stays Hz.
     """
     plain = _plain(text)
     if not plain:
@@ -189,10 +151,7 @@ def parse_unit(text: str) -> Unit:
 def known_units() -> tuple[str, ...]:
     """Return the unit symbols that are suggested to a user, simple ones first.
 
-    Returns
-    -------
-    tuple of str
-        The simple symbols and the compounds that bearings need; other prefixes and products are read too.
+    Returns the simple symbols and the compounds that bearings need; other prefixes and products are read too.
     """
     return (*_SUGGESTED, *_KNOWN_COMPOUNDS)
 
@@ -215,15 +174,7 @@ def _factor(symbol: str, text: str) -> tuple[float, _Powers, int]:
 def nearest_unit(text: str) -> str:
     """Name the known units whose spelling is nearest.
 
-    Parameters
-    ----------
-    text : str
-        What was written.
-
-    Returns
-    -------
-    str
-        Up to three symbols, comma-separated.
+    `text`: what was written. Returns up to three symbols, comma-separated.
     """
     wanted = _plain(text).lower()
     by_closeness = sorted(known_units(), key=lambda u: -difflib.SequenceMatcher(None, wanted, u.lower()).ratio())

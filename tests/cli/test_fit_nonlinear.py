@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ambid.cli import fit_nonlinear
-from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
 WORDS = ("--input", "u", "--output", "y", "--open-loop")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.identify.blackbox.fit_file import NO_INNOVATIONS, fit_from_json
+from ambid.blackbox.fit_file import NO_INNOVATIONS, fit_from_json
 from ambid.physics.presets import preset
 from ambid.record import read_record
 from tests.job.loops import loop_csv

@@ -10,7 +10,7 @@ import pytest
 
 from ambid.cli import identify_nonlinear
 from ambid.record import write_record
-from tests.identify.nonlinear_bearing.estimates import ball, by_hand, seen
+from tests.bearing.magnet.estimates import ball, by_hand, seen
 
 RIG = """schema = "ambid.rig/1"
 name = "ball"

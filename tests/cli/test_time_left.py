@@ -79,7 +79,7 @@ def test_words(seconds, words) -> None:
 
 SLOWLY = """
 import sys, time
-from ambid.identify.narmax import search
+from ambid.nonlinear.narmax import search
 quick = search.evaluated
 def evaluated(*words, **named):
     time.sleep(0.3)

@@ -13,13 +13,17 @@ TIERS: tuple[tuple[str, ...], ...] = (
     ("acquire",),
     ("track",),
     ("validate",),
-    ("identify",),
+    ("recursive",),
+    ("bearing", "rotor"),
+    ("nonlinear",),
+    ("blackbox",),
+    ("estimation",),
     ("simulate",),
     ("rig",),
     ("physics", "signals"),
     ("record",),
     ("units",),
-    ("errors",),
+    ("errors", "arrays", "compiled", "lazy"),
 )
 RANK = {room: rank for rank, tier in enumerate(TIERS) for room in tier}
 

@@ -28,13 +28,13 @@ FABRICATED = {
     "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
     "sideways": ("ambid.signals.filters", "from ambid.physics import models", "sideways"),
     "sideways, top": ("ambid.fleet.many", "import ambid.cli", "sideways"),
-    "inside a function": ("ambid.rig.load", "def f():\n    from ambid.identify import greybox\n", "line 2: rig"),
+    "inside a function": ("ambid.rig.load", "def f():\n    from ambid.bearing import greybox\n", "line 2: rig"),
     "for typing only": (
         "ambid.errors",
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ambid.record import Record\n",
         "line 3: errors",
     ),
-    "by name": ("ambid.identify", "import importlib\nm = importlib.import_module('ambid.validate')", "upward"),
+    "by name": ("ambid.bearing", "import importlib\nm = importlib.import_module('ambid.validate')", "upward"),
     "private module": ("ambid.rig.schema", "from ambid.record._files import file_bytes", "_files is private to record"),
     "private module as a name": ("ambid.rig.schema", "from ambid.record import _files", "_files is private to record"),
     "private name": (
@@ -58,7 +58,7 @@ def test_a_forbidden_import_is_found(module, source, complaint):
 
 ALLOWED = {
     "downward": (
-        "ambid.identify.greybox",
+        "ambid.bearing.greybox",
         "from ambid.physics.models import model\nfrom ambid.errors import ModelError",
     ),
     "own private module": ("ambid.record.csv_format", "from ambid.record._files import file_bytes"),

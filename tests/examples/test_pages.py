@@ -151,7 +151,7 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
 
 
 def test_the_page_on_nonlinear_models_names_every_structure():
-    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
     text = (ROOT / "docs" / "nonlinear.md").read_text(encoding="utf-8")
     assert {f"| `{name}` |" for name in NONLINEAR_STRUCTURES} <= set(re.findall(r"\| `\w+` \|", text))

@@ -1,4 +1,4 @@
-"""The black-box job: what it says of its progress. What it fits, `tests/identify` and `tests/cli` look at."""
+"""The black-box job: what it says of its progress. What it fits, `tests/blackbox` and `tests/cli` look at."""
 
 from __future__ import annotations
 

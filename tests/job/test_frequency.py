@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import freqz, lfilter
 
+from ambid.blackbox.frequency.measured import model_responses
 from ambid.errors import EstimationError
-from ambid.identify.frequency.measured import model_responses
 from ambid.job import frf
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record, write_record

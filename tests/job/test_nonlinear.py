@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError, EstimationError
-from ambid.identify.nonlinear.fit_file import nonlinear_fit_text
 from ambid.job import fit_nonlinear
 from ambid.job.estimates import read_estimate
+from ambid.nonlinear.fit_file import nonlinear_fit_text
 from ambid.record import read_record
 
 CHANNELS = {"inputs": ("u",), "outputs": ("y",)}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.identify.estimate_file import estimate_to_json
+from ambid.estimation.estimate_file import estimate_to_json
 from ambid.job.physical import identify
 from ambid.job.track import track
 from ambid.physics.presets import preset

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.response import one_step, simulation
-from ambid.identify.subspace import cva, moesp, n4sid, pbsid
+from ambid.blackbox.data import IOData
+from ambid.blackbox.response import one_step, simulation
+from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
 
 BENCHMARKS = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "benchmarks"
 pytestmark = pytest.mark.skipif(not BENCHMARKS.is_dir(), reason="the measured records are not beside this checkout")

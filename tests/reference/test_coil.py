@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from ambid.bearing.coil import coil_instrumental, coil_least_squares
+from ambid.bearing.greybox import Signals, greybox
 from ambid.errors import EstimationError
-from ambid.identify.coil import coil_instrumental, coil_least_squares
-from ambid.identify.greybox import Signals, greybox
-from ambid.identify.uncertainty import uncertainty
+from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from ambid.blackbox.frequency.laguerre import best_conditioned, block_rows_condition, laguerre_operator
 from ambid.errors import EstimationError
-from ambid.identify.frequency.laguerre import best_conditioned, block_rows_condition, laguerre_operator
 
 ORDERS = np.arange(2, 21)
 BANDS = {

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ambid.identify.greybox import greybox
-from ambid.identify.uncertainty import uncertainty
+from ambid.bearing.greybox import greybox
+from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model
 from ambid.physics.presets import preset
-from tests.identify.benches import parameters, run
+from tests.bearing.benches import parameters, run
 
 # thesis eq. 4.10 (simulated plant) and 4.11 (what its network found); states position, velocity, current
 A_410 = np.array([[0, 1, 0], [-5872.2, 0, -3100.8], [0, 5202.7, -20.97]])

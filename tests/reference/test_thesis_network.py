@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.networks.nn import nn
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.blackbox.data import IOData
+from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.networks.nn import nn
 from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.simulate.bench import simulate_preset

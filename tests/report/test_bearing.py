@@ -8,7 +8,7 @@ import pytest
 from ambid.report.bearing_figure import bearing_evidence, bearing_figures, bearing_overview
 from ambid.report.bearing_page import bearing_html
 from ambid.report.bearing_text import bearing_text, curve_rows
-from tests.identify.nonlinear_bearing.estimates import by_hand, seen
+from tests.bearing.magnet.estimates import by_hand, seen
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 from scipy.signal import lfilter
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.structures import structure
+from ambid.blackbox.data import IOData
+from ambid.blackbox.structures import structure
 from ambid.report.fit_figures import overview
 from ambid.validate.blackbox import judged
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ambid.identify.narmax.estimate import narmax
-from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.narmax.estimate import narmax
 from ambid.report.nonlinear_figure import nonlinear_overview, traces_of
 from ambid.report.nonlinear_panels import bars_of, columns_of
 from ambid.report.nonlinear_parameters import named_lines, schedule_lines, term_lines

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
 from ambid.report.response import poles, responses
 

@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 
-from ambid.identify.estimate import Check
+from ambid.estimation.estimate import Check
 from ambid.report.page import report_html
 from ambid.report.text import check_lines, columns, estimate_text, verdict
 

@@ -9,10 +9,10 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 
+from ambid.recursive.lines import Event, TrackedValue
 from ambid.report.figures import save
 from ambid.report.track_figure import event_words, runs, track_figure, truth_words
 from ambid.report.track_history import STATES, TrackHistory
-from ambid.track.lines import Event, TrackedValue
 from tests.track.tracks import track_of, truth_of
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
+from ambid.recursive.lines import Event, Latency, TrackedValue, TrackLine
 from ambid.report.track_text import change_words, speed_words, track_text, troubles_of, value_words
-from ambid.track.lines import Event, Latency, TrackedValue, TrackLine
 from tests.track.tracks import header, track_of
 
 

@@ -8,8 +8,8 @@ import math
 import pytest
 from rich.console import Console
 
+from ambid.recursive.lines import Event
 from ambid.report.track_view import TrackView, interval_bar, live_view, sparkline
-from ambid.track.lines import Event
 from tests.track.tracks import track_of
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
+from ambid.bearing.magnet.problem import UNITS
 from ambid.errors import RigError
-from ambid.identify.nonlinear_bearing.problem import UNITS
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.parameters import Parameter
 from ambid.rig import RigMagnet, load_rig, rig_from_text, rig_text

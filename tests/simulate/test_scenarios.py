@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError, RigError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.record import read_record, write_record

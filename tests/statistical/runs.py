@@ -11,13 +11,13 @@ from unittest import mock
 
 import numpy as np
 
-from ambid.identify.greybox import greybox
-from ambid.identify.likelihood import weight_of
-from ambid.identify.predictor import assemble
-from ambid.identify.sensitivity import innovations, linearise
-from ambid.identify.uncertainty import uncertainty
+from ambid.bearing.greybox import greybox
+from ambid.estimation.likelihood import weight_of
+from ambid.estimation.predictor import assemble
+from ambid.estimation.sensitivity import innovations, linearise
+from ambid.estimation.uncertainty import uncertainty
 from ambid.validate.residuals import residuals_uncorrelated, residuals_white
-from tests.identify.benches import parameters, problem_of, run
+from tests.bearing.benches import parameters, problem_of, run
 
 NAMES = ("m", "k_x", "k_i", "R", "L")
 EXCITATION_SEED = 5

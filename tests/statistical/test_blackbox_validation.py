@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ambid.identify.polynomial import arma, armax, arx, oe
+from ambid.blackbox.polynomial import arma, armax, arx, oe
 from ambid.validate.blackbox import judged
 from ambid.validate.blackbox.gradient import gradient
 from ambid.validate.blackbox.predictor import errors

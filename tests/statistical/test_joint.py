@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.track.joint import JointEkf, JointUkf
-from tests.identify.benches import run
-from tests.track.joint.starts import start_of, truth_of
+from ambid.recursive.joint import JointEkf, JointUkf
+from tests.bearing.benches import run
+from tests.recursive.joint.starts import start_of, truth_of
 
 RUNS = 80
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from tests.identify.benches import run
-from tests.identify.kalman import cramer_rao_sd
+from tests.bearing.benches import run
+from tests.estimation.kalman import cramer_rao_sd
 from tests.statistical.runs import EXCITATION_SEED, NAMES, many
 
 pytestmark = pytest.mark.slow

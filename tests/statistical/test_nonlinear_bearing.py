@@ -11,14 +11,14 @@ from functools import cache
 
 import numpy as np
 
-from ambid.identify.nonlinear_bearing.likelihood import search
-from ambid.identify.nonlinear_bearing.residual_test import whiteness
-from ambid.identify.nonlinear_bearing.uncertainty import uncertainty
+from ambid.bearing.magnet.likelihood import search
+from ambid.bearing.magnet.residual_test import whiteness
+from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.job.bearing_estimate import judged
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
-from tests.identify.nonlinear_bearing.bearings import Motion, as_seen, moved, problem_of, truth_of
+from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 
 RUNS, SAMPLES = 40, 3000
 FAR = Motion(swing=0.45, swing_hz=4.0, volts=8.0, hold=3)

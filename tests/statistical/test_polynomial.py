@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.identify.polynomial.systems import SYSTEMS
+from tests.blackbox.polynomial.systems import SYSTEMS
 
 pytestmark = pytest.mark.slow
 

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ambid.track.adaptive.gradient import Lms, Nlms
-from ambid.track.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
-from ambid.track.adaptive.least_squares import RecursiveLeastSquares
-from ambid.track.estimator import RecursiveEstimator
+from ambid.recursive.adaptive.gradient import Lms, Nlms
+from ambid.recursive.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
+from ambid.recursive.adaptive.least_squares import RecursiveLeastSquares
+from ambid.recursive.estimator import RecursiveEstimator
 
 RUNS = 400
 TRUTH = np.array([1.5, -0.7, 1.0, 0.5])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.track.polynomial import RecursivePolynomial
-from tests.identify.polynomial.systems import SYSTEMS, unstable_loop
+from ambid.recursive.polynomial import RecursivePolynomial
+from tests.blackbox.polynomial.systems import SYSTEMS, unstable_loop
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.identify.subspace import pbsid, sspem
-from tests.identify.subspace.systems import COLOURED, UNSTABLE, modal, record
+from ambid.blackbox.subspace import pbsid, sspem
+from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, modal, record
 from tests.statistical.test_subspace import real_numbers
 
 RUNS = 100

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.identify.blackbox.spread import pole_covariance, response_covariance
-from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.subspace import n4sid, pbsid
-from tests.identify.subspace.systems import COLOURED, UNSTABLE, record
+from ambid.blackbox.spread import pole_covariance, response_covariance
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.subspace import n4sid, pbsid
+from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, record
 
 RUNS = 100
 OMEGA = np.array([1.0, 20.0, 50.0, 150.0, 280.0])

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ambid.errors import AmbidError, RecordError
-from ambid.track.lines import Event, TrackedValue, TrackLine
+from ambid.recursive.lines import Event, TrackedValue, TrackLine
 from ambid.track.lines_json import TrackWriter, event_json, header_json, line_json, summary_json
 from ambid.track.lines_read import read_track
 from ambid.track.tally import Tally, most_important

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.track.lines import TrackLine
+from ambid.recursive.lines import TrackLine
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.reporter import Reporter, header

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.track.lines import Event, Latency, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, Latency, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.tally import Tally
 
 UNITS = {"m": "kg", "k_x": "N/m", "k_i": "N/A", "R": "ohm", "L": "H"}

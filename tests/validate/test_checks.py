@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.likelihood import search
-from ambid.identify.sensitivity import innovations
-from ambid.identify.uncertainty import uncertainty
+from ambid.estimation.likelihood import search
+from ambid.estimation.sensitivity import innovations
+from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.models import model
 from ambid.record import Channel, Record
 from ambid.validate.agreement import agreement
 from ambid.validate.checks import lowest_power_hz, physical_checks, residual_check, residual_checks
 from ambid.validate.plausibility import implausible
 from ambid.validate.residuals import ResidualTest
-from tests.identify.benches import BEARING, problem_of, run
+from tests.bearing.benches import BEARING, problem_of, run
 from tests.validate.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")

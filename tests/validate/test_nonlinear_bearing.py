@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.validate.nonlinear_bearing import replay, validation
-from tests.identify.nonlinear_bearing.estimates import LEVELS, by_hand, seen
+from tests.bearing.magnet.estimates import LEVELS, by_hand, seen
 
 
 @pytest.fixture(scope="module")

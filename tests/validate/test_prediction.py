@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.likelihood import search
-from ambid.identify.predictor import assemble
-from ambid.identify.sensitivity import innovations
+from ambid.estimation.likelihood import search
+from ambid.estimation.predictor import assemble
+from ambid.estimation.sensitivity import innovations
 from ambid.validate.prediction import expected_prediction_sd, fit_of, prediction_error, simulation_error
-from tests.identify.benches import problem_of, run
-from tests.identify.reference import sampled
+from tests.bearing.benches import problem_of, run
+from tests.estimation.reference import sampled
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from ambid.identify.likelihood import search
-from ambid.identify.sensitivity import innovations
+from ambid.estimation.likelihood import search
+from ambid.estimation.sensitivity import innovations
 from ambid.validate.residuals import residuals_uncorrelated, residuals_white
-from tests.identify.benches import problem_of, run
+from tests.bearing.benches import problem_of, run
 from tests.validate.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.narmax import narmax
+from ambid.nonlinear.narmax import narmax
 from ambid.validate.nonlinear import judged, validation
 from ambid.validate.second_fit import objections
-from tests.identify.nonlinear.systems import smooth
+from tests.nonlinear.systems import smooth
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.bearing.greybox import Signals
 from ambid.errors import EstimationError
-from ambid.identify.greybox import Signals
 from ambid.job import identify, signals_of
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.structures import structure
 from ambid.validate.arx_orders import arx_candidates
 from ambid.validate.selection import select
 from tests.validate.blackbox.fits import arx, io, polynomial, run

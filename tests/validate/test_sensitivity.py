@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.blackbox.polynomial import fir, oe
 from ambid.errors import EstimationError
-from ambid.identify.polynomial import fir, oe
 from ambid.validate.blackbox.predictor import errors
 from ambid.validate.sensitivity import estimate_sensitivity, sensitivity_analysis
 from tests.validate.blackbox.fits import arx, io, polynomial, run

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.blackbox.response import states
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.response import states
 from ambid.report.stabilisation import stabilisation_figure
 from ambid.validate.stabilisation import assurance, stabilisation
 from tests.validate.blackbox.fits import DT, io

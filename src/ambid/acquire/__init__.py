@@ -1,1 +1,14 @@
-"""Acquisition: from a controller, real, emulated or simulated, to a record and to whoever listens meanwhile."""
+"""The way from a controller to a record: wire protocol, devices, recorder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.acquire.device import Device as Device
+    from ambid.acquire.program import expected as expected
+    from ambid.acquire.recorder import read_acquisition as read_acquisition
+
+__getattr__, __dir__, __all__ = exports(__name__)

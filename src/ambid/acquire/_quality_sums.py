@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.acquire.device import Column
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 _DIFFERENCES = np.array([1.0, -3.0, 3.0, -1.0])
 _GAIN = float(np.sum(_DIFFERENCES**2))  # of white noise through a third difference: 20

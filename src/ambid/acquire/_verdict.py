@@ -26,17 +26,8 @@ _SURE = 5.0  # standard deviations
 def verdict(report: QualityReport, info: DeviceInfo) -> tuple[str, ...]:
     """Say what is not good enough.
 
-    Parameters
-    ----------
-    report : QualityReport
-        All but its verdict.
-    info : DeviceInfo
-        Of the device.
-
-    Returns
-    -------
-    tuple of str
-        Empty where all is well, or where there are too few samples to tell.
+    `report`: all but its verdict; `info`: of the device. Returns empty where all is well, or where there are too few
+    samples to tell.
     """
     lines = list(_stream(report, info))
     if report.samples >= _FEWEST:

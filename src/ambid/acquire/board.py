@@ -37,20 +37,7 @@ LAG_S = 175e-6
 def period_of(rate_hz: float) -> int:
     """Return the tick of a rate.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Ticks in one second.
-
-    Returns
-    -------
-    int
-        In periods of the pulse width modulation.
-
-    Raises
-    ------
-    DeviceError
-        If the controller has no such tick; the message names the nearest rates.
+    `rate_hz`: ticks in one second. Returns in periods of the pulse width modulation.
     """
     exact = PWM_HZ / rate_hz
     period = round(exact)
@@ -67,17 +54,7 @@ def period_of(rate_hz: float) -> int:
 def nearest_rate(rate_hz: float, *, output: bool = False) -> float:
     """Return the rate that the controller can do and that is nearest by ratio.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Wanted rate, Hz.
-    output : bool
-        Only rates with which the output may be on.
-
-    Returns
-    -------
-    float
-        Hz.
+    `rate_hz`: wanted rate, Hz; `output`: only rates with which the output may be on. Returns hz.
     """
     ends = (FASTEST_OUTPUT, SLOWEST_OUTPUT) if output else (SHORTEST_PERIOD, LONGEST_PERIOD)
     exact = PWM_HZ / rate_hz
@@ -88,14 +65,7 @@ def nearest_rate(rate_hz: float, *, output: bool = False) -> float:
 def drives(period: int) -> bool:
     """Return whether the output may be on with ticks of that length.
 
-    Parameters
-    ----------
-    period : int
-        In periods of the pulse width modulation.
-
-    Returns
-    -------
-    bool
+    `period`: in periods of the pulse width modulation.
     """
     return FASTEST_OUTPUT <= period <= SLOWEST_OUTPUT
 
@@ -103,10 +73,7 @@ def drives(period: int) -> bool:
 def output_rates() -> str:
     """Return the rates with which the output may be on, for messages.
 
-    Returns
-    -------
-    str
-        Such as ``1000 to 2500 Hz``.
+    Returns such as ``1000 to 2500 Hz``.
     """
     return f"{PWM_HZ / SLOWEST_OUTPUT:g} to {PWM_HZ / FASTEST_OUTPUT:g} Hz"
 

@@ -30,18 +30,7 @@ _AT_ONCE_MS = 10  # after the time to lift
 def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int = 0) -> str:
     """Write a fault for people: cause, what it means, where, and what to do.
 
-    Parameters
-    ----------
-    fault : DeviceEvent
-        Of kind ``fault``.
-    rate_hz, lift_ms : float, int
-        Samples in one second, and the time that the rotor is given to lift off, where the run began with sample 0:
-        what left the gap at the end of that time had not come into it.
-
-    Returns
-    -------
-    str
-        One sentence with its remedy, without a full stop.
+    `fault`: of kind ``fault``. Returns one sentence with its remedy, without a full stop.
     """
     about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
     at = "" if fault.sample is None else f" at sample {fault.sample}"

@@ -26,20 +26,8 @@ _UNITS = {"position": "m", "current": "A", "voltage": "V"}
 def with_default_daq(rig: Rig) -> Rig:
     """Return a rig with ``[daq]`` and calibrations from counts; what it has already stays.
 
-    Parameters
-    ----------
-    rig : Rig
-        With limits of voltage, current and position where it has no calibrations.
-
-    Returns
-    -------
-    Rig
-        For `controller_settings`, as an emulated or simulated bench uses it; `default_daq_notes` says what was made up.
-
-    Raises
-    ------
-    RigError
-        If there are no limits to make an instrument from.
+    `rig`: with limits of voltage, current and position where it has no calibrations. Returns for `controller_settings`,
+    as an emulated or simulated bench uses it; `default_daq_notes` says what was made up.
     """
     return _filled(rig)[0]
 
@@ -47,20 +35,7 @@ def with_default_daq(rig: Rig) -> Rig:
 def default_daq_notes(rig: Rig) -> tuple[str, ...]:
     """Return what `with_default_daq` makes up for a rig, one line each.
 
-    Parameters
-    ----------
-    rig : Rig
-        As for `with_default_daq`.
-
-    Returns
-    -------
-    tuple of str
-        Empty where the rig is complete.
-
-    Raises
-    ------
-    RigError
-        As `with_default_daq`.
+    `rig`: as for `with_default_daq`. Returns empty where the rig is complete.
     """
     return _filled(rig)[1]
 

@@ -22,151 +22,74 @@ _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """One column of what a device samples.
+    """One column of what a device samples."""
 
-    Attributes
-    ----------
-    name : str
-        As it stands in the record: the rig's column of that role.
-    role : str
-        ``voltage``, ``current``, ``position``, ``extra``, ``excitation``, ``reference``.
-    unit : str
-        ``"1"`` for counts of the controller, else an SI unit.
-    span : (float, float) or None
-        Least and largest value that the converter can give: at them it is saturated. None: not known.
-    """
-
-    name: str
-    role: str
-    unit: str
+    name: str  # as it stands in the record: the rig's column of that role
+    role: str  # ``voltage``, ``current``, ``position``, ``extra``, ``excitation``, ``reference``
+    unit: str  # ``"1"`` for counts of the controller, else an SI unit
+    # least and largest value that the converter can give: at them it is saturated. None: not known.
     span: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceInfo:
-    """Who is there.
-
-    Attributes
-    ----------
-    kind : {"serial", "emulated", "simulated", "replay"}
-    port : str
-        Where: a port, a file, or the name of the bench.
-    rate_hz : float
-        Samples in one second.
-    columns : tuple of Column
-        In the order of a block's values.
-    identity : Mapping of str to int
-        What the controller says of itself (message ``identity``); empty where there is none.
-    """
+    """Who is there."""
 
     kind: Literal["serial", "emulated", "simulated", "replay"]
-    port: str
-    rate_hz: float
-    columns: tuple[Column, ...]
+    port: str  # where: a port, a file, or the name of the bench
+    rate_hz: float  # samples in one second
+    columns: tuple[Column, ...]  # in the order of a block's values
+    # what the controller says of itself (message ``identity``); empty where there is none
     identity: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
-    """An excitation as a controller plays it; `acquire.program` makes one from a name, an amplitude and a band.
-
-    Attributes
-    ----------
-    kind : {"none", "step", "prbs", "table"}
-    amplitude : float
-        Peak, in V at the coil.
-    hold : int
-        Ticks per element.
-    length : int
-        Elements of the table, or bits of the shift register.
-    cycles : int
-        How often it is played; 0: until it is ended.
-    seed : int
-        Start of the shift register.
-    table : tuple of int
-        Elements, -127 to 127.
-    """
+    """An excitation as a controller plays it; `acquire.program` makes one from a name, an amplitude and a band."""
 
     kind: Kind
-    amplitude: float = 0.0
-    hold: int = 1
-    length: int = 1
-    cycles: int = 0
-    seed: int = 1
-    table: tuple[int, ...] = ()
+    amplitude: float = 0.0  # peak, in V at the coil
+    hold: int = 1  # ticks per element
+    length: int = 1  # elements of the table, or bits of the shift register
+    cycles: int = 0  # how often it is played; 0: until it is ended
+    seed: int = 1  # start of the shift register
+    table: tuple[int, ...] = ()  # elements, -127 to 127
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceEvent:
-    """Something that a device told beside its samples.
+    """Something that a device told beside its samples."""
 
-    Attributes
-    ----------
-    kind : {"fault", "state", "lost", "damaged", "link"}
-        A fault with its safe state, another change of state, samples that never came, frames whose check value was
-        wrong, or the state of the line.
-    sample : int or None
-        Number of the sample at which it happened, where that is known.
-    what : str
-        For a fault the cause (enum ``cause``), for a state its name; else one line for a person.
-    count : int
-        Samples or frames concerned.
-    """
-
+    # a fault with its safe state, another change of state, samples that never came, frames whose check value was
+    # wrong, or the state of the line
     kind: Literal["fault", "state", "lost", "damaged", "link"]
-    sample: int | None
-    what: str
-    count: int = 0
+    sample: int | None  # number of the sample at which it happened, where that is known
+    what: str  # for a fault the cause (enum ``cause``), for a state its name; else one line for a person
+    count: int = 0  # samples or frames concerned
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counters:
-    """What went over the line since the device was opened. Nothing is lost without being counted here.
+    """What went over the line since the device was opened. Nothing is lost without being counted here."""
 
-    Attributes
-    ----------
-    samples, lost : int
-        Samples received; samples of which nothing or not all came.
-    damaged : int
-        Frames with a wrong CRC, length or code.
-    discarded_bytes : int
-        Bytes that belonged to no sound frame.
-    overruns : int
-        Blocks that the host itself had no room for.
-    resent : int
-        Commands that were sent again for want of an answer.
-    controller : Mapping of str to float
-        What the controller counted: ``overruns``, ``dropped``, ``rx_errors``, ``rx_lost``, ``busy_us``, ``supply_mv``.
-    drift : float
-        Of the controller's clock against the host's, relative; NaN while unknown.
-    drift_sd : float
-        Its standard deviation.
-    """
-
-    samples: int = 0
+    samples: int = 0  # samples received; samples of which nothing or not all came
     lost: int = 0
-    damaged: int = 0
-    discarded_bytes: int = 0
-    overruns: int = 0
-    resent: int = 0
+    damaged: int = 0  # frames with a wrong CRC, length or code
+    discarded_bytes: int = 0  # bytes that belonged to no sound frame
+    overruns: int = 0  # blocks that the host itself had no room for
+    resent: int = 0  # commands that were sent again for want of an answer
+    # what the controller counted: ``overruns``, ``dropped``, ``rx_errors``, ``rx_lost``, ``busy_us``, ``supply_mv``
     controller: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)
-    drift: float = float("nan")
-    drift_sd: float = float("nan")
+    drift: float = float("nan")  # of the controller's clock against the host's, relative; NaN while unknown
+    drift_sd: float = float("nan")  # its standard deviation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SelfTest:
-    """What a device found in itself.
+    """What a device found in itself."""
 
-    Attributes
-    ----------
-    failed : tuple of str
-        One line for each thing that is not as it should be; empty: passed.
-    numbers : Mapping of str to float
-        What was measured, e.g. ``supply_mv``, ``position``, ``current`` (counts).
-    """
-
-    failed: tuple[str, ...]
+    failed: tuple[str, ...]  # one line for each thing that is not as it should be; empty: passed
+    # what was measured, e.g. ``supply_mv``, ``position``, ``current`` (counts).
     numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)
 
 

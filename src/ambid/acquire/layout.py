@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ambid.acquire.board import ADC_TOP, PWM_TOP
 from ambid.acquire.device import Column
 from ambid.acquire.scales import Scale, scale_of
+from ambid.arrays import Array
 from ambid.physics.models import model
 from ambid.rig.rig import Daq, Rig
 
 if TYPE_CHECKING:
     from ambid.acquire.settings import ControllerSettings
 
-Array = NDArray[np.float64]
 
 STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
 """Roles of what a sample may carry, in the order of the bits of the stream mask and of a block's columns."""
@@ -25,20 +25,9 @@ STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
 def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tuple[Column, ...]:
     """Return what a sample carries, column by column.
 
-    Parameters
-    ----------
-    rig : Rig
-        Names the columns.
-    settings : ControllerSettings
-        Which there are.
-    si : bool
-        As `in_si` gives them instead of in counts.
-
-    Returns
-    -------
-    tuple of Column
-        In the order of the stream mask; spans are what the converter can give, for the voltage what the controller
-        orders at most.
+    `rig`: names the columns; `settings`: which there are; `si`: as `in_si` gives them instead of in counts. Returns in
+    the order of the stream mask; spans are what the converter can give, for the voltage what the controller orders at
+    most.
     """
     taken = {c.column for c in rig.channels}
     found = []
@@ -58,19 +47,8 @@ def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tupl
 def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
     """Turn samples in counts into SI.
 
-    Parameters
-    ----------
-    rig : Rig
-        With calibrations.
-    settings : ControllerSettings
-        What a sample carries.
-    values : array_like, shape (n_samples, n_columns), counts
-        As the controller sends them.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_columns), SI
-        Columns without a calibration stay as they are.
+    `rig`: with calibrations; `settings`: what a sample carries; `values`: (n_samples, n_columns), counts, as the
+    controller sends them. Returns (n_samples, n_columns), SI, columns without a calibration stay as they are.
     """
     out = np.array(values, dtype=np.float64)
     for k, role in enumerate(carried(settings)):
@@ -83,17 +61,7 @@ def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
 def stream_of(rig: Rig, daq: Daq) -> int:
     """Return the stream mask: current, pulse width and excitation always, the rest where the rig has it.
 
-    Parameters
-    ----------
-    rig : Rig
-        With channel ``reference`` or not.
-    daq : Daq
-        With a third input or not.
-
-    Returns
-    -------
-    int
-        One bit for each of `STREAM`.
+    `rig`: with channel ``reference`` or not; `daq`: with a third input or not. Returns one bit for each of `STREAM`.
     """
     wanted = {"current", "voltage", "excitation"} | ({"position"} if has_position(rig) else set())
     wanted |= {"third"} if daq.third is not None else set()
@@ -104,15 +72,7 @@ def stream_of(rig: Rig, daq: Daq) -> int:
 def carried(settings: ControllerSettings) -> list[str]:
     """Return the roles of what a sample carries.
 
-    Parameters
-    ----------
-    settings : ControllerSettings
-        With the stream mask.
-
-    Returns
-    -------
-    list of str
-        Of `STREAM`, in its order.
+    `settings`: with the stream mask. Returns of `STREAM`, in its order.
     """
     return [role for bit, role in enumerate(STREAM) if settings.stream >> bit & 1]
 
@@ -120,15 +80,7 @@ def carried(settings: ControllerSettings) -> list[str]:
 def has_position(rig: Rig) -> bool:
     """Return whether the rig's model has a position.
 
-    Parameters
-    ----------
-    rig : Rig
-        Any.
-
-    Returns
-    -------
-    bool
-        False for a coil alone.
+    `rig`: any. Returns false for a coil alone.
     """
     return "position" in model(rig.model).outputs
 

@@ -8,14 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.acquire.device import Program
 from ambid.acquire.scales import scale_of, who
+from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.rig.rig import Rig
-
-Array = NDArray[np.float64]
 
 MASKS = dict(enumerate((3, 3, 5, 3, 3, 0x1D, 0x11, 9, 5, 0x53, 0x1B, 0x443, 3), start=3))
 """Feedback of a register of so many bits: the bits whose parity comes in at its top; all of greatest length."""
@@ -56,20 +54,8 @@ def expected(program: Program, n_ticks: int, *, counts: int | None = None) -> Ar
 def elements_of(program: Program) -> Array:
     """Return the elements of one cycle.
 
-    Parameters
-    ----------
-    program : Program
-        The excitation.
-
-    Returns
-    -------
-    ndarray, shape (n_elements,)
-        1 and -1 for steps and PRBS, -127 to 127 for a table, one 0 for none.
-
-    Raises
-    ------
-    DeviceError
-        If a PRBS has a register that the controller does not have, or one that never moves.
+    `program`: the excitation. Returns (n_elements,), 1 and -1 for steps and PRBS, -127 to 127 for a table, one 0 for
+    none.
     """
     if program.kind == "step":
         return np.array([1.0, -1.0])
@@ -96,28 +82,8 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
 
     Where the voltage falls as the pulse gets wider, the excitation at the coil has the other sign.
 
-    Parameters
-    ----------
-    program : Program
-        The excitation.
-    rig : Rig
-        With a calibration of the voltage.
-    duty_bias : int
-        Pulse width at rest, counts.
-    duty : (int, int)
-        Least and largest pulse width, counts.
-
-    Returns
-    -------
-    int
-        At least 1.
-
-    Raises
-    ------
-    DeviceError
-        If it is less than one count, or does not fit between the pulse widths allowed.
-    RigError
-        If the voltage has no calibration.
+    `program`: the excitation; `rig`: with a calibration of the voltage; `duty_bias`: pulse width at rest, counts;
+    `duty`: least and largest pulse width, counts. Returns at least 1.
     """
     step = abs(scale_of(rig, "voltage").slope(duty_bias))
     exact = program.amplitude / step
@@ -133,38 +99,18 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Played:
-    """What is in an excitation as it is really played.
+    """What is in an excitation as it is really played."""
 
-    Attributes
-    ----------
-    period : int
-        Of the whole excitation, ticks.
-    rms_v, peak_v : float
-        V.
-    frequency_hz : ndarray, shape (n_lines,), Hz
-        Lines up to half the rate; without 0.
-    line_v : ndarray, shape (n_lines,), V
-        Peak of each line.
-    """
-
-    period: int
-    rms_v: float
+    period: int  # of the whole excitation, ticks
+    rms_v: float  # V
     peak_v: float
-    frequency_hz: Array
-    line_v: Array
+    frequency_hz: Array  # (n_lines,), Hz, lines up to half the rate; without 0
+    line_v: Array  # (n_lines,), V, peak of each line
 
     def share(self, band: tuple[float, float]) -> float:
         """Return the share of the power that lies in a band.
 
-        Parameters
-        ----------
-        band : (float, float)
-            Hz, ends included.
-
-        Returns
-        -------
-        float
-            0 to 1.
+        `band`: hz, ends included. Returns 0 to 1.
         """
         inside = (self.frequency_hz >= band[0] * (1 - 1e-9)) & (self.frequency_hz <= band[1] * (1 + 1e-9))
         power = self.line_v**2
@@ -174,15 +120,7 @@ class Played:
 def period_ticks(program: Program) -> int:
     """Return the period of an excitation.
 
-    Parameters
-    ----------
-    program : Program
-        The excitation.
-
-    Returns
-    -------
-    int
-        Ticks; 0 where it has none.
+    `program`: the excitation. Returns ticks; 0 where it has none.
     """
     n = {"none": 0, "step": 2, "prbs": 2**program.length - 1, "table": program.length}[program.kind]
     return int(n) * program.hold
@@ -191,26 +129,8 @@ def period_ticks(program: Program) -> int:
 def played(program: Program, rate_hz: float, *, counts: int | None = None, volts_per_count: float = 1.0) -> Played:
     """Return what is in one period of an excitation.
 
-    Parameters
-    ----------
-    program : Program
-        The excitation.
-    rate_hz : float
-        Ticks in one second.
-    counts : int, optional
-        Amplitude in counts: with its rounding to counts.
-    volts_per_count : float
-        Only with `counts`: V per count of pulse width.
-
-    Returns
-    -------
-    Played
-        Rms, peak and lines.
-
-    Raises
-    ------
-    DeviceError
-        If it plays nothing.
+    `program`: the excitation; `rate_hz`: ticks in one second; `counts`: amplitude in counts: with its rounding to
+    counts; `volts_per_count`: only with `counts`: V per count of pulse width. Returns rms, peak and lines.
     """
     period = period_ticks(program)
     if period == 0:

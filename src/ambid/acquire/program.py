@@ -46,32 +46,9 @@ def program(
 ) -> Program:
     """Make an excitation for a controller.
 
-    Parameters
-    ----------
-    name : str
-        ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation.excitation` knows them.
-    amplitude_v : float
-        Peak at the coil, V.
-    band : (float, float), optional
-        Hz. By default what the controller can play, to a fifth of the rate. Steps have none.
-    rate_hz : float
-        Ticks in one second.
-    seconds : float
-        How long it is to be recorded; at least one period of it has to fit.
-    seed : int
-        Phases of a multisine, where the register of a PRBS starts.
-    table_length : int
-        Elements of the controller's table.
-
-    Returns
-    -------
-    Program
-        Played until it is ended.
-
-    Raises
-    ------
-    DeviceError
-        If the controller does not know the excitation, or cannot play that band; the message names what it can.
+    `name`: ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation.excitation` knows them;
+    `amplitude_v`: peak at the coil, V; `rate_hz`: ticks in one second; `seed`: phases of a multisine, where the
+    register of a PRBS starts; `table_length`: elements of the controller's table. Returns played until it is ended.
     """
     _check(name, amplitude_v, band, rate_hz, seconds)
     ticks = round(seconds * rate_hz)

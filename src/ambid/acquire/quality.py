@@ -17,9 +17,8 @@ from ambid.acquire._quality_sums import Differences, Moments, Periods, Rate
 from ambid.acquire._verdict import verdict
 from ambid.acquire.device import DeviceInfo, Program
 from ambid.acquire.playing import period_ticks
+from ambid.arrays import Array
 from ambid.track.stream.block import Frame
-
-Array = NDArray[np.float64]
 
 _LONGEST_PERIOD = 1 << 17  # ticks that are folded: 1 MB a column
 _FREEDOM = 30  # degrees of freedom under which the periods do not tell the noise,
@@ -28,98 +27,48 @@ _FREE_SHARE = 0.5  # and part of a period that has to have come again: noise of 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnQuality:
-    """How good one column is.
+    """How good one column is."""
 
-    Attributes
-    ----------
-    name, role, unit : str
-        As the device has it.
-    mean, sd, rms : float
-        In `unit`; NaN without samples.
-    least, most : float
-        Extremes, in `unit`.
-    saturated : float
-        Share of the samples at an end of the column's span, 0 to 1.
-    used : float or None
-        Share of the span between the extremes; None where the span is not known.
-    signal_sd, noise_sd : float
-        What the excitation makes of it and what it does not, in `unit`. By differences the noise is an upper bound.
-    snr_db : float or None
-        Signal over noise, dB; infinite without noise, None where nothing moves.
-    noise_by : {"periods", "differences"}
-        How the noise was told from the signal.
-    still_s : float
-        Longest time for which the value did not change, s of the device's clock.
-    """
-
-    name: str
+    name: str  # as the device has it
     role: str
     unit: str
-    mean: float
+    mean: float  # in `unit`; NaN without samples
     sd: float
     rms: float
-    least: float
+    least: float  # extremes, in `unit`
     most: float
-    saturated: float
-    used: float | None
+    saturated: float  # share of the samples at an end of the column's span, 0 to 1
+    used: float | None  # share of the span between the extremes; None where the span is not known
+    # what the excitation makes of it and what it does not, in `unit`. By differences the noise is an upper bound.
     signal_sd: float
     noise_sd: float
-    snr_db: float | None
-    noise_by: Literal["periods", "differences"]
-    still_s: float
+    snr_db: float | None  # signal over noise, dB; infinite without noise, None where nothing moves
+    noise_by: Literal["periods", "differences"]  # how the noise was told from the signal
+    still_s: float  # longest time for which the value did not change, s of the device's clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QualityReport:
-    """How good a stream is so far.
+    """How good a stream is so far."""
 
-    Attributes
-    ----------
-    samples : int
-        Judged.
-    lost, gaps : int
-        Samples that never came, and the gaps that they make.
-    repeated : int
-        Samples that came under a number that was there already; they are left out.
-    damaged : int
-        Samples with a value that is no number; they are left out.
-    seconds : float
-        Of the device's clock, from the first to the last sample.
-    rate_hz : float
-        As the device says.
-    measured_hz, measured_sd : float
-        By the times of arrival, with its standard deviation, Hz; NaN while unknown.
-    excited : bool
-        Whether an excitation plays.
-    columns : tuple of ColumnQuality
-        In the device's order.
-    verdict : tuple of str
-        What is not good enough, one line each with its remedy; empty where all is well.
-    """
-
-    samples: int
-    lost: int
+    samples: int  # judged
+    lost: int  # samples that never came, and the gaps that they make
     gaps: int
-    repeated: int
-    damaged: int
-    seconds: float
-    rate_hz: float
-    measured_hz: float
+    repeated: int  # samples that came under a number that was there already; they are left out
+    damaged: int  # samples with a value that is no number; they are left out
+    seconds: float  # of the device's clock, from the first to the last sample
+    rate_hz: float  # as the device says
+    measured_hz: float  # by the times of arrival, with its standard deviation, Hz; NaN while unknown
     measured_sd: float
-    excited: bool
-    columns: tuple[ColumnQuality, ...]
-    verdict: tuple[str, ...] = ()
+    excited: bool  # whether an excitation plays
+    columns: tuple[ColumnQuality, ...]  # in the device's order
+    verdict: tuple[str, ...] = ()  # what is not good enough, one line each with its remedy; empty where all is well
 
 
 class Quality:
     """Judges a stream as it comes.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-        Of the opened device.
-    program : Program or None
-        The excitation that begins with the stream; None: none.
+    `info`: of the opened device; `program`: the excitation that begins with the stream; None: none.
     """
 
     def __init__(self, info: DeviceInfo, program: Program | None = None) -> None:
@@ -137,10 +86,7 @@ class Quality:
     def add(self, frame: Frame) -> None:
         """Take the next block.
 
-        Parameters
-        ----------
-        frame : Frame
-            Values of shape (n_samples, n_columns), in the device's units.
+        `frame`: values of shape (n_samples, n_columns), in the device's units.
         """
         with np.errstate(all="ignore"):  # what is too large for sums makes them no number: the verdict says so
             self._add(frame)
@@ -174,10 +120,7 @@ class Quality:
     def report(self) -> QualityReport:
         """Return how good the stream is so far.
 
-        Returns
-        -------
-        QualityReport
-            With what is not good enough, in words.
+        Returns with what is not good enough, in words.
         """
         with np.errstate(all="ignore"):
             return self._report()

@@ -25,24 +25,8 @@ _SLOW_PERIODS = 2000.0  # ticks in which a mode of the loop should have settled
 def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] | None = None) -> tuple[str, ...]:
     """Say what a rig's controller will do only roughly, or what speaks against closing its loop.
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    settings : ControllerSettings
-        Made from it by `ambid.acquire.settings.controller_settings`.
-    parameters : Mapping of str to float, optional
-        Plant that the controller really stands before, SI; default: the values that the rig gives.
-
-    Returns
-    -------
-    tuple of str
-        One line each, with its remedy; empty where nothing is to be said.
-
-    Raises
-    ------
-    RigError
-        If the plant is so absurd that its loop has no finite numbers.
+    `rig`: the rig; `settings`: made from it by `ambid.acquire.settings.controller_settings`. Returns one line each,
+    with its remedy; empty where nothing is to be said.
     """
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:

@@ -5,68 +5,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ambid.acquire.board import ADC_TOP, PWM_TOP
+from ambid.arrays import Array
 from ambid.errors import RigError
 from ambid.rig.rig import Rig, RigChannel
 from ambid.units import parse_unit
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scale:
-    """A straight or bent line from counts to SI, everywhere rising or everywhere falling.
+    """A straight or bent line from counts to SI, everywhere rising or everywhere falling."""
 
-    Attributes
-    ----------
-    role, column : str
-        Of the rig's channel.
-    top : int
-        Largest count that the controller gives or takes; the least is 0.
-    raw : ndarray, shape (n_points,), counts
-        Corners of the line, increasing; at least two.
-    si : ndarray, shape (n_points,), SI
-        Values there, increasing or decreasing. The first and last piece go on outside.
-    ends : (float, float) or None
-        Counts outside which the calibration table refuses to be read; None: nowhere.
-    """
-
-    role: str
+    role: str  # of the rig's channel
     column: str
-    top: int
-    raw: Array
-    si: Array
+    top: int  # largest count that the controller gives or takes; the least is 0
+    raw: Array  # (n_points,), counts, corners of the line, increasing; at least two
+    si: Array  # (n_points,), SI, values there, increasing or decreasing. The first and last piece go on outside.
+    # counts outside which the calibration table refuses to be read; None: nowhere
     ends: tuple[float, float] | None = None
 
     def to_si(self, counts: ArrayLike) -> Array:
         """Return what counts mean.
 
-        Parameters
-        ----------
-        counts : array_like, any shape, counts
-            What the controller gives.
-
-        Returns
-        -------
-        ndarray, same shape, SI
-            Continued in a straight line outside the corners.
+        `counts`: what the controller gives. Returns continued in a straight line outside the corners.
         """
         return _line(np.asarray(counts, dtype=np.float64), self.raw, self.si)
 
     def to_counts(self, si: ArrayLike) -> Array:
         """Return the counts that mean a value, not rounded.
 
-        Parameters
-        ----------
-        si : array_like, any shape, SI
-            Values of the role.
-
-        Returns
-        -------
-        ndarray, same shape, counts
-            Continued in a straight line outside the corners; may lie outside 0 to `top`.
+        `si`: values of the role. Returns continued in a straight line outside the corners; may lie outside 0 to `top`.
         """
         order = slice(None) if self.si[-1] > self.si[0] else slice(None, None, -1)
         return _line(np.asarray(si, dtype=np.float64), self.si[order], self.raw[order])
@@ -74,15 +44,7 @@ class Scale:
     def slope(self, counts: float) -> float:
         """Return SI per count at a point of the line; at a corner the mean of both sides.
 
-        Parameters
-        ----------
-        counts : float
-            Where.
-
-        Returns
-        -------
-        float
-            Positive or negative, never 0.
+        `counts`: where. Returns positive or negative, never 0.
         """
         slopes = np.diff(self.si) / np.diff(self.raw)
         last = slopes.size - 1
@@ -93,15 +55,7 @@ class Scale:
     def slopes(self, low: float, high: float) -> tuple[float, float]:
         """Return the least and the largest slope by magnitude between two counts.
 
-        Parameters
-        ----------
-        low, high : float
-            The stretch, counts.
-
-        Returns
-        -------
-        (float, float)
-            SI per count, without sign.
+        `low`, `high`: the stretch, counts. Returns SI per count, without sign.
         """
         slopes = np.abs(np.diff(self.si) / np.diff(self.raw))
         touched = (self.raw[:-1] < high) & (self.raw[1:] > low)
@@ -112,22 +66,8 @@ class Scale:
 def scale_of(rig: Rig, role: str) -> Scale:
     """Return the scale of a role.
 
-    Parameters
-    ----------
-    rig : Rig
-        With a calibration from counts for that role.
-    role : str
-        ``voltage`` (counts of pulse width), or an analog input: ``position``, ``current``, ``speed``, ``angle``.
-
-    Returns
-    -------
-    Scale
-        From counts to the role's SI unit.
-
-    Raises
-    ------
-    RigError
-        If the channel has no calibration, is not calibrated from plain counts, or its table is not monotone.
+    `rig`: with a calibration from counts for that role; `role`: ``voltage`` (counts of pulse width), or an analog
+    input: ``position``, ``current``, ``speed``, ``angle``. Returns from counts to the role's SI unit.
     """
     c = rig.channel(role)
     top = PWM_TOP if role == "voltage" else ADC_TOP
@@ -157,15 +97,7 @@ def scale_of(rig: Rig, role: str) -> Scale:
 def who(rig: Rig) -> str:
     """Return how messages call a rig.
 
-    Parameters
-    ----------
-    rig : Rig
-        Any.
-
-    Returns
-    -------
-    str
-        By its file, else by its name.
+    `rig`: any. Returns by its file, else by its name.
     """
     return f"rig {rig.source}" if rig.source is not None else f"rig {rig.name!r}"
 

@@ -31,66 +31,35 @@ class Tap(Protocol):
     def take(self, frame: Frame) -> None:
         """Take a block; must not keep the run waiting.
 
-        Parameters
-        ----------
-        frame : Frame
-            A block with its time of arrival.
+        `frame`: a block with its time of arrival.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """What a run is to do.
-
-    Attributes
-    ----------
-    mode : {"sample", "drive", "levitate"}
-    seconds : float
-        Length of what is passed on, s of the device's clock.
-    settle_s : float
-        Time after the start that is not passed on: lift-off and its transient, s.
-    program : Program or None
-        Excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
-        periodic from its first sample.
-    """
+    """What a run is to do."""
 
     mode: Mode
-    seconds: float
-    settle_s: float = 0.0
+    seconds: float  # length of what is passed on, s of the device's clock
+    settle_s: float = 0.0  # time after the start that is not passed on: lift-off and its transient, s
+    # excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
+    # periodic from its first sample.
     program: Program | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunReport:
-    """What came of a run.
+    """What came of a run."""
 
-    Attributes
-    ----------
-    samples : int
-        Passed on.
-    wanted : int
-        Samples that the course asks for.
-    lost : int
-        Samples of the wanted ones, up to the last one that came, that never came.
-    first, after : int
-        Number of the first sample that was passed on, and of the one after the last; equal where none was.
-    fault : DeviceEvent or None
-        What ended the run early.
-    interrupted : bool
-        Whether it was ended by request.
-    events : tuple of DeviceEvent
-        All that the device told meanwhile.
-    """
-
-    samples: int
-    wanted: int
-    lost: int
-    first: int
+    samples: int  # passed on
+    wanted: int  # samples that the course asks for
+    lost: int  # samples of the wanted ones, up to the last one that came, that never came
+    first: int  # number of the first sample that was passed on, and of the one after the last; equal where none was
     after: int
-    fault: DeviceEvent | None
-    interrupted: bool
-    events: tuple[DeviceEvent, ...]
+    fault: DeviceEvent | None  # what ended the run early
+    interrupted: bool  # whether it was ended by request
+    events: tuple[DeviceEvent, ...]  # all that the device told meanwhile
 
     @property
     def complete(self) -> bool:
@@ -108,26 +77,8 @@ def run(
 ) -> RunReport:
     """Let a device do a course, and pass on what it samples.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-    course : Course
-    taps : sequence of Tap
-        Each is given every block, cut to the wanted part.
-    on_event : callable, optional
-        Told of each event of the device as it comes.
-    stopped : callable, optional
-        Asked between blocks; True ends the run in an orderly way.
-
-    Returns
-    -------
-    RunReport
-
-    Raises
-    ------
-    DeviceError
-        If the device refuses the course, or the line falls silent. The device is stopped in any case.
+    `device`: opened, idle; `taps`: each is given every block, cut to the wanted part; `on_event`: told of each event of
+    the device as it comes; `stopped`: asked between blocks; True ends the run in an orderly way.
     """
     made = _Run(device, course, taps, on_event)
     try:

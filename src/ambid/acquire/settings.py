@@ -45,41 +45,25 @@ _GAINS = ("kp", "ki", "kd", "pole", "kc", "setpoint", "current_rest", "duty_bias
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerSettings:
-    """What the messages ``configure``, ``limits`` and ``gains`` want, under the names of their fields.
+    """What the messages ``configure``, ``limits`` and ``gains`` want, under the names of their fields."""
 
-    Attributes
-    ----------
-    period, stream : int
-        Tick in periods of the pulse width modulation; mask of what a sample carries.
-    position_low, position_high, current_low, current_high : int
-        Trips, counts.
-    duty_low, duty_high, duty_off : int
-        Pulse widths, counts.
-    host_ms, lift_ms : int
-        Silence of the host, time to lift, ms.
-    kp, ki, kd, pole, kc : int
-        Gains in the fixed point of the message ``gains``.
-    setpoint, current_rest, duty_bias : int
-        Rest, counts.
-    """
-
-    period: int
+    period: int  # tick in periods of the pulse width modulation; mask of what a sample carries
     stream: int
-    position_low: int
+    position_low: int  # trips, counts
     position_high: int
     current_low: int
     current_high: int
-    duty_low: int
+    duty_low: int  # pulse widths, counts
     duty_high: int
     duty_off: int
-    host_ms: int
+    host_ms: int  # silence of the host, time to lift, ms
     lift_ms: int
-    kp: int = 0
+    kp: int = 0  # gains in the fixed point of the message ``gains``
     ki: int = 0
     kd: int = 0
     pole: int = 0
     kc: int = 0
-    setpoint: int = 0
+    setpoint: int = 0  # rest, counts
     current_rest: int = 0
     duty_bias: int = 0
 
@@ -114,22 +98,8 @@ class ControllerSettings:
 def controller_settings(rig: Rig) -> ControllerSettings:
     """Turn a rig into what its controller is told.
 
-    Parameters
-    ----------
-    rig : Rig
-        With ``[daq]`` and calibrations from counts; `ambid.acquire.default_daq.with_default_daq` makes them up.
-
-    Returns
-    -------
-    ControllerSettings
-        Each within what the controller takes. Trips are rounded inwards, all else to the nearest.
-
-    Raises
-    ------
-    RigError
-        If the rig does not say enough, or something that the controller cannot represent or protect.
-    DeviceError
-        If the controller has no exact tick of that rate.
+    `rig`: with ``[daq]`` and calibrations from counts; `ambid.acquire.default_daq.with_default_daq` makes them up.
+    Returns each within what the controller takes. Trips are rounded inwards, all else to the nearest.
     """
     daq = _daq(rig)
     voltage, current = scale_of(rig, "voltage"), scale_of(rig, "current")
@@ -168,17 +138,8 @@ def controller_settings(rig: Rig) -> ControllerSettings:
 def realised(settings: ControllerSettings, rig: Rig) -> Loop:
     """Return the loop that the controller really closes, after rounding, in SI.
 
-    Parameters
-    ----------
-    settings : ControllerSettings
-        What it is told.
-    rig : Rig
-        The rig that they were made from, for its calibrations.
-
-    Returns
-    -------
-    Loop
-        In SI, by the slopes of the calibrations at rest; its delay is that of the controller itself.
+    `settings`: what it is told; `rig`: the rig that they were made from, for its calibrations. Returns in SI, by the
+    slopes of the calibrations at rest; its delay is that of the controller itself.
     """
     voltage = scale_of(rig, "voltage").slope(settings.duty_bias)
     current = scale_of(rig, "current").slope(settings.current_rest)
@@ -199,15 +160,7 @@ def realised(settings: ControllerSettings, rig: Rig) -> Loop:
 def rest_of(rig: Rig) -> dict[str, float]:
     """Return the point about which the controller works.
 
-    Parameters
-    ----------
-    rig : Rig
-        Its operating point; what that does not give is 0, for the voltage R times the current.
-
-    Returns
-    -------
-    dict of str to float
-        ``position`` (m), ``current`` (A), ``voltage`` (V).
+    Returns ``position`` (m), ``current`` (A), ``voltage`` (V).
     """
     given = rig.operating_point
     current = given.get("current", 0.0)
@@ -244,17 +197,8 @@ def _daq(rig: Rig) -> Daq:
 def exact_gains(rig: Rig, rest: tuple[int, int, int]) -> dict[str, float]:
     """Return the loop's gains in steps of the controller, not rounded, by the slopes of the calibrations at rest.
 
-    Parameters
-    ----------
-    rig : Rig
-        With a loop, ``[daq]`` and calibrations.
-    rest : (int, int, int)
-        Counts at rest: pulse width, current, position.
-
-    Returns
-    -------
-    dict of str to float
-        ``kp``, ``ki``, ``kd``, ``kc`` in the units of the message ``gains``.
+    `rig`: with a loop, ``[daq]`` and calibrations; `rest`: counts at rest: pulse width, current, position. Returns
+    ``kp``, ``ki``, ``kd``, ``kc`` in the units of the message ``gains``.
     """
     assert rig.loop is not None
     assert rig.daq is not None

@@ -6,34 +6,19 @@ from collections.abc import Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.acquire.device import Column, DeviceInfo
+from ambid.arrays import Array
 from ambid.record import Channel, Record
 from ambid.rig import Rig, bench_record
 from ambid.track.stream.block import Block
-
-Array = NDArray[np.float64]
 
 
 def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start_s: float = 0.0) -> Record:
     """Return samples of a device as a record.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_columns), in the columns' units
-        As blocks hold them.
-    columns : sequence of Column
-        Of the device.
-    rate_hz : float
-        Sampling rate in Hz.
-    start_s : float
-        Time of the first sample, s.
-
-    Returns
-    -------
-    Record
-        One channel per column, named like it.
+    `values`: (n_samples, n_columns), in the columns' units, as blocks hold them; `columns`: of the device; `rate_hz`:
+    sampling rate in Hz; `start_s`: time of the first sample, s. Returns one channel per column, named like it.
     """
     channels = tuple(Channel(name=c.name, unit=c.unit, values=values[:, k]) for k, c in enumerate(columns))
     return Record(channels=channels, rate_hz=rate_hz, start_s=start_s, provenance=MappingProxyType({}), history=())
@@ -42,26 +27,9 @@ def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start
 class BenchView:
     """Turns raw blocks of a device into blocks of roles, SI.
 
-    Parameters
-    ----------
-    info : DeviceInfo
-        Of the opened device.
-    rig : Rig
-        Its columns and calibrations.
-    roles : sequence of str
-        Which, in which order.
+    `info`: of the opened device; `rig`: its columns and calibrations; `roles`: which, in which order.
 
-    Attributes
-    ----------
-    units : dict of str to str
-        SI unit of each role, in the order given.
-    rate_hz : float
-        Sampling rate in Hz.
-
-    Raises
-    ------
-    AmbidError
-        If the device has not the columns that the rig wants, or their units do not fit.
+    `units`: SI unit of each role, in the order given; `rate_hz`: sampling rate in Hz.
     """
 
     def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
@@ -74,15 +42,7 @@ class BenchView:
     def block(self, raw: Block) -> Block:
         """Return a block in the order of the roles.
 
-        Parameters
-        ----------
-        raw : Block
-            Shape (n_samples, n_columns), in the device's units.
-
-        Returns
-        -------
-        Block
-            Shape (n_samples, n_roles), SI.
+        `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
         """
         seen = self.record(raw.values)
         values = np.column_stack([seen[role] for role in self.units])
@@ -91,16 +51,7 @@ class BenchView:
     def record(self, values: Array, *, start_s: float = 0.0) -> Record:
         """Return samples as a record whose channels are named by role.
 
-        Parameters
-        ----------
-        values : ndarray, shape (n_samples, n_columns), in the device's units
-            As blocks hold them.
-        start_s : float
-            Time of the first sample, s.
-
-        Returns
-        -------
-        Record
-            All of the rig's channels, SI.
+        `values`: (n_samples, n_columns), in the device's units, as blocks hold them; `start_s`: time of the first
+        sample, s. Returns all of the rig's channels, SI.
         """
         return bench_record(as_record(values, self._columns, self.rate_hz, start_s=start_s), self._rig)

@@ -21,10 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     Exit codes: 0 done; 2 input refused; 3 done, but a check failed under ``--strict``; 1 a defect of the program;
     130 interrupted; 141 nobody read the output to its end.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after ``ambid``; by default those of the command line.
+    `arguments`: words after ``ambid``; by default those of the command line.
     """
     # Matrices here are small: threads of the linear algebra libraries only cost time. They look at this when they are
     # first imported, which is later.
@@ -82,15 +79,8 @@ class _Told(io.TextIOWrapper):
 def run(arguments: Sequence[str]) -> int:
     """Run the command and turn whatever happens into an exit code and at most one line of error.
 
-    Parameters
-    ----------
-    arguments : sequence of str
-        Words after ``ambid``. ``--traceback`` anywhere among them shows where an error arose.
-
-    Returns
-    -------
-    int
-        The exit code.
+    `arguments`: words after ``ambid``. ``--traceback`` anywhere among them shows where an error arose. Returns the exit
+    code.
     """
     if sys.stdout is None:  # it was closed before the program began
         sys.stdout = _Nobody()

@@ -23,14 +23,7 @@ if TYPE_CHECKING:
 def tell(done: Acquired, wish: Wish, stop: Stop, *, table: bool) -> None:
     """Say what was recorded; where standard output is of the track, only what is not good of it.
 
-    Parameters
-    ----------
-    done : Acquired
-    wish : Wish
-    stop : Stop
-        With the signal that ended it, if one did: a terminal that was closed takes nothing.
-    table : bool
-        Whether standard output is for it.
+    `table`: whether standard output is for it.
     """
     if done.recorded is None:
         return
@@ -53,21 +46,7 @@ def tell(done: Acquired, wish: Wish, stop: Stop, *, table: bool) -> None:
 def finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
     """Tell what ended the run early, and end with the exit code.
 
-    Parameters
-    ----------
-    done : Acquired
-    wish : Wish
-    stop : Stop
-        With the signal that ended it, if one did.
-    strict : bool
-        Whether what is not good enough is a failed check.
-
-    Raises
-    ------
-    AmbidError
-        If a fault, a disk or a bench without samples ended it.
-    typer.Exit
-        With the code of a signal or a failed check.
+    `stop`: with the signal that ended it, if one did; `strict`: whether what is not good enough is a failed check.
     """
     stored = done.run.samples - done.not_stored - done.quality.repeated
     kept = f"{wish.record} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
@@ -95,16 +74,7 @@ def finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
 def left(record: Path, changed: bool) -> str:
     """Say where what was recorded is, after a second signal tore the run off.
 
-    Parameters
-    ----------
-    record : Path
-    changed : bool
-        Whether it is another file than before.
-
-    Returns
-    -------
-    str
-        What goes on after the word that it was interrupted.
+    `changed`: whether it is another file than before. Returns what goes on after the word that it was interrupted.
     """
     from ambid.acquire.recorder.header import journal_path
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from ambid.acquire.device import Device
     from ambid.acquire.session import Course, RunReport
     from ambid.cli.interrupts import Stop
-    from ambid.identify.estimate import Estimate
+    from ambid.estimation.estimate import Estimate
     from ambid.job.acquire import Acquired
-    from ambid.track.lines import Track
+    from ambid.recursive.lines import Track
 
 
 def followed(
@@ -27,30 +27,9 @@ def followed(
 ) -> tuple[Acquired, Callable[[], None]]:
     """Record, and track what is recorded.
 
-    Parameters
-    ----------
-    wish : Wish
-    device : Device
-        Opened, idle.
-    course : Course
-    start : Estimate or None
-        Where tracking begins; None: identified from the first part.
-    json : str or None
-        Where the track goes.
-    stop : Stop
-        Told of a signal that ended the run.
-    live : bool
-        Whether a live view is wanted.
-
-    Returns
-    -------
-    (Acquired, callable)
-        The second one prints the track, and raises what it ends with.
-
-    Raises
-    ------
-    AmbidError
-        If device, disk or start break a rule before there is anything to keep.
+    `device`: opened, idle; `start`: where tracking begins; None: identified from the first part; `json`: where the
+    track goes; `stop`: told of a signal that ended the run; `live`: whether a live view is wanted. Returns the second
+    one prints the track, and raises what it ends with.
     """
     from ambid.cli.live import Follower
     from ambid.cli.track import finish

@@ -13,44 +13,25 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.acquire.device import Mode
-    from ambid.identify.estimate import Estimate
+    from ambid.estimation.estimate import Estimate
     from ambid.rig import Rig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wish:
-    """What the user asks for; refused when it is made, where it does not go together.
-
-    Attributes
-    ----------
-    port : str
-    rig : Rig
-    record : Path
-    mode : {"sample", "drive", "levitate"}
-    seconds, settle_s : float
-        Length of the record, and time before it, s.
-    name : str or None
-        Of the excitation.
-    amplitude : float or None
-        Peak in V; None: found by trials.
-    band : (float, float) or None
-        In Hz.
-    seed : int
-    force : bool
-        Whether a record that exists may be written over.
-    """
+    """What the user asks for; refused when it is made, where it does not go together."""
 
     port: str
     rig: Rig
     record: Path
     mode: Mode
-    seconds: float
+    seconds: float  # length of the record, and time before it, s
     settle_s: float
-    name: str | None
-    amplitude: float | None
-    band: tuple[float, float] | None
+    name: str | None  # of the excitation
+    amplitude: float | None  # peak in V; None: found by trials
+    band: tuple[float, float] | None  # in Hz
     seed: int
-    force: bool
+    force: bool  # whether a record that exists may be written over
 
     def __post_init__(self) -> None:
         """Refuse what does not go together."""
@@ -75,15 +56,7 @@ class Wish:
     def check_length(self, rate_hz: float) -> None:
         """Refuse a record that would be too short to be read.
 
-        Parameters
-        ----------
-        rate_hz : float
-            Of the device.
-
-        Raises
-        ------
-        AmbidError
-            If it has fewer samples than a record needs.
+        `rate_hz`: of the device.
         """
         from ambid.record.sampling import MIN_SAMPLES
 
@@ -98,24 +71,11 @@ class Wish:
 def start_of_track(track: str | None) -> Estimate | None:
     """Read the estimate that tracking is to begin with.
 
-    Parameters
-    ----------
-    track : str or None
-        As given: None, ``auto``, or a file.
-
-    Returns
-    -------
-    Estimate or None
-        None where none is named.
-
-    Raises
-    ------
-    AmbidError
-        If it is not the file of an estimate.
+    `track`: as given: None, ``auto``, or a file. Returns none where none is named.
     """
     if track in (None, "auto"):
         return None
-    from ambid.identify.estimate import Estimate
+    from ambid.estimation.estimate import Estimate
     from ambid.job.estimates import read_estimate
 
     found = read_estimate(str(track))
@@ -128,10 +88,5 @@ def start_of_track(track: str | None) -> Estimate | None:
 
 
 def told(what: AmbidError) -> None:
-    """Say on standard error what goes wrong while a recording goes on.
-
-    Parameters
-    ----------
-    what : AmbidError
-    """
+    """Say on standard error what goes wrong while a recording goes on."""
     typer.echo(f"ambid: {what}", err=True)

@@ -70,15 +70,7 @@ def run_verb(words: Sequence[str]) -> int:
 
     Errors come out as they are raised: `ambid.cli.run` is the one place that puts them into words.
 
-    Parameters
-    ----------
-    words : sequence of str
-        After ``ambid``.
-
-    Returns
-    -------
-    int
-        0, or 3 for a failed check under ``--strict``.
+    `words`: after ``ambid``. Returns 0, or 3 for a failed check under ``--strict``.
     """
     plain_where_needed(sys.stdout)
     plain_where_needed(sys.stderr)
@@ -94,15 +86,8 @@ def run_verb(words: Sequence[str]) -> int:
 def refusal(error: Exception) -> str | None:
     """Put an error of usage into one line.
 
-    Parameters
-    ----------
-    error : Exception
-        Anything that a verb raised.
-
-    Returns
-    -------
-    str or None
-        What is wrong with the words, and where help is; None for an error of another kind.
+    `error`: anything that a verb raised. Returns what is wrong with the words, and where help is; None for an error of
+    another kind.
     """
     if not isinstance(error, typer.TyperException) or not hasattr(error, "format_message"):
         return None

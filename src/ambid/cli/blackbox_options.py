@@ -10,7 +10,7 @@ import typer
 from ambid.errors import EstimationError
 
 if TYPE_CHECKING:
-    from ambid.identify.blackbox.orders import Orders
+    from ambid.blackbox.orders import Orders
 
 Inputs = Annotated[
     list[str] | None,
@@ -39,21 +39,7 @@ SecondRecord = Annotated[
 def orders_of(text: str) -> Orders | None:
     """Read orders as they are written on the command line.
 
-    Parameters
-    ----------
-    text : str
-        ``"auto"``, or ``"na=2,nb=2,nk=1"``; inputs that differ are separated by a slash, ``"nb=2/3"``; an order may be
-        ``auto``.
-
-    Returns
-    -------
-    dict of str to int, tuple of int or "auto", or None
-        None where all are to be chosen.
-
-    Raises
-    ------
-    EstimationError
-        If a part is not NAME=NUMBER, or a name stands twice.
+    Returns none where all are to be chosen.
     """
     if text.strip() == "auto":
         return None
@@ -76,21 +62,7 @@ def orders_of(text: str) -> Orders | None:
 
 
 def fixed_of(parts: list[str] | None) -> dict[str, float]:
-    """Read known coefficients, ``a1=-1.5``.
-
-    Parameters
-    ----------
-    parts : list of str or None
-
-    Returns
-    -------
-    dict of str to float
-
-    Raises
-    ------
-    EstimationError
-        If a part is not NAME=NUMBER, or a name stands twice.
-    """
+    """Read known coefficients, ``a1=-1.5``."""
     found: dict[str, float] = {}
     for part in parts or []:
         name, _, value = (x.strip() for x in part.partition("="))

@@ -15,7 +15,7 @@ from ambid.errors import AmbidError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ambid.identify.estimate import EstimatedParameter
+    from ambid.estimation.estimate import EstimatedParameter
     from ambid.report.text import Paint
 
 # Truth of the thesis's simulation rig (table 4.1, corrected) and what its own identification found there (eq. 4.11).
@@ -62,19 +62,8 @@ def command(
 def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float], paint: Paint) -> list[str]:
     """Write estimated parameters beside their truth.
 
-    Parameters
-    ----------
-    found : tuple of EstimatedParameter
-        Fixed ones are left out.
-    truth : Mapping[str, float]
-        SI.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        A table, and a line on how many truths lie inside their 99.9 % intervals.
+    `found`: fixed ones are left out; `truth`: SI; `paint`: adds colour. Returns a table, and a line on how many truths
+    lie inside their 99.9 % intervals.
     """
     from ambid.report.numbers import quantity
     from ambid.report.text import columns

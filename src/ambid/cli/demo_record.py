@@ -28,15 +28,7 @@ _COLUMNS = (("voltage", "V", 1.0, 3), ("current", "mA", 1e3, 2), ("position", "u
 def demo_file(name: str) -> Traversable:
     """Return a file of the demo.
 
-    Parameters
-    ----------
-    name : str
-        ``"demo.csv.gz"`` or ``"demo.toml"``.
-
-    Returns
-    -------
-    Traversable
-        In the package's data.
+    `name`: ``"demo.csv.gz"`` or ``"demo.toml"``. Returns in the package's data.
     """
     return files("ambid").joinpath("data", name)
 
@@ -44,10 +36,7 @@ def demo_file(name: str) -> Traversable:
 def demo_simulation() -> Simulation:
     """Simulate the bench of the demo: the unstable bearing under its PID, with process and sensor noise.
 
-    Returns
-    -------
-    Simulation
-        Its `truth` is what the demo compares with.
+    Returns its `truth` is what the demo compares with.
     """
     from ambid.physics.presets import preset
     from ambid.signals import excitation
@@ -62,15 +51,7 @@ def demo_simulation() -> Simulation:
 def demo_csv(simulation: Simulation) -> str:
     """Write the record of the demo with the few digits that a logger keeps.
 
-    Parameters
-    ----------
-    simulation : Simulation
-        As `demo_simulation` gives it.
-
-    Returns
-    -------
-    str
-        CSV: voltage to 1 mV, current to 10 uA, position to 1 nm.
+    `simulation`: as `demo_simulation` gives it. Returns CSV: voltage to 1 mV, current to 10 uA, position to 1 nm.
     """
     record = simulation.record
     lines = [
@@ -88,15 +69,7 @@ def demo_csv(simulation: Simulation) -> str:
 def write_demo_record(folder: Path) -> Path:
     """Write the record of the demo.
 
-    Parameters
-    ----------
-    folder : Path
-        Where to.
-
-    Returns
-    -------
-    Path
-        The file.
+    `folder`: where to. Returns the file.
     """
     path = folder / "demo.csv.gz"
     path.write_bytes(gzip.compress(demo_csv(demo_simulation()).encode(), compresslevel=9, mtime=0))

@@ -57,22 +57,8 @@ Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitati
 def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:
     """Choose what a device does where the user does not say.
 
-    Parameters
-    ----------
-    port : str
-        See ``--port``.
-    rig : Rig
-        Of the device.
-    mode : str or None
-        As given.
-    excitation : str or None
-        As given.
-
-    Returns
-    -------
-    {"sample", "drive", "levitate"}
-        Of a replay, sample. Levitate where the rig has a loop and does not say ``open_loop``; else drive, if there is
-        something to play.
+    `port`: see ``--port``; `rig`: of the device; `mode`: as given; `excitation`: as given. Returns of a replay, sample.
+    Levitate where the rig has a loop and does not say ``open_loop``; else drive, if there is something to play.
     """
     if mode is not None:
         return mode
@@ -89,28 +75,8 @@ def opened(
 ) -> Iterator[Device]:
     """Open a device and close it.
 
-    Parameters
-    ----------
-    port : str
-        See ``--port``.
-    rig : Rig
-        Of the device.
-    bench : str or None
-        See ``--bench``.
-    pace : {"fastest", "real-time"}
-        Of a device that is no hardware.
-    seed : int
-        Of simulated noise.
-
-    Yields
-    ------
-    Device
-        Idle.
-
-    Raises
-    ------
-    AmbidError
-        If there is no such bench, or the device cannot be opened.
+    `port`: see ``--port``; `rig`: of the device; `bench`: see ``--bench``; `pace`: of a device that is no hardware;
+    `seed`: of simulated noise. Returns idle.
     """
     from ambid.acquire.devices.choose import open_device
 

@@ -16,9 +16,9 @@ from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
 if TYPE_CHECKING:
-    from ambid.identify.blackbox.data import IOData
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.physical import PhysicalFit
+    from ambid.bearing.physical import PhysicalFit
+    from ambid.blackbox.data import IOData
+    from ambid.blackbox.fit import BlackBoxFit
     from ambid.validate.sensitivity import SensitivityAnalysis
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
@@ -124,7 +124,7 @@ def command(
     With --rig, inputs and outputs are the rig's, and a linear fit is carried on to its physical parameters.
     Ctrl-C during a nonlinear fit keeps the best model so far (exit code 130).
     """
-    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
     if structure in NONLINEAR_STRUCTURES:
         linear_only = {
@@ -248,9 +248,9 @@ def _json_text(found: BlackBoxFit, physical: PhysicalFit | None, matter: Sensiti
     """Put the fit into ``ambid.fit/1``, with ``physical`` of a rig and ``sensitivity`` where they were asked for."""
     from dataclasses import asdict
 
-    from ambid.identify.blackbox.fit_file import fit_to_json
-    from ambid.identify.json_values import plain_json
-    from ambid.identify.physical_file import physical_to_json
+    from ambid.bearing.physical_file import physical_to_json
+    from ambid.blackbox.fit_file import fit_to_json
+    from ambid.estimation.json_values import plain_json
 
     document = fit_to_json(found)
     if physical is not None:

@@ -16,9 +16,9 @@ from ambid.cli.terminal import painter, progress
 from ambid.errors import EstimationError, nearest
 
 if TYPE_CHECKING:
-    from ambid.identify.blackbox.data import IOData
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.nonlinear.fit import NonlinearFit, Settings
+    from ambid.blackbox.data import IOData
+    from ambid.blackbox.fit import BlackBoxFit
+    from ambid.nonlinear.fit import NonlinearFit, Settings
 
 Part = tuple[float | None, float | None]
 
@@ -44,38 +44,11 @@ def fit_records(
 ) -> None:
     """Fit a nonlinear model to records, write and show it.
 
-    Parameters
-    ----------
-    records : sequence of Path
-    structure, settings : str
-        As the command line has them.
-    inputs, outputs : sequence of str
-        Columns.
-    open_loop : bool
-    part : (float or None, float or None), s
-        Of every record.
-    rate : float or None, Hz
-    gaps : str or None
-    second : Path or None
-        To judge on.
-    second_part : (float or None, float or None), s
-        Of it.
-    rig : Path or None
-    seed : int
-    json : str or None
-    plot : Path or None
-    strict : bool
-
-    Raises
-    ------
-    AmbidError
-        If something that is given breaks a rule.
-    typer.Exit
-        130 (143 for the signal to terminate) after an interruption, with everything written; 3 for a failed fit, and
-        under `strict` for a failed check.
+    `structure`, `settings`: as the command line has them; `inputs`, `outputs`: columns; `part`: of every record;
+    `second`: to judge on; `second_part`: of it.
     """
-    from ambid.identify.nonlinear.fit_file import nonlinear_fit_text
     from ambid.job import fit_nonlinear
+    from ambid.nonlinear.fit_file import nonlinear_fit_text
     from ambid.report.nonlinear_text import nonlinear_text
 
     stop = Stop()
@@ -127,14 +100,7 @@ def fit_records(
 def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
     """Say why a fit does not hold on the second record, where there is one.
 
-    Parameters
-    ----------
-    found : BlackBoxFit or NonlinearFit
-
-    Returns
-    -------
-    list of str
-        A line for each reason; empty where it holds, or was not judged there.
+    Returns a line for each reason; empty where it holds, or was not judged there.
     """
     from ambid.validate.second_fit import objections
 
@@ -156,23 +122,7 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
 
 
 def settings_of(text: str) -> Settings:
-    """Read settings as they are written on the command line.
-
-    Parameters
-    ----------
-    text : str
-        ``"ny=2,nu=2/3,degree=3,criterion=bic"``: numbers, words, or several numbers with a slash between; ``auto``, for
-        one or instead of all, leaves the choice to the method.
-
-    Returns
-    -------
-    dict of str to int, float, str or tuple of int
-
-    Raises
-    ------
-    EstimationError
-        If a part is not NAME=VALUE, or a name stands twice.
-    """
+    """Read settings as they are written on the command line."""
     found: dict[str, int | float | str | tuple[int, ...]] = {}
     if text.strip() in ("auto", ""):
         return found
@@ -204,16 +154,7 @@ def _value(text: str) -> int | float | str | tuple[int, ...]:
 def refuse_linear_only(given: Mapping[str, bool], structure: str) -> None:
     """Refuse options that only the linear structures have.
 
-    Parameters
-    ----------
-    given : Mapping[str, bool]
-        By option: whether it was given.
-    structure : str
-
-    Raises
-    ------
-    EstimationError
-        Naming the first one.
+    `given`: by option: whether it was given.
     """
     for option, was in given.items():
         if was:
@@ -221,48 +162,17 @@ def refuse_linear_only(given: Mapping[str, bool], structure: str) -> None:
 
 
 def only_one(orders: str, settings: str) -> str:
-    """Return the settings where ``--orders``, which is another name for them, is not given too.
-
-    Parameters
-    ----------
-    orders, settings : str
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    EstimationError
-        If both are given.
-    """
+    """Return the settings where ``--orders``, which is another name for them, is not given too."""
     if orders != "auto":
         raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
     return settings
 
 
 def one_record(records: Sequence[Path], structure: str, settings: str | None, seed: int | None) -> Path:
-    """Return the one record that a linear structure is fitted to.
-
-    Parameters
-    ----------
-    records : sequence of Path
-    structure : str
-    settings : str or None
-    seed : int or None
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    EstimationError
-        If there are several, or an option that only nonlinear structures have.
-    """
-    from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
-    from ambid.identify.blackbox.structures import structure as linear
-    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+    """Return the one record that a linear structure is fitted to."""
+    from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
+    from ambid.blackbox.structures import structure as linear
+    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
     if structure in RESPONSE_STRUCTURES:
         linear(structure)  # says where those are fitted

@@ -13,7 +13,7 @@ from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
 if TYPE_CHECKING:
-    from ambid.identify.estimate import Estimate
+    from ambid.estimation.estimate import Estimate
     from ambid.record import Record
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
@@ -139,14 +139,7 @@ def command(
 def stage_json(estimate: Estimate, json: str | None, outputs: Outputs) -> None:
     """Give the estimate out as JSON, where that is wanted.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        What to write.
-    json : str or None
-        The option ``--json``.
-    outputs : Outputs
-        Takes the file.
+    `estimate`: what to write; `json`: the option ``--json``; `outputs`: takes the file.
     """
     path = json_path(json)
     if path is not None:
@@ -158,16 +151,8 @@ def stage_json(estimate: Estimate, json: str | None, outputs: Outputs) -> None:
 def draw(estimate: Estimate, used: Record, outputs: Outputs, *, plot: Path | None, report: Path | None) -> None:
     """Draw the figures of an estimate, and write its report.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        What is shown.
-    used : Record
-        The record it came from, cut, channels named by role.
-    outputs : Outputs
-        Takes the files.
-    plot, report : Path or None
-        Where figures and report go.
+    `estimate`: what is shown; `used`: the record it came from, cut, channels named by role; `outputs`: takes the files;
+    `plot`, `report`: where figures and report go.
     """
     from datetime import UTC, datetime
 

@@ -17,7 +17,7 @@ from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
     from ambid.job.bearing_records import TakenRecord
 
 Part = tuple[float | None, float | None]
@@ -27,43 +27,17 @@ _FIGURES = (".png", ".svg", ".pdf")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wishes:
-    """Options that only the nonlinear magnet has.
+    """Options that only the nonlinear magnet has."""
 
-    Attributes
-    ----------
-    held : tuple of Path
-        Records with the rotor held at rest.
-    magnet : {"auto", "single", "pair"} or None
-        None: as the rig says.
-    eddy, drift : bool
-    off_below : float or None
-        In V.
-    """
-
-    held: tuple[Path, ...] = ()
-    magnet: Literal["auto", "single", "pair"] | None = None
+    held: tuple[Path, ...] = ()  # records with the rotor held at rest
+    magnet: Literal["auto", "single", "pair"] | None = None  # none: as the rig says
     eddy: bool = False
     drift: bool = False
-    off_below: float | None = None
+    off_below: float | None = None  # in V
 
 
 def one_record(records: Sequence[Path], wishes: Wishes) -> Path:
-    """Return the one record that the linear model takes.
-
-    Parameters
-    ----------
-    records : sequence of Path
-    wishes : Wishes
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    AmbidError
-        If there are several, or an option is given that only the nonlinear magnet has.
-    """
+    """Return the one record that the linear model takes."""
     given = {
         "--held": bool(wishes.held),
         "--magnet": wishes.magnet is not None,
@@ -98,29 +72,7 @@ def identify_records(
 ) -> None:
     """Identify a nonlinear magnet from records, write and show it.
 
-    Parameters
-    ----------
-    records : sequence of Path
-        In which the rotor moves.
-    rig : Path or None
-    wishes : Wishes
-    part : (float or None, float or None), s
-        Of every record in which the rotor moves.
-    rate : float or None, Hz
-    gaps : str or None
-    second : Path or None
-        To judge on.
-    json : str or None
-    plot, report : Path or None
-    strict : bool
-
-    Raises
-    ------
-    AmbidError
-        If something that is given breaks a rule.
-    typer.Exit
-        130 (143 for the signal to terminate) after an interruption, with everything written; 3 for a failed check
-        under `strict`.
+    `records`: in which the rotor moves; `part`: of every record in which the rotor moves; `second`: to judge on.
     """
     from ambid.job.bearing_records import Reading
     from ambid.job.nonlinear_bearing import identify_taken, read_records

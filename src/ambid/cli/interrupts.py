@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
-from ambid.identify.nonlinear.progress import Tick
+from ambid.estimation.progress import Tick
 
 
 @contextmanager
@@ -17,15 +17,7 @@ def signals(take: Callable[[int], None]) -> Iterator[None]:
 
     What is ignored stays so: a program under ``nohup`` outlives its terminal.
 
-    Parameters
-    ----------
-    take : callable
-        Given the number of the signal, in the main thread. In another thread nothing is done.
-
-    Yields
-    ------
-    None
-        While signals are taken.
+    Returns while signals are taken.
     """
     if current_thread() is not main_thread():
         yield
@@ -53,10 +45,7 @@ class Stop:
     Whoever presses Ctrl-C again and again would otherwise tear off the very steps that switch the output off, close
     the device and keep what was recorded.
 
-    Attributes
-    ----------
-    number : int or None
-        Of the signal; None as long as there was none.
+    `number`: of the signal; None as long as there was none.
     """
 
     def __init__(self) -> None:
@@ -65,17 +54,7 @@ class Stop:
         self._torn = False
 
     def take(self, number: int) -> None:
-        """Take a signal.
-
-        Parameters
-        ----------
-        number : int
-
-        Raises
-        ------
-        KeyboardInterrupt
-            At the second one.
-        """
+        """Take a signal."""
         if self.number is None:
             self.number = number
         elif not self._torn:
@@ -85,20 +64,13 @@ class Stop:
     def wished(self) -> bool:
         """Return whether the run is to end.
 
-        Returns
-        -------
-        bool
-            True after a signal.
+        Returns true after a signal.
         """
         return self.number is not None
 
     def torn(self) -> None:
-        """Interrupt at once if there was a second signal: a search may have taken its interruption for the first one's.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            After a second signal.
+        """Interrupt at once if there was a second signal: a search may have taken its interruption for the first
+        one's.
         """
         if self._torn:
             raise KeyboardInterrupt
@@ -112,18 +84,8 @@ class Stop:
 def interruptible(show: Tick, stop: Stop) -> Tick:
     """Return a tick that interrupts a search once where that is wished; what judges its result afterwards goes on.
 
-    Parameters
-    ----------
-    show : Tick
-        Shows the progress.
-    stop : Stop
-        Whether the user wishes to end.
-
-    Returns
-    -------
-    Tick
-        Raises KeyboardInterrupt at the first call after the wish, but not in the stage ``"check"``; after a second
-        signal, at every call.
+    `show`: shows the progress; `stop`: whether the user wishes to end. Returns raises KeyboardInterrupt at the first
+    call after the wish, but not in the stage ``"check"``; after a second signal, at every call.
     """
     told = False
 

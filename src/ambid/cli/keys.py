@@ -14,10 +14,7 @@ class Keys:
 
     Ctrl-C stays what it is. Elsewhere (a pipe, the background, a system without such terminals) there are no keys.
 
-    Parameters
-    ----------
-    fd : int, optional
-        File descriptor of the terminal; standard input by default.
+    `fd`: file descriptor of the terminal; standard input by default.
     """
 
     def __init__(self, fd: int | None = None) -> None:
@@ -52,15 +49,7 @@ class Keys:
     def read(self, wait_s: float) -> str:
         """Wait for a key.
 
-        Parameters
-        ----------
-        wait_s : float
-            Longest time to wait, s.
-
-        Returns
-        -------
-        str
-            What was pressed, several keys perhaps; empty where nothing was.
+        `wait_s`: longest time to wait, s. Returns what was pressed, several keys perhaps; empty where nothing was.
         """
         if self._before is None or self._fd is None:
             time.sleep(wait_s)

@@ -20,9 +20,9 @@ from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
+    from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_history import TrackHistory
     from ambid.report.track_view import TrackView
-    from ambid.track.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.track.lines_json import TrackWriter
     from ambid.track.tally import Tally
 
@@ -39,13 +39,7 @@ _NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; o
 
 
 class Stopped(KeyboardInterrupt):
-    """The operator ended a run that has begun to give lines.
-
-    Parameters
-    ----------
-    code : int
-        Exit code: 0 for the key q, 130 for Ctrl-C, 143 for a signal to terminate.
-    """
+    """The operator ended a run that has begun to give lines."""
 
     def __init__(self, code: int) -> None:
         """Keep the exit `code`."""
@@ -56,16 +50,8 @@ class Stopped(KeyboardInterrupt):
 class Follower:
     """Follows one run.
 
-    Parameters
-    ----------
-    writer : TrackWriter or None
-        Where lines are written.
-    keep : bool
-        Keep columns for a figure.
-    live : bool
-        Show the live view on standard error.
-    real_time : bool
-        Whether the record is replayed as it was taken.
+    `writer`: where lines are written; `keep`: keep columns for a figure; `live`: show the live view on standard error;
+    `real_time`: whether the record is replayed as it was taken.
     """
 
     def __init__(self, writer: TrackWriter | None, *, keep: bool, live: bool, real_time: bool) -> None:
@@ -92,15 +78,8 @@ class Follower:
     def run(self, job: Callable[[], Track]) -> TrackSummary | None:
         """Let the job run to its end, or until it is stopped, and write the summary.
 
-        Parameters
-        ----------
-        job : callable
-            Runs the tracker with the callbacks of this object.
-
-        Returns
-        -------
-        TrackSummary or None
-            `complete` is False where the run was stopped; None where it was stopped before its first line.
+        `job`: runs the tracker with the callbacks of this object. Returns `complete` is False where the run was
+        stopped; None where it was stopped before its first line.
         """
         found: TrackSummary | None = None
         with self._before_header, signals(self._signalled):
@@ -169,16 +148,7 @@ class Follower:
     def tick(self, stage: str, done: float | None = None) -> None:
         """Take a sign of life from the job.
 
-        Parameters
-        ----------
-        stage : str
-        done : float or None, optional
-            Not shown.
-
-        Raises
-        ------
-        Stopped
-            If the run is to end.
+        `done`: not shown.
         """
         del done
         if self._stop is not None:
@@ -187,11 +157,8 @@ class Follower:
             self._say(stage)
 
     def on_header(self, header: TrackHeader) -> None:
-        """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older one.
-
-        Parameters
-        ----------
-        header : TrackHeader
+        """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
+        one.
         """
         from ambid.track.tally import Tally
 
@@ -209,19 +176,7 @@ class Follower:
     def on_line(self, line: TrackLine) -> Sequence[Flag] | None:
         """Take a line: written, counted and kept; drawing looks at it later.
 
-        Parameters
-        ----------
-        line : TrackLine
-
-        Returns
-        -------
-        sequence of str or None
-            Flags that the operator has set since the last line.
-
-        Raises
-        ------
-        Stopped
-            If the run is to end; the line is kept.
+        Returns flags that the operator has set since the last line.
         """
         assert self.header is not None
         assert self._tally is not None

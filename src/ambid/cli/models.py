@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from ambid.identify.nonlinear.structures import NonlinearStructure
+    from ambid.nonlinear.structures import NonlinearStructure
 
 
 def command() -> None:
     """List models with their parameters and units, black-box structures, excitations, scenarios and preset benches."""
+    from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.cli.terminal import painter
-    from ambid.identify.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
-    from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
     from ambid.physics.models import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns

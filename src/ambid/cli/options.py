@@ -57,15 +57,7 @@ LARGEST = 1e9
 def check_positive(given: Mapping[str, float | None]) -> None:
     """Refuse numbers that are not positive, not finite or absurd.
 
-    Parameters
-    ----------
-    given : mapping of str to float or None
-        By option; None where it was not given.
-
-    Raises
-    ------
-    AmbidError
-        For the first one that breaks the rule.
+    `given`: by option; None where it was not given.
     """
     for option, x in given.items():
         if x is not None and not 0 < x <= LARGEST:
@@ -75,15 +67,7 @@ def check_positive(given: Mapping[str, float | None]) -> None:
 def json_path(json: str | None) -> Path | None:
     """Return the file that ``--json`` names.
 
-    Parameters
-    ----------
-    json : str or None
-        As given; ``"-"`` is standard output.
-
-    Returns
-    -------
-    Path or None
-        None where no file is to be written.
+    `json`: as given; ``"-"`` is standard output. Returns none where no file is to be written.
     """
     return None if json in (None, "-") else Path(str(json))
 
@@ -91,20 +75,7 @@ def json_path(json: str | None) -> Path | None:
 def band_of(text: str | None) -> tuple[float, float] | None:
     """Read ``--band``.
 
-    Parameters
-    ----------
-    text : str or None
-        Two frequencies in Hz with a colon between.
-
-    Returns
-    -------
-    (float, float) or None
-        None where none was given.
-
-    Raises
-    ------
-    AmbidError
-        If it is not of that form, or the second is not above the first.
+    `text`: two frequencies in Hz with a colon between. Returns none where none was given.
     """
     if text is None:
         return None
@@ -123,20 +94,7 @@ def band_of(text: str | None) -> tuple[float, float] | None:
 def preset_of(name: str) -> Preset | None:
     """Take a word for a preset if it is one, or cannot be a file.
 
-    Parameters
-    ----------
-    name : str
-        A preset or the path of a rig file.
-
-    Returns
-    -------
-    Preset or None
-        None for a path.
-
-    Raises
-    ------
-    ModelError
-        If it is neither.
+    `name`: a preset or the path of a rig file. Returns none for a path.
     """
     from ambid.physics.presets import preset, preset_names
 
@@ -146,17 +104,7 @@ def preset_of(name: str) -> Preset | None:
 
 
 def refuse_twice(records: Sequence[Path]) -> None:
-    """Refuse to count data twice: standard deviations would come out too small.
-
-    Parameters
-    ----------
-    records : sequence of Path
-
-    Raises
-    ------
-    AmbidError
-        Naming the first record that is given twice.
-    """
+    """Refuse to count data twice: standard deviations would come out too small."""
     seen = set[Path]()
     for path in records:
         if path.resolve() in seen:

@@ -18,10 +18,7 @@ class Outputs:
     Each is written beside its place under another name; only when everything is there are all of them moved. After an
     error or Ctrl-C nothing is left behind.
 
-    Parameters
-    ----------
-    inputs : sequence of Path
-        Files that are read; none of them may be written over.
+    `inputs`: files that are read; none of them may be written over.
     """
 
     def __init__(self, *inputs: Path | None) -> None:
@@ -33,19 +30,8 @@ class Outputs:
     def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = ()) -> None:
         """Check that a file can be written, before any work is done.
 
-        Parameters
-        ----------
-        path : Path or None
-            The file; None: the option was not given.
-        option : str
-            The option that names it, for messages.
-        suffixes : sequence of str
-            Endings that it may have; any if empty.
-
-        Raises
-        ------
-        AmbidError
-            If the file is a folder or an input, its folder is missing or may not be written, or its ending is wrong.
+        `path`: the file; None: the option was not given; `option`: the option that names it, for messages; `suffixes`:
+        endings that it may have; any if empty.
         """
         if path is None:
             return
@@ -78,17 +64,7 @@ class Outputs:
     def stage(self, path: Path, write: Callable[[Path], object]) -> None:
         """Write a file under a name beside its own.
 
-        Parameters
-        ----------
-        path : Path
-            Where the file will be.
-        write : callable
-            Takes the present name, which ends like `path`, and writes it.
-
-        Raises
-        ------
-        AmbidError
-            If the system does not let it be written.
+        `path`: where the file will be; `write`: takes the present name, which ends like `path`, and writes it.
         """
         path = path.resolve()  # through a link, to the file that it stands for
         beside = path.with_name(f".{os.getpid()}-{path.name}")
@@ -103,17 +79,7 @@ class Outputs:
     def stage_text(self, path: Path, text: str) -> None:
         """Write a text file under a name beside its own.
 
-        Parameters
-        ----------
-        path : Path
-            Where the file will be.
-        text : str
-            What it holds, in UTF-8.
-
-        Raises
-        ------
-        AmbidError
-            If the system does not let it be written.
+        `path`: where the file will be; `text`: what it holds, in UTF-8.
         """
         self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 

@@ -19,51 +19,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What the user says of a scenario; None for what the scenario or the bench says.
+    """What the user says of a scenario; None for what the scenario or the bench says."""
 
-    Attributes
-    ----------
-    name : str
-        Of the scenario.
-    duration_s, rate_hz, amplitude, at_s, size : float or None
-        As `ambid.simulate.simulate_scenario`.
-    seed : int
-        Of excitation, noise and losses.
-    closed : bool or None
-        Closed or open loop.
-    log_excitation : bool
-        A column ``excitation`` too.
-    """
-
-    name: str
-    duration_s: float | None
+    name: str  # of the scenario
+    duration_s: float | None  # as `ambid.simulate.simulate_scenario`
     rate_hz: float | None
     amplitude: float | None
     at_s: float | None
     size: float | None
-    seed: int
-    closed: bool | None
-    log_excitation: bool
+    seed: int  # of excitation, noise and losses
+    closed: bool | None  # closed or open loop
+    log_excitation: bool  # a column ``excitation`` too
 
 
 def simulate_course(course: Course, preset: Preset | None, rig: str, record: Path) -> None:
     """Simulate, write the record and say what is in it.
 
-    Parameters
-    ----------
-    course : Course
-        The scenario.
-    preset : Preset or None
-        The bench; None: the rig file.
-    rig : str
-        The bench in the user's words.
-    record : Path
-        File to write; a scenario that loses samples is written as CSV.
-
-    Raises
-    ------
-    AmbidError
-        If the bench or the scenario refuse a number, or the file cannot be written.
+    `course`: the scenario; `preset`: the bench; None: the rig file; `rig`: the bench in the user's words; `record`:
+    file to write; a scenario that loses samples is written as CSV.
     """
     from ambid.record import write_record
     from ambid.rig import load_rig
@@ -106,10 +79,7 @@ def simulate_course(course: Course, preset: Preset | None, rig: str, record: Pat
 def warn(done: Simulation) -> None:
     """Say on standard error what went wrong in a simulation.
 
-    Parameters
-    ----------
-    done : Simulation
-        With its warnings.
+    `done`: with its warnings.
     """
     for warning in done.warnings:
         typer.echo(f"ambid: warning: {warning}", err=True)
@@ -118,15 +88,7 @@ def warn(done: Simulation) -> None:
 def truth_words(done: Simulation) -> str:
     """Return the parameters of a simulation in words.
 
-    Parameters
-    ----------
-    done : Simulation
-        With its truth.
-
-    Returns
-    -------
-    str
-        Names and values on one line.
+    `done`: with its truth. Returns names and values on one line.
     """
     return ", ".join(f"{name} {value:.6g}" for name, value in done.truth.items()) + " (SI; delay in samples)"
 

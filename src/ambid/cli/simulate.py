@@ -17,10 +17,10 @@ from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
+    from ambid.arrays import Array
     from ambid.physics.loop import Limits
     from ambid.physics.nonlinear import OperatingPoint
     from ambid.physics.presets import Preset
-    from ambid.record.record import Array
     from ambid.simulate import Simulation
 
     Respond = Callable[[Array], Simulation]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TextIO
 import typer
 
 from ambid.cli.time_left import TimeLeft, in_words
-from ambid.identify.nonlinear.progress import Tick, silent
+from ambid.estimation.progress import Tick, silent
 
 if TYPE_CHECKING:
     from ambid.report.text import Paint, Style
@@ -28,10 +28,7 @@ _EXPECTED = 30  # evaluations of a whole identification, from which the time lef
 def plain_where_needed(stream: TextIO) -> None:
     """Write ± … ✓ ✗ in plain letters on a stream whose encoding has none of them, instead of failing.
 
-    Parameters
-    ----------
-    stream : text file
-        Standard output or error; left alone where it cannot be reconfigured.
+    `stream`: standard output or error; left alone where it cannot be reconfigured.
     """
     codecs.register_error("ambid-plain", _in_plain_letters)
     if hasattr(stream, "reconfigure"):
@@ -47,10 +44,7 @@ def _in_plain_letters(error: UnicodeError) -> tuple[str, int]:
 def painter() -> Paint:
     """Return the way of painting that standard output can show: colour on a terminal, nothing elsewhere.
 
-    Returns
-    -------
-    callable
-        Takes a text and a style.
+    Returns takes a text and a style.
     """
     from ambid.report.text import plain
 
@@ -70,15 +64,8 @@ def progress(title: str) -> Iterator[Tick]:
     A job that says what share of it is over shows that too. Nothing is shown in the first second, nor where standard
     error is no terminal.
 
-    Parameters
-    ----------
-    title : str
-        What is done.
-
-    Yields
-    ------
-    callable
-        To be called with the name of the stage at each evaluation, and the share that is over where it is known.
+    `title`: what is done. Returns to be called with the name of the stage at each evaluation, and the share that is
+    over where it is known.
     """
     if not sys.stderr.isatty():
         yield silent

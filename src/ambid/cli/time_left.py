@@ -32,10 +32,7 @@ class TimeLeft:
     def __init__(self, now: float) -> None:
         """Begin.
 
-        Parameters
-        ----------
-        now : float, s
-            On any clock that runs evenly.
+        `now`: on any clock that runs evenly.
         """
         self._begin = now
         self._last: tuple[float, float] | None = None  # when, share
@@ -51,11 +48,7 @@ class TimeLeft:
     def take(self, share: float, now: float) -> None:
         """Take a word on how much is over.
 
-        Parameters
-        ----------
-        share : float
-            0 to 1; one below an earlier one changes nothing.
-        now : float, s
+        `share`: 0 to 1; one below an earlier one changes nothing.
         """
         share = min(max(share, 0.0), 1.0)
         if self._last is None:
@@ -72,14 +65,7 @@ class TimeLeft:
     def left(self, now: float) -> float | None:
         """Return how long it still takes.
 
-        Parameters
-        ----------
-        now : float, s
-
-        Returns
-        -------
-        float or None, s
-            None as long as too little has been done to tell.
+        Returns none as long as too little has been done to tell.
         """
         word = self._word
         if word is None or now - self._begin < _LEAST_S:
@@ -95,14 +81,7 @@ class TimeLeft:
 def in_words(seconds: float) -> str:
     """Say how long something still takes.
 
-    Parameters
-    ----------
-    seconds : float, s
-
-    Returns
-    -------
-    str
-        Such as ``"about 12 s left"``; minutes from 100 s on.
+    Returns such as ``"about 12 s left"``; minutes from 100 s on.
     """
     if seconds < 1.0:
         return "nearly done"

@@ -18,7 +18,7 @@ from ambid.errors import AmbidError, nearest
 
 if TYPE_CHECKING:
     from ambid.cli.live import Flag, Follower
-    from ambid.track.lines import TrackHeader, TrackSummary
+    from ambid.recursive.lines import TrackHeader, TrackSummary
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 _FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
@@ -171,21 +171,7 @@ def _check_interval(every: float, rate_hz: float) -> None:
 
 
 def memory_of(text: str) -> float | Literal["auto", "all"]:
-    """Read ``--memory``.
-
-    Parameters
-    ----------
-    text : str
-
-    Returns
-    -------
-    float, "auto" or "all"
-
-    Raises
-    ------
-    AmbidError
-        If it is none of them.
-    """
+    """Read ``--memory``."""
     if text == "auto":
         return "auto"
     if text == "all":
@@ -207,20 +193,7 @@ def memory_of(text: str) -> float | Literal["auto", "all"]:
 def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
     """Read ``--flag``.
 
-    Parameters
-    ----------
-    texts : list of str or None
-        Each a time in s, a colon and a flag.
-
-    Returns
-    -------
-    tuple of (float, str)
-        In the order of their times.
-
-    Raises
-    ------
-    AmbidError
-        If one is not of that form.
+    `texts`: each a time in s, a colon and a flag. Returns in the order of their times.
     """
     found: list[tuple[float, Flag]] = []
     for text in texts or []:
@@ -255,19 +228,9 @@ def _draw(follower: Follower, record: Path, rate: float | None, plot: Path, outp
 def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
     """Read the truth that a simulated record holds: columns ``true_NAME``.
 
-    Parameters
-    ----------
-    record : Path
-    rate : float or None
-        Sampling rate in Hz, for a record without time.
-    units : Mapping[str, str]
-        SI unit of each tracked number; empty where it is not known.
-
-    Returns
-    -------
-    dict of str to (t, values)
-        ndarrays of shape (n_samples,), s of record and SI; without parameters that have no such column, or one in
-        another unit.
+    `rate`: sampling rate in Hz, for a record without time; `units`: SI unit of each tracked number; empty where it is
+    not known. Returns ndarrays of shape (n_samples,), s of record and SI; without parameters that have no such column,
+    or one in another unit.
     """
     from ambid.record import read_record
 
@@ -315,25 +278,9 @@ def finish(
 ) -> None:
     """Print the table, say what was interrupted or not reached, and end with the exit code.
 
-    Parameters
-    ----------
-    follower : Follower
-        That followed the run.
-    summary : TrackSummary or None
-        None where the run ended before its first line.
-    written : list of str
-        Files that hold the track.
-    table, strict : bool
-        Whether to print the table; whether troubles end with exit code 3.
-    flags : sequence of (float, str)
-        As given.
-
-    Raises
-    ------
-    Exit
-        With the exit code, where it is not 0.
-    AmbidError
-        If no line was reached.
+    `follower`: that followed the run; `summary`: none where the run ended before its first line; `written`: files that
+    hold the track; `table`, `strict`: whether to print the table; whether troubles end with exit code 3; `flags`: as
+    given.
     """
     header, last = follower.header, follower.last
     if summary is None or header is None or last is None:

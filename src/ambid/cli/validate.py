@@ -15,10 +15,10 @@ from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError, EstimationError
 
 if TYPE_CHECKING:
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.estimate import Estimate
-    from ambid.identify.nonlinear.fit import NonlinearFit
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.blackbox.fit import BlackBoxFit
+    from ambid.estimation.estimate import Estimate
+    from ambid.nonlinear.fit import NonlinearFit
     from ambid.rig import Rig
 
 
@@ -44,10 +44,10 @@ def command(
 
     Without --rig: the record is read as the one that the estimate came from.
     """
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.nonlinear.fit import NonlinearFit
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.blackbox.fit import BlackBoxFit
     from ambid.job.estimates import read_estimate
+    from ambid.nonlinear.fit import NonlinearFit
 
     with Outputs(estimate, record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
@@ -108,8 +108,8 @@ def _judged_bearing(
 def _judged_fit(
     known: BlackBoxFit | NonlinearFit, record: Path, part: Part, rate: float | None, gaps: str | None
 ) -> tuple[dict[str, Any], list[str]]:
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.json_values import plain_json
+    from ambid.blackbox.fit import BlackBoxFit
+    from ambid.estimation.json_values import plain_json
     from ambid.job import read_data
     from ambid.job.blackbox import same_bench
     from ambid.report.fit_text import validation_lines

@@ -23,14 +23,7 @@ class Watch:
     def show(self, title: str, part: float, text: str) -> None:
         """Show how far it is.
 
-        Parameters
-        ----------
-        title : str
-            What is done.
-        part : float
-            0 to 1.
-        text : str
-            What is to be seen of it, short.
+        `title`: what is done; `part`: 0 to 1; `text`: what is to be seen of it, short.
         """
         if not sys.stderr.isatty():
             return
@@ -56,10 +49,7 @@ class Watch:
 def watching() -> Iterator[Watch]:
     """Show a line while something runs.
 
-    Yields
-    ------
-    Watch
-        To be told how far it is; taken away at the end, whatever happens.
+    Returns to be told how far it is; taken away at the end, whatever happens.
     """
     watch = Watch()
     try:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from ambid.identify.nonlinear.progress import Tick, silent
+from ambid.estimation.progress import Tick, silent
 
 __all__ = ["Tick", "silent"]

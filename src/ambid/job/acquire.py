@@ -18,53 +18,25 @@ from ambid.track.stream.block import Frame
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """How far an acquisition is.
+    """How far an acquisition is."""
 
-    Attributes
-    ----------
-    samples, wanted : int
-        So far, and in all.
-    quality : QualityReport
-        Of what came so far.
-    counters : Counters
-        Of the line.
-    """
-
-    samples: int
+    samples: int  # so far, and in all
     wanted: int
-    quality: QualityReport
-    counters: Counters
+    quality: QualityReport  # of what came so far
+    counters: Counters  # of the line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acquired:
-    """What an acquisition gave.
+    """What an acquisition gave."""
 
-    Attributes
-    ----------
-    info : DeviceInfo
-        Who gave it.
-    run : RunReport
-        Of the device.
-    quality : QualityReport
-        Of the samples.
-    counters : Counters
-        Of the line.
-    recorded : Recorded or None
-        The record's file; None where no sample came.
-    troubles : tuple of DeviceError
-        What the recorder told: a disk that is slow, nearly full, or failed.
-    not_stored : int
-        Samples that came and are not in the record, because the disk was too slow or failed.
-    """
-
-    info: DeviceInfo
-    run: RunReport
-    quality: QualityReport
-    counters: Counters
-    recorded: Recorded | None
-    troubles: tuple[DeviceError, ...]
-    not_stored: int = 0
+    info: DeviceInfo  # who gave it
+    run: RunReport  # of the device
+    quality: QualityReport  # of the samples
+    counters: Counters  # of the line
+    recorded: Recorded | None  # the record's file; None where no sample came
+    troubles: tuple[DeviceError, ...]  # what the recorder told: a disk that is slow, nearly full, or failed
+    not_stored: int = 0  # samples that came and are not in the record, because the disk was too slow or failed
 
 
 def acquire(
@@ -83,38 +55,10 @@ def acquire(
 ) -> Acquired:
     """Record what a device samples during a course.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-    rig : Rig
-        Its bench; its text goes with the record.
-    path : str or Path
-        The record: .h5, .hdf5, .csv or .csv.gz.
-    course : Course
-        What the device is to do.
-    force : bool
-        Whether a record that exists may be written over.
-    taps : sequence of Tap
-        Others who listen.
-    every_s : float
-        How often `on_progress` is called, s of the device's clock.
-    on_progress, on_event : callable, optional
-        Told how far it is, and what the device tells.
-    on_trouble : callable, optional
-        Told at once when the disk is slow, nearly full, or fails; in the thread that sees it.
-    stopped : callable, optional
-        Asked between blocks; True ends the run in an orderly way, with what came so far. So does a disk that failed.
-
-    Returns
-    -------
-    Acquired
-        Also where a fault ended the run early: see ``run.fault``.
-
-    Raises
-    ------
-    DeviceError
-        If device or disk refuse, or the line is lost; samples that came before are in the record, or in its journal.
+    `device`: opened, idle; `rig`: its bench; its text goes with the record; `path`: the record: .h5, .hdf5, .csv or
+    .csv.gz; `course`: what the device is to do; `force`: whether a record that exists may be written over; `taps`:
+    others who listen; `every_s`: how often `on_progress` is called, s of the device's clock; `on_progress`, `on_event`:
+    told how far it is, and what the device tells. Returns also where a fault ended the run early: see ``run.fault``.
     """
     with recording(
         device, rig, path, course, force=force, every_s=every_s, on_progress=on_progress, on_event=on_event,
@@ -141,20 +85,8 @@ def recording(
 ) -> Iterator[Recording]:
     """Record what a run passes on, whoever runs it.
 
-    Parameters
-    ----------
-    device, rig, path, course, force, every_s, on_progress, on_event, on_trouble
-        As `acquire`.
-
-    Yields
-    ------
-    Recording
-        A tap of the run; on leaving, the journal becomes the record.
-
-    Raises
-    ------
-    DeviceError
-        If the record exists, or cannot be written; what goes wrong meanwhile is raised with what the record holds.
+    `device`, `rig`, `path`, `course`, `force`, `every_s`, `on_progress`, `on_event`, `on_trouble`: as `acquire`.
+    Returns a tap of the run; on leaving, the journal becomes the record.
     """
     troubles: list[DeviceError] = []
 
@@ -188,20 +120,8 @@ def _text(rig: Rig) -> str:
 class Recording:
     """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`.
 
-    Parameters
-    ----------
-    recorder : Recorder
-        Opened.
-    device : Device
-        That samples.
-    course : Course
-        What it does.
-    every_s : float
-        How often `on_progress` is called, s of the device's clock.
-    on_progress, on_event : callable or None
-        As `acquire`.
-    troubles : list of DeviceError
-        What the recorder tells.
+    `recorder`: opened; `device`: that samples; `course`: what it does; `every_s`: how often `on_progress` is called, s
+    of the device's clock; `on_progress`, `on_event`: as `acquire`; `troubles`: what the recorder tells.
     """
 
     def __init__(
@@ -230,10 +150,7 @@ class Recording:
     def take(self, frame: Frame) -> None:
         """Take a block.
 
-        Parameters
-        ----------
-        frame : Frame
-            As it came.
+        `frame`: as it came.
         """
         self._recorder.append(frame.block)
         self._quality.add(frame)
@@ -252,10 +169,7 @@ class Recording:
     def tell(self, event: DeviceEvent) -> None:
         """Take what the device tells.
 
-        Parameters
-        ----------
-        event : DeviceEvent
-            It goes into the record too.
+        `event`: it goes into the record too.
         """
         self._recorder.event(event)
         if self._on_event is not None:
@@ -264,15 +178,7 @@ class Recording:
     def acquired(self, report: RunReport) -> Acquired:
         """Return what came of it, once the recording is closed.
 
-        Parameters
-        ----------
-        report : RunReport
-            Of the run.
-
-        Returns
-        -------
-        Acquired
-            With the record's file.
+        `report`: of the run. Returns with the record's file.
         """
         return Acquired(
             info=self._device.info,

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from ambid.acquire.device import Device, Mode
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
+from ambid.arrays import Array
 from ambid.errors import DeviceError
-from ambid.job.look import Array, Look, Room, ended, looking
+from ambid.job.look import Look, Room, ended, looking
 from ambid.rig import Rig
 
 _FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
@@ -27,64 +28,30 @@ _NEAR = 0.85  # of the way to a trip: no room left
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """What a trial plays.
+    """What a trial plays."""
 
-    Attributes
-    ----------
-    name : str
-        Excitation, as `ambid.acquire.program` knows it.
-    band : (float, float) or None
-        In Hz.
-    mode : {"drive", "levitate"}
-        Of the device.
-    settle_s, seconds : float
-        Time after the start, and length of the trial, s.
-    seed : int
-        Of the excitation.
-    """
-
-    name: str
-    band: tuple[float, float] | None
-    mode: Mode
-    settle_s: float
+    name: str  # excitation, as `ambid.acquire.program` knows it
+    band: tuple[float, float] | None  # in Hz
+    mode: Mode  # of the device
+    settle_s: float  # time after the start, and length of the trial, s
     seconds: float
-    seed: int
+    seed: int  # of the excitation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Size:
-    """What trials found.
+    """What trials found."""
 
-    Attributes
-    ----------
-    amplitude_v : float
-        Peak of the excitation, V.
-    used : float
-        Part of the room that it used, 0 to 1 and beyond.
-    findings, reasons : tuple of str
-        What each trial showed; why the size is not good.
-    """
-
-    amplitude_v: float
-    used: float
-    findings: tuple[str, ...]
+    amplitude_v: float  # peak of the excitation, V
+    used: float  # part of the room that it used, 0 to 1 and beyond
+    findings: tuple[str, ...]  # what each trial showed; why the size is not good
     reasons: tuple[str, ...] = ()
 
 
 def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
     """Return the band in which a levitated rotor moves: an excitation above it tells of the coil alone.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Of the device, Hz.
-    seconds : float
-        Length of the record, s: the lowest line has at least four periods in it.
-
-    Returns
-    -------
-    (float, float)
-        From a thousandth of the rate to a thirtieth, Hz.
+    `rate_hz`: of the device, Hz. Returns from a thousandth of the rate to a thirtieth, Hz.
     """
     return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
 
@@ -101,28 +68,9 @@ def find_amplitude(
 ) -> Size:
     """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
 
-    Parameters
-    ----------
-    look : callable
-        See `ambid.job.look.looking`.
-    room : Room
-        Limits.
-    trial : Trial
-        What is played.
-    resting : Mapping of str to float
-        Position in m and current in A without excitation.
-    rate_hz : float
-        Of the device, Hz.
-    use : float
-        Part of the room.
-    given : float, optional
-        A size that is only tried, V: it may use all but the last 15 % of the way to a trip.
-
-    Returns
-    -------
-    Size
-        That of the last trial; with reasons where it tripped, or used too much. It may use less than its part where
-        trials have run out.
+    `look`: see `ambid.job.look.looking`; `room`: limits; `trial`: what is played; `resting`: position in m and current
+    in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
+    reasons where it tripped, or used too much. It may use less than its part where trials have run out.
     """
     low, high = room.voltage
     if given is None and not math.isfinite(high - low):
@@ -157,28 +105,8 @@ def fitting_amplitude(
 ) -> float:
     """Find an amplitude for a device that has not run yet.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-    rig : Rig
-        Of the device.
-    trial : Trial
-        What is played.
-    use : float
-        Part of the room.
-    stopped : callable, optional
-        As `session.run`.
-
-    Returns
-    -------
-    float
-        Peak in V.
-
-    Raises
-    ------
-    DeviceError
-        If the bench does not hold still, or no size is good.
+    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `use`: part of the room; `stopped`: as
+    `session.run`. Returns peak in V.
     """
     look, room = looking(device, rig, stopped), Room.of(rig)
     report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))

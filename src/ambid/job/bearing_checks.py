@@ -10,7 +10,7 @@ from ambid.errors import EstimationError
 from ambid.job.bearing_records import TakenRecord
 
 if TYPE_CHECKING:
-    from ambid.identify.nonlinear_bearing.problem import BearingRecord
+    from ambid.bearing.magnet.problem import BearingRecord
 
 _SAME = 1e-9  # part of a channel's spread that another one leaves over, at or below which both are the same signal
 _ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
@@ -19,22 +19,7 @@ _ROCKS = 0.25  # spread of a held position over that of the moving ones from whi
 def checked_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
     """Check what shows only in values or between records.
 
-    Parameters
-    ----------
-    taken : sequence of TakenRecord
-        To identify from.
-    second : TakenRecord or None
-        To judge on.
-
-    Returns
-    -------
-    tuple of TakenRecord
-        `taken`, with a warning where a held rotor moves.
-
-    Raises
-    ------
-    EstimationError
-        If data would count twice or judge themselves, two channels hold one signal, or the stage is off throughout.
+    `taken`: to identify from; `second`: to judge on. Returns `taken`, with a warning where a held rotor moves.
     """
     for j, one in enumerate(taken):
         _refuse_senseless(one.record)

@@ -11,11 +11,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ambid.identify.estimate import Check, Delay, EstimatedParameter, OutputFit
-    from ambid.identify.nonlinear_bearing.likelihood import BearingFit
-    from ambid.identify.nonlinear_bearing.residual_test import WhitenessTest
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
-    from ambid.identify.nonlinear_bearing.uncertainty import BearingUncertainty
+    from ambid.bearing.magnet.likelihood import BearingFit
+    from ambid.bearing.magnet.residual_test import WhitenessTest
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.uncertainty import BearingUncertainty
+    from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 
 _P_LEAST = 1e-3  # as for the linear model
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -27,27 +27,14 @@ def judged(
 ) -> NonlinearBearingEstimate:
     """Check a fit on its own records and put the estimate together.
 
-    Parameters
-    ----------
-    fit : BearingFit
-        Not failed.
-    known : BearingUncertainty
-        Of that fit.
-    taken : sequence of TakenRecord
-        The records that it came from.
-    delay_given : bool
-        Whether the rig gives the delay.
-
-    Returns
-    -------
-    NonlinearBearingEstimate
-        Without validation, timings and rig.
+    `fit`: not failed; `known`: of that fit; `taken`: the records that it came from; `delay_given`: whether the rig
+    gives the delay. Returns without validation, timings and rig.
     """
     import numpy as np
 
-    from ambid.identify.nonlinear_bearing.problem import LEVELS
-    from ambid.identify.nonlinear_bearing.residual_test import whiteness
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.problem import LEVELS
+    from ambid.bearing.magnet.residual_test import whiteness
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
 
     problem, names = fit.problem, _names(fit)
     tests = [whiteness(fit, r) for r in range(len(problem.records))]
@@ -89,7 +76,7 @@ def judged(
 
 def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
     """One-step errors against their own past and against past voltages: a check passes where every record does."""
-    from ambid.identify.estimate import Check
+    from ambid.estimation.estimate import Check
 
     against = {
         "residuals_white": ("their past", [t.p_own for t in tests]),
@@ -111,7 +98,7 @@ def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
     import math
 
-    from ambid.identify.estimate import Delay
+    from ambid.estimation.estimate import Delay
 
     found = {}
     for rate in fit.problem.delays:
@@ -126,7 +113,7 @@ def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[
 def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
     import math
 
-    from ambid.identify.estimate import OutputFit
+    from ambid.estimation.estimate import OutputFit
 
     found: dict[str, dict[str, OutputFit]] = {}
     for name, record, test in zip(names, fit.problem.records, tests, strict=True):
@@ -155,9 +142,9 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
     """Every number that acts, as it came out."""
     import numpy as np
 
-    from ambid.identify.estimate import EstimatedParameter
-    from ambid.identify.nonlinear_bearing.problem import UNITS
-    from ambid.identify.uncertainty import WEAK
+    from ambid.bearing.magnet.problem import UNITS
+    from ambid.estimation.estimate import EstimatedParameter
+    from ambid.estimation.uncertainty import WEAK
 
     law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
     sds = np.sqrt(np.diag(known.covariance(robust=robust)))
@@ -192,7 +179,7 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
-    from ambid.identify.estimate import Check
+    from ambid.estimation.estimate import Check
 
     hidden = [p.name for p in parameters if not p.identifiable]
     detail = "the records show every number" if not hidden else (
@@ -204,8 +191,8 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
     """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
-    from ambid.identify.estimate import Check
-    from ambid.identify.nonlinear_bearing.weight import weight_carried
+    from ambid.bearing.magnet.weight import weight_carried
+    from ambid.estimation.estimate import Check
 
     law, values = fit.problem.law, fit.problem.values(fit.vector)
     weight = values["m"] * values["g"]
@@ -246,8 +233,8 @@ def _unseen(fit: BearingFit) -> list[str]:
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
-    from ambid.identify.nonlinear_bearing.rescue import RescuedFit
-    from ambid.identify.rescue import told
+    from ambid.bearing.magnet.rescue import RescuedFit
+    from ambid.bearing.rescue import told
 
     if isinstance(fit, RescuedFit):
         found.append(told(fit.global_search))

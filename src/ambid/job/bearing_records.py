@@ -14,7 +14,7 @@ from ambid.record import Record
 from ambid.rig import Rig, RigMagnet, default_rig, load_rig
 
 if TYPE_CHECKING:
-    from ambid.identify.nonlinear_bearing.problem import BearingRecord
+    from ambid.bearing.magnet.problem import BearingRecord
 
 Magnet = MagnetLaw | Literal["auto", "single", "pair"]
 
@@ -25,44 +25,24 @@ _REVERSED = 0.2  # largest current backwards over that forwards from which two m
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TakenRecord:
-    """A record that was read for a nonlinear bearing.
+    """A record that was read for a nonlinear bearing."""
 
-    Attributes
-    ----------
-    record : BearingRecord
-        What the predictor runs over.
-    remembered : Mapping[str, object]
-        ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` and ``history``, for the estimate.
-    warnings : tuple of str
-        What was changed in it.
-    start_s : float
-        Time of its first sample in s.
-    """
-
-    record: BearingRecord
+    record: BearingRecord  # what the predictor runs over
+    # ``samples``, ``rate_hz``, ``sha256``, ``file``, ``held`` and ``history``, for the estimate
     remembered: Mapping[str, object]
-    warnings: tuple[str, ...]
-    start_s: float
+    warnings: tuple[str, ...]  # what was changed in it
+    start_s: float  # time of its first sample in s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """How files are read.
+    """How files are read."""
 
-    Attributes
-    ----------
-    from_s, to_s : float or None
-        Part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones.
-    rate_hz : float or None
-        For files without time.
-    gaps : str or None
-        ``"error"``, ``"interpolate"`` or ``"cut"``.
-    """
-
+    # part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones
     from_s: float | None = None
     to_s: float | None = None
-    rate_hz: float | None = None
-    gaps: str | None = None
+    rate_hz: float | None = None  # for files without time
+    gaps: str | None = None  # ``"error"``, ``"interpolate"`` or ``"cut"``
 
 
 def bearing_rig(
@@ -76,32 +56,11 @@ def bearing_rig(
 ) -> Rig:
     """Return a rig whose magnet is known as it says, but for what is given here.
 
-    Parameters
-    ----------
-    rig : Rig, str, Path or None
-        None: nothing is known, columns are named like the roles.
-    magnet : MagnetLaw, str or None
-        Kind or whole law; None: as the rig says.
-    parameters : sequence of Parameter
-        Each instead of the rig's.
-    eddy, drift : bool
-        Beside what the rig says.
-    off_below : float or None
-        In V; None: as the rig says.
-
-    Returns
-    -------
-    Rig
-        With a `magnet`.
-
-    Raises
-    ------
-    EstimationError
-        If the rig is of another model, or a number is not known.
-    RigError
-        If what is known contradicts itself.
+    `rig`: none: nothing is known, columns are named like the roles; `magnet`: kind or whole law; None: as the rig says;
+    `parameters`: each instead of the rig's; `eddy`, `drift`: beside what the rig says; `off_below`: in V; None: as the
+    rig says. Returns with a `magnet`.
     """
-    from ambid.identify.nonlinear_bearing.problem import UNITS
+    from ambid.bearing.magnet.problem import UNITS
 
     bench = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
     if bench.model != "one-axis":
@@ -146,15 +105,7 @@ def bearing_rig(
 def known_numbers(rig: Rig) -> dict[str, Parameter]:
     """Return what a rig knows of the numbers of a nonlinear bearing.
 
-    Parameters
-    ----------
-    rig : Rig
-        With a `magnet`.
-
-    Returns
-    -------
-    dict of str to Parameter
-        Its m, R and c, and those of the magnet.
+    `rig`: with a `magnet`. Returns its m, R and c, and those of the magnet.
     """
     assert rig.magnet is not None
     return {**{n: rig.parameter(n) for n in _LINEAR}, **{p.name: p for p in rig.magnet.parameters}}
@@ -163,17 +114,8 @@ def known_numbers(rig: Rig) -> dict[str, Parameter]:
 def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
     """Return the laws between which the likelihood is to decide.
 
-    Parameters
-    ----------
-    known : RigMagnet
-    records : sequence of BearingRecord
-        In which the rotor moves.
-
-    Returns
-    -------
-    laws : list of MagnetLaw
-    extend : bool
-        Whether a rising leakage, and unequal magnets of a pair, are to be tried beyond them.
+    `records`: in which the rotor moves. Returns `extend`: whether a rising leakage, and unequal magnets of a pair, are
+    to be tried beyond them.
     """
     kind = known.kind
     if kind == "auto" and known.gap == "exponential":
@@ -195,29 +137,12 @@ def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[Ma
 def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
     """Read a record as the predictor sees it.
 
-    Parameters
-    ----------
-    record : Record, str or Path
-        A file in the rig's columns, or a record whose channels are named by role.
-    rig : Rig
-        With a `magnet`.
-    how : Reading
-    held : bool
-        The rotor is held at rest: all of the record is taken.
-
-    Returns
-    -------
-    TakenRecord
-
-    Raises
-    ------
-    AmbidError
-        If the file, its columns or the part break a rule.
+    `rig`: with a `magnet`; `held`: the rotor is held at rest: all of the record is taken.
     """
     import numpy as np
 
-    from ambid.identify.nonlinear_bearing.contact import touching
-    from ambid.identify.nonlinear_bearing.problem import BearingRecord
+    from ambid.bearing.magnet.contact import touching
+    from ambid.bearing.magnet.problem import BearingRecord
     from ambid.job.physical import load
 
     if held:

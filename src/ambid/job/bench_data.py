@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ambid.blackbox.data import IOData, io_data
 from ambid.errors import EstimationError, RecordError
-from ambid.identify.blackbox.data import IOData, io_data
 from ambid.physics.models import model
 from ambid.record import Record, read_record
 from ambid.rig import Rig, bench_record, mat_variables
@@ -29,33 +29,8 @@ def bench_data(
 ) -> IOData:
     """Take inputs and outputs by role, calibrated, and references as they stand in the file, or by role.
 
-    Parameters
-    ----------
-    record : Record, str or Path
-        A file in the rig's columns, or a record whose channels are named by role.
-    rig : Rig
-    inputs, outputs : sequence of str
-        Roles or columns of the rig; by default all of its model.
-    references : sequence of str
-    open_loop : bool
-        Beside what the rig says.
-    part : (float or None, float or None)
-        From and to, in s; overrides the rig's.
-    rate_hz : float, optional
-    gaps : {"error", "interpolate", "cut"}, optional
-
-    Returns
-    -------
-    IOData
-
-    Raises
-    ------
-    AmbidError
-        If the file or the cut break a rule.
-    RecordError
-        If a reference is no column of the record.
-    EstimationError
-        If an input or output is none of the rig's.
+    `inputs`, `outputs`: roles or columns of the rig; by default all of its model; `open_loop`: beside what the rig
+    says; `part`: from and to, in s; overrides the rig's.
     """
     plant = model(rig.model)
     if isinstance(record, Record):

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.job.physical import load
 from ambid.physics.linear_model import LinearModel
@@ -19,32 +19,18 @@ from ambid.rig.rig import RigChannel
 from ambid.track.physical.synchronous import Forcing, forcing_of
 from ambid.track.stream.replay import Replay, blocks_of
 
-Array = NDArray[np.float64]
-
 _BLOCK_S = 0.01  # of the stream
 _ROWS = (".csv", ".csv.gz", ".h5", ".hdf5")  # formats whose rows are read with their damage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BenchRows:
-    """Rows of a bench's record.
+    """Rows of a bench's record."""
 
-    Attributes
-    ----------
-    record : Record
-        Channels named by role; may hold NaN.
-    replay : Replay
-        Inputs, outputs and forcing as a stream of blocks.
-    forcing : Forcing or None
-        Where the angle of the rotor is known.
-    t0 : float
-        Time of sample number 0, s of record.
-    """
-
-    record: Record
-    replay: Replay
-    forcing: Forcing | None
-    t0: float
+    record: Record  # channels named by role; may hold NaN
+    replay: Replay  # inputs, outputs and forcing as a stream of blocks
+    forcing: Forcing | None  # where the angle of the rotor is known
+    t0: float  # time of sample number 0, s of record
 
     @property
     def duration_s(self) -> float:
@@ -59,22 +45,7 @@ class BenchRows:
     def clean_part(self, n: int, *, begin_anywhere: bool) -> tuple[Record, int]:
         """Return the first clean stretch, and the number of the sample after it.
 
-        Parameters
-        ----------
-        n : int
-            Samples wanted.
-        begin_anywhere : bool
-            Take a later stretch, or a shorter one, where the beginning is damaged.
-
-        Returns
-        -------
-        record : Record
-        after : int
-
-        Raises
-        ------
-        RecordError
-            If the beginning is damaged, or no stretch is long enough.
+        `n`: samples wanted; `begin_anywhere`: take a later stretch, or a shorter one, where the beginning is damaged.
         """
         numbers = self.replay.numbers
         sound = np.asarray(np.isfinite(self.replay.values).all(axis=1))
@@ -108,24 +79,8 @@ def rows_of(
 ) -> BenchRows:
     """Read the rows of a record through a rig.
 
-    Parameters
-    ----------
-    record : Record, str or Path
-        A file, or a record whose channels are named by role.
-    known : Rig or None
-        None: columns named like the roles, those of a turning rotor with them.
-    from_s, to_s : float or None
-        Part to use, s of record; override the rig's.
-    rate_hz : float or None
-
-    Returns
-    -------
-    BenchRows
-
-    Raises
-    ------
-    AmbidError
-        If the file or its columns break a rule.
+    `record`: a file, or a record whose channels are named by role; `known`: none: columns named like the roles, those
+    of a turning rotor with them; `from_s`, `to_s`: part to use, s of record; override the rig's.
     """
     rig = default_rig() if known is None else known
     if isinstance(record, Record) or not str(record).lower().endswith(_ROWS):

@@ -12,12 +12,12 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
+from ambid.blackbox.data import IOData, io_data
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.orders import Orders
+from ambid.blackbox.structures import STRUCTURES, Structure, structure
 from ambid.errors import EstimationError, nearest
-from ambid.identify.blackbox.data import IOData, io_data
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.orders import Orders
-from ambid.identify.blackbox.structures import STRUCTURES, Structure, structure
-from ambid.identify.nonlinear.progress import guessed
+from ambid.estimation.progress import guessed
 from ambid.job._progress import Tick, silent
 from ambid.job.bench_data import bench_data
 from ambid.physics.models import model
@@ -27,7 +27,7 @@ from ambid.signals.samples import cut
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
-    from ambid.identify.physical import PhysicalFit
+    from ambid.bearing.physical import PhysicalFit
     from ambid.validate.comparison import Comparison
 
 _ORDERS = 0.95  # of a job's time goes into the choice of orders, where they are chosen
@@ -64,7 +64,7 @@ def fit(
     inputs, outputs : sequence of str
         Channel names; no inputs for a time series.
     structure_name : str
-        As in `ambid.identify.blackbox.structures`.
+        As in `ambid.blackbox.structures`.
     orders : Mapping[str, int, "auto" or tuple of int], optional
         A tuple has one number for each input. None: all are chosen by `criterion`.
     criterion : str, optional
@@ -105,7 +105,7 @@ def fit(
     EstimationError
         If nothing can be estimated.
     """
-    from ambid.identify.threads import one_thread
+    from ambid.estimation.threads import one_thread
     from ambid.validate.blackbox import judged
 
     say = tick or silent
@@ -172,7 +172,7 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
     EstimationError
         If the fit cannot carry the model: inputs, outputs, poles or a covariance are missing.
     """
-    from ambid.identify.physical import physical_parameters
+    from ambid.bearing.physical import physical_parameters
 
     bench = rig if isinstance(rig, Rig) else load_rig(rig)
     plant = model(bench.model)
@@ -223,7 +223,7 @@ def compare(
     AmbidError
         If the record, its channels or the orders break a rule.
     """
-    from ambid.identify.threads import one_thread
+    from ambid.estimation.threads import one_thread
     from ambid.validate.comparison import compare as compared
 
     for name, _ in candidates:
@@ -292,18 +292,7 @@ def read_data(
 def same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:
     """Refuse a second record whose rate or units are not those of the first.
 
-    Parameters
-    ----------
-    units : Mapping[str, str]
-        SI unit by channel, of the first record; one that is not known agrees with any.
-    dt : float, s
-        Of the first record.
-    second : IOData
-
-    Raises
-    ------
-    EstimationError
-        Naming the rate or the channel.
+    `dt`: of the first record.
     """
     if abs(second.dt / dt - 1) > 1e-6:
         raise EstimationError(

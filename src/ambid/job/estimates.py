@@ -7,34 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 
 if TYPE_CHECKING:
-    from ambid.identify.blackbox.fit import BlackBoxFit
-    from ambid.identify.nonlinear.fit import NonlinearFit
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.blackbox.fit import BlackBoxFit
+    from ambid.nonlinear.fit import NonlinearFit
 
 
 def read_estimate(path: str | Path) -> Estimate | NonlinearBearingEstimate | BlackBoxFit | NonlinearFit:
     """Read an estimate, linear or nonlinear, or a black-box or nonlinear fit from its file.
 
-    Parameters
-    ----------
-    path : str or Path
-        JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
-
-    Returns
-    -------
-    Estimate, NonlinearBearingEstimate, BlackBoxFit or NonlinearFit
-
-    Raises
-    ------
-    EstimationError
-        If the file cannot be read, is no JSON or no estimate.
+    `path`: JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
     """
-    from ambid.identify.blackbox.fit_file import SCHEMA, fit_from_json
-    from ambid.identify.estimate_file import SCHEMA as ESTIMATE
-    from ambid.identify.estimate_file import estimate_from_json
+    from ambid.blackbox.fit_file import SCHEMA, fit_from_json
+    from ambid.estimation.estimate_file import SCHEMA as ESTIMATE
+    from ambid.estimation.estimate_file import estimate_from_json
     from ambid.record.files import file_bytes, utf8_text
 
     path = Path(path)
@@ -51,15 +39,15 @@ def read_estimate(path: str | Path) -> Estimate | NonlinearBearingEstimate | Bla
             "Give what 'ambid identify --json' wrote"
         ) from None
     if isinstance(document, dict) and document.get("schema") == SCHEMA:
-        from ambid.identify.nonlinear.structures import NONLINEAR_STRUCTURES
+        from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
         if str(document.get("structure")) in NONLINEAR_STRUCTURES:
-            from ambid.identify.nonlinear.fit_file import nonlinear_fit_from_json
+            from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 
             return nonlinear_fit_from_json(document, f"fit {path}")
         return fit_from_json(document, f"fit {path}")
     if isinstance(document, dict) and document.get("schema") == ESTIMATE and "law" in document:
-        from ambid.identify.nonlinear_bearing.result_file import bearing_from_json
+        from ambid.bearing.magnet.result_file import bearing_from_json
 
         return bearing_from_json(document, f"estimate {path}")
     return estimate_from_json(document, f"estimate {path}")

@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.identify.estimate import Estimate
-from ambid.identify.threads import one_thread
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.threads import one_thread
 from ambid.job.bench_rows import BenchRows
 from ambid.job.track_start import Start, check_settling, credible_limits
 from ambid.physics.models import model
+from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig
-from ambid.track.lines import Track, TrackHeader, TrackLine
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.physical.synchronous import Forcing
@@ -50,32 +50,10 @@ def follow(
 ) -> Track:
     """Follow the physical parameters of a bench through a stream of blocks.
 
-    Parameters
-    ----------
-    blocks : iterable of Block, or BlockRing
-        Inputs, outputs and forcing, SI, from sample ``begin.first`` on.
-    source : BenchRows
-        The record that is replayed; of a live stream, the part of it that is known.
-    begin : Start
-        Estimate and numbers to begin with.
-    rig : Rig
-        The bench.
-    every_s, limit, memory, pace, flags, on_header, on_line, keep
-        As `ambid.job.track.track`.
-    live : bool
-        Whether the stream has no known end.
-    stopped : callable, optional
-        Asked between blocks; True ends the stream.
-
-    Returns
-    -------
-    Track
-        Header, lines where they are kept, summary.
-
-    Raises
-    ------
-    EstimationError
-        If the start cannot be tracked from.
+    `blocks`: inputs, outputs and forcing, SI, from sample ``begin.first`` on; `begin`: estimate and numbers to begin
+    with; `rig`: the bench; `every_s`, `limit`, `memory`, `pace`, `flags`, `on_header`, `on_line`, `keep`: as
+    `ambid.job.track.track`; `live`: whether the stream has no known end; `stopped`: asked between blocks; True ends the
+    stream. Returns header, lines where they are kept, summary.
     """
     numbers, first, forcing = begin.numbers, begin.first, source.forcing
     rpem = PhysicalRpem(numbers, memory=memory)

@@ -13,13 +13,13 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.frequency.measured import Measured
+from ambid.blackbox.frequency.physical_estimate import FrequencyEstimate
+from ambid.blackbox.orders import Orders
+from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.orders import Orders
-from ambid.identify.blackbox.response import Offsets
-from ambid.identify.frequency.measured import Measured
-from ambid.identify.frequency.physical_estimate import FrequencyEstimate
 from ambid.job._progress import Tick, silent
 from ambid.job.bench_data import bench_data
 from ambid.job.blackbox import read_data
@@ -175,7 +175,7 @@ def _agree(
 
 def _measured(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
     """Measure the response by the wanted method, in the wanted band."""
-    from ambid.identify.threads import one_thread
+    from ambid.estimation.threads import one_thread
 
     r = data.reference if data.references else None
     if method == "auto":
@@ -212,8 +212,8 @@ def _fitted(
     delay: Delay,
 ) -> BlackBoxFit:
     """Fit the black-box model; its operating point is that of the record, which a response does not show."""
-    from ambid.identify.frequency.rational import frf_ml
-    from ambid.identify.frequency.subspace import frf_subspace
+    from ambid.blackbox.frequency.rational import frf_ml
+    from ambid.blackbox.frequency.subspace import frf_subspace
 
     if orders is not None:
         found = frf_ml(response, orders, domain=domain, delay=delay)
@@ -231,7 +231,7 @@ def _fitted(
 
 def _physical(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
     """Estimate the rig's parameters; a delay in s is so many samples."""
-    from ambid.identify.frequency.greybox import greybox_frf
+    from ambid.blackbox.frequency.greybox import greybox_frf
 
     plant = model(rig.model)
     known: Delay = rig.channel(plant.inputs[0]).delay if delay is None else delay

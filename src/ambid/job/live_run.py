@@ -12,8 +12,9 @@ import numpy as np
 from ambid.acquire.device import Device, DeviceEvent
 from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.acquire.view import BenchView
+from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.track.stream.block import Array, Block, Frame
+from ambid.track.stream.block import Block, Frame
 from ambid.track.stream.ring import BlockRing
 
 LOOK_S = 0.1
@@ -27,18 +28,9 @@ class RingTap:
     ahead of the tracker, and is held up instead. Samples that a calibration does not cover go in as NaN, which the
     tracker rejects and counts.
 
-    Parameters
-    ----------
-    ring : BlockRing
-    view : BenchView
-        Of device and rig.
-    waits : bool
-        Whether the device may be held up.
+    `view`: of device and rig; `waits`: whether the device may be held up.
 
-    Attributes
-    ----------
-    over : threading.Event
-        Set when nobody reads the ring any more.
+    `over`: set when nobody reads the ring any more.
     """
 
     def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
@@ -49,10 +41,7 @@ class RingTap:
     def take(self, frame: Frame) -> None:
         """Put a block into the ring.
 
-        Parameters
-        ----------
-        frame : Frame
-            As it came.
+        `frame`: as it came.
         """
         block = self._seen(frame.block)
         if self._origin is None:
@@ -77,20 +66,9 @@ class RingTap:
 class LiveRun:
     """The run of the device, in a thread of its own; leaving the context ends it.
 
-    Parameters
-    ----------
-    device, course, on_event, stopped
-        As `ambid.acquire.session.run`.
-    ring_tap : RingTap
-        Hears last of all: who records is never behind the tracker.
-    taps : sequence of Tap
-        The others.
-    on_run : callable, optional
-        Given what came of the run.
-    on_trouble : callable, optional
-        Told why nobody reads the ring any more; where there are others, the run goes on to its end.
-    ring : BlockRing
-        Ended with the run.
+    `device`, `course`, `on_event`, `stopped`: as `ambid.acquire.session.run`; `ring_tap`: hears last of all: who
+    records is never behind the tracker; `taps`: the others; `on_run`: given what came of the run; `ring`: ended with
+    the run.
     """
 
     def __init__(
@@ -134,17 +112,7 @@ class LiveRun:
                 self._on_run = None
 
     def report(self) -> RunReport:
-        """Return what came of the run; raise what ended it.
-
-        Returns
-        -------
-        RunReport
-
-        Raises
-        ------
-        BaseException
-            What ended it, as it was raised in its thread.
-        """
+        """Return what came of the run; raise what ended it."""
         if self._failure is not None:
             raise self._failure
         assert self._report is not None

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.acquire.causes import fault_words
 from ambid.acquire.default_daq import with_default_daq
@@ -16,41 +15,25 @@ from ambid.acquire.device import Device
 from ambid.acquire.scales import scale_of
 from ambid.acquire.session import Course, RunReport, run
 from ambid.acquire.view import BenchView
+from ambid.arrays import Array
 from ambid.physics.models import model
 from ambid.rig import Rig
 from ambid.track.stream.block import Frame
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Room:
-    """Where a bench may work, SI.
+    """Where a bench may work, SI."""
 
-    Attributes
-    ----------
-    trips : Mapping of str to (float, float)
-        Of position and current, those of them that the bench has: the controller's limits.
-    voltage : (float, float)
-        That may be ordered: inside the limits of the loop and ``daq.duty``.
-    """
-
+    # of position and current, those of them that the bench has: the controller's limits
     trips: Mapping[str, tuple[float, float]]
-    voltage: tuple[float, float]
+    voltage: tuple[float, float]  # that may be ordered: inside the limits of the loop and ``daq.duty``
 
     @classmethod
     def of(cls, rig: Rig) -> Room:
         """Take it from a rig.
 
-        Parameters
-        ----------
-        rig : Rig
-            With ``[daq]``.
-
-        Returns
-        -------
-        Room
-            Infinite where the rig knows no limit.
+        `rig`: with ``[daq]``. Returns infinite where the rig knows no limit.
         """
         unlimited = (-math.inf, math.inf)
         roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
@@ -62,19 +45,8 @@ class Room:
     def used(self, role: str, values: Array, rest: float) -> float:
         """Return which part of the way from rest to the nearer trip is used, 0 to 1 and beyond.
 
-        Parameters
-        ----------
-        role : str
-            ``position`` or ``current``.
-        values : ndarray, shape (n_samples,), SI
-            Measured.
-        rest : float
-            Where the bench rests, SI.
-
-        Returns
-        -------
-        float
-            0 where there is no limit.
+        `role`: ``position`` or ``current``; `values`: (n_samples,), SI, measured; `rest`: where the bench rests, SI.
+        Returns 0 where there is no limit.
         """
         low, high = self.trips[role]
         up, down = float(values.max()) - rest, rest - float(values.min())
@@ -94,10 +66,7 @@ def _ordered(rig: Rig, limits: tuple[float, float]) -> tuple[float, float]:
 class Kept:
     """Keeps what a run passes on, seen through the rig.
 
-    Parameters
-    ----------
-    view : BenchView
-        Of device and rig.
+    `view`: of device and rig.
     """
 
     def __init__(self, view: BenchView) -> None:
@@ -107,20 +76,14 @@ class Kept:
     def take(self, frame: Frame) -> None:
         """Take a block.
 
-        Parameters
-        ----------
-        frame : Frame
-            As it came.
+        `frame`: as it came.
         """
         self._values.append(self._view.block(frame.block).values)
 
     def roles(self) -> dict[str, Array]:
         """Return what came, by role.
 
-        Returns
-        -------
-        dict of str to ndarray, shape (n_samples,), SI
-            Empty arrays where nothing came.
+        Returns (n_samples,), SI, empty arrays where nothing came.
         """
         n = len(self._view.units)
         values = np.concatenate(self._values) if self._values else np.empty((0, n))
@@ -133,19 +96,8 @@ Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
 def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
     """Return a way of running a course and keeping what it shows.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-    rig : Rig
-        Its bench.
-    stopped : callable
-        As `session.run`.
-
-    Returns
-    -------
-    callable
-        Takes a course, gives report and values by role.
+    `device`: opened, idle; `rig`: its bench; `stopped`: as `session.run`. Returns takes a course, gives report and
+    values by role.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
@@ -161,17 +113,7 @@ def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
 def ended(report: RunReport, what: str) -> tuple[str, ...]:
     """Say why a run is not whole.
 
-    Parameters
-    ----------
-    report : RunReport
-        Of the run.
-    what : str
-        What it was for.
-
-    Returns
-    -------
-    tuple of str
-        Empty where it is whole.
+    `report`: of the run; `what`: what it was for. Returns empty where it is whole.
     """
     if report.fault is not None:
         return (f"the controller went to its safe state during {what}: {fault_words(report.fault)}",)

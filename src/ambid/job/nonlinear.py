@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError, nearest
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit, Settings
-from ambid.identify.nonlinear.progress import part_of
-from ambid.identify.nonlinear.structures import NonlinearStructure, nonlinear_structure
+from ambid.estimation.progress import part_of
 from ambid.job._progress import Tick, silent
 from ambid.job.blackbox import read_data, same_bench
+from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.structures import NonlinearStructure, nonlinear_structure
 from ambid.record import Record
 from ambid.rig import Rig, load_rig
 
@@ -54,7 +54,7 @@ def fit_nonlinear(
     inputs, outputs : sequence of str
         Channel names.
     structure_name : str
-        As in `ambid.identify.nonlinear.structures`.
+        As in `ambid.nonlinear.structures`.
     settings : Mapping, optional
         As the register describes them; what is left out the method chooses.
     open_loop : bool, optional
@@ -89,7 +89,7 @@ def fit_nonlinear(
     EstimationError
         If nothing can be estimated.
     """
-    from ambid.identify.threads import one_thread
+    from ambid.estimation.threads import one_thread
     from ambid.validate.nonlinear import judged
 
     say = tick or silent

@@ -21,7 +21,7 @@ from ambid.record import Record
 from ambid.rig import Rig, rig_text
 
 if TYPE_CHECKING:
-    from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate
 
 
 def identify_nonlinear(
@@ -45,53 +45,9 @@ def identify_nonlinear(
 
     Prediction error with an extended Kalman predictor, consistent under feedback as far as its linearised noise is.
 
-    Parameters
-    ----------
-    records : sequence of Record, str or Path
-        Of a rotor that moves; files in the rig's columns, or records with channels named by role.
-    rig : Rig, str or Path, optional
-        Model ``one-axis``. Its m, R, c and ``[magnet]`` say what is known; its k_x, k_i and L are not looked at: they
-        are curves here. Calibration tables take duty to voltage; ``loop.limits.voltage`` is what the amplifier gives.
-        Default: columns named by role, nothing known.
-    magnet : MagnetLaw or {"auto", "single", "pair"}, optional
-        Co-energy, instead of the rig's; "auto" (and the default, where the rig says nothing): a pair where the current
-        changes its sign; one magnet: hyperbolic or exponential gap law and rising leakage, as the likelihood decides.
-        With a `MagnetLaw`, just that.
-    held : sequence of Record, str or Path
-        Records with the rotor held at rest at different distances: they show the coil.
-    parameters : sequence of Parameter
-        What is known of further numbers, or otherwise than the rig says: k, s, L_g, zeta, sigma, L_leak, L_rise,
-        i_knee, i0, g, a, x_offset, i_offset, v_offset (SI). g is fixed at 9.81 for one magnet and 0 for a pair;
-        i_offset, and for one magnet x_offset, at 0.
-    eddy : bool
-        The force has a pole a/(s + a) (thesis eq. 1.4), found up to about twice the sampling rate in rad/s.
-    drift : bool
-        A slowly walking force takes up what the law leaves over. One magnet then no longer has to carry the weight
-        at rest, which is the surest thing that its records say; so it is off unless asked for.
-    off_below : float, optional
-        Voltage in V at or below which the stage is off: while the current then dies through a diode, the coil's
-        voltage is not known (1 V rms is taken for it).
-    validate : Record, str or Path, optional
-        A further record, of a rotor that moves, to judge the estimate on.
-    from_s, to_s : float, optional
-        Part of the moving records to use, in s; overrides the rig's, which does not apply to held ones.
-    rate_hz : float, optional
-        For files without time.
-    gaps : {"error", "interpolate", "cut"}, optional
-        What to do about gaps in a file.
-    tick : callable, optional
-        Called with the name of the stage; KeyboardInterrupt during the search ends in the best so far, stalled.
-
-    Returns
-    -------
-    NonlinearBearingEstimate
-
-    Raises
-    ------
-    AmbidError
-        If a record or the rig breaks a rule.
-    EstimationError
-        If the rig is not ``one-axis``, a number is not known, or nothing can be estimated.
+    `held`: records with the rotor held at rest at different distances: they show the coil; `validate`: a further
+    record, of a rotor that moves, to judge the estimate on; `rate_hz`: for files without time; `gaps`: what to do about
+    gaps in a file.
     """
     how = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
     taken = read_records(
@@ -103,24 +59,12 @@ def identify_nonlinear(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingJob:
-    """What was read for one identification.
+    """What was read for one identification."""
 
-    Attributes
-    ----------
-    rig : Rig
-        With a `magnet` that says all that is known and wished.
-    taken : tuple of TakenRecord
-        Those in which the rotor moves, then those in which it is held.
-    second : TakenRecord or None
-        To judge on.
-    read_s : float
-        Time that reading took, in s.
-    """
-
-    rig: Rig
-    taken: tuple[TakenRecord, ...]
-    second: TakenRecord | None
-    read_s: float
+    rig: Rig  # with a `magnet` that says all that is known and wished
+    taken: tuple[TakenRecord, ...]  # those in which the rotor moves, then those in which it is held
+    second: TakenRecord | None  # to judge on
+    read_s: float  # time that reading took, in s
 
 
 def read_records(
@@ -139,31 +83,7 @@ def read_records(
 ) -> BearingJob:
     """Read all records of one identification.
 
-    Parameters
-    ----------
-    records : sequence of Record, str or Path
-    rig : Rig, str, Path or None
-    held : sequence of Record, str or Path
-    validate : Record, str, Path or None
-    magnet : MagnetLaw, {"auto", "single", "pair"} or None
-    parameters : sequence of Parameter
-    eddy, drift : bool
-    off_below : float or None
-        In V.
-    how : Reading
-    tick : callable, optional
-        All as `identify_nonlinear`.
-
-    Returns
-    -------
-    BearingJob
-
-    Raises
-    ------
-    AmbidError
-        As `identify_nonlinear`.
-    EstimationError
-        If there is no record of a rotor that moves, or the further one is of a rate that none of them has.
+    `off_below`: in V; `tick`: all as `identify_nonlinear`.
     """
     say, begun = tick or silent, time.perf_counter()
     bench = bearing_rig(rig, magnet=magnet, parameters=parameters, eddy=eddy, drift=drift, off_below=off_below)
@@ -188,23 +108,10 @@ def read_records(
 def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBearingEstimate:
     """Identify from records that were read.
 
-    Parameters
-    ----------
-    job : BearingJob
-    tick : callable, optional
-        As `identify_nonlinear`.
-
-    Returns
-    -------
-    NonlinearBearingEstimate
-
-    Raises
-    ------
-    EstimationError
-        If nothing can be estimated.
+    `tick`: as `identify_nonlinear`.
     """
-    from ambid.identify.nonlinear_bearing.estimate import estimate_bearing
-    from ambid.identify.nonlinear_bearing.uncertainty import uncertainty
+    from ambid.bearing.magnet.estimate import estimate_bearing
+    from ambid.bearing.magnet.uncertainty import uncertainty
 
     say, begun, bench = tick or silent, time.perf_counter(), job.rig
     assert bench.magnet is not None
@@ -240,27 +147,8 @@ def validate_bearing(
 ) -> dict[str, object]:
     """Judge an estimate on a further record, of a rotor that moves.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    record : Record, str or Path
-    rig : Rig, str or Path
-        Through which the record is read.
-    from_s, to_s : float, optional
-        Part of it, in s; overrides the rig's.
-    rate_hz : float, optional
-        For a file without time.
-    gaps : {"error", "interpolate", "cut"}, optional
-
-    Returns
-    -------
-    dict
-        As `ambid.validate.nonlinear_bearing.validation`.
-
-    Raises
-    ------
-    AmbidError
-        If the record or the rig breaks a rule.
+    `rig`: through which the record is read; `from_s`, `to_s`: part of it, in s; overrides the rig's; `rate_hz`: for a
+    file without time. Returns as `ambid.validate.nonlinear_bearing.validation`.
     """
     how = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
     return _validated(estimate, taken_record(record, bearing_rig(rig), how))

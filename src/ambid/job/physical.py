@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Check, Estimate
+from ambid.estimation.estimate import Check, Estimate
 from ambid.job._progress import Tick, silent
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
@@ -21,8 +21,8 @@ from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
 from ambid.signals.samples import cut
 
 if TYPE_CHECKING:
-    from ambid.identify.likelihood import Fit
-    from ambid.identify.uncertainty import Uncertainty
+    from ambid.estimation.likelihood import Fit
+    from ambid.estimation.uncertainty import Uncertainty
 
 
 def identify(
@@ -67,9 +67,9 @@ def identify(
     EstimationError
         If nothing can be identified from the record.
     """
-    from ambid.identify.greybox import greybox
-    from ambid.identify.threads import one_thread
-    from ambid.identify.uncertainty import uncertainty
+    from ambid.bearing.greybox import greybox
+    from ambid.estimation.threads import one_thread
+    from ambid.estimation.uncertainty import uncertainty
 
     say = tick or silent
     clock = _Clock()
@@ -130,8 +130,8 @@ def judged(
     """
     import numpy as np
 
-    from ambid.identify.result import estimate_of
-    from ambid.identify.sensitivity import innovations
+    from ambid.bearing.result import estimate_of
+    from ambid.estimation.sensitivity import innovations
     from ambid.validate.agreement import agreement
     from ambid.validate.assumptions import assumption_checks
     from ambid.validate.checks import physical_checks, residual_checks
@@ -179,7 +179,7 @@ def _remembered(rig: Rig) -> dict[str, object]:
 
 def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
-    from ambid.identify.rescue import told
+    from ambid.bearing.rescue import told
 
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
     if fit.global_search is not None:
@@ -256,12 +256,12 @@ def signals_of(record: Record, plant: LinearModel) -> Any:
 
     Returns
     -------
-    ambid.identify.greybox.Signals
+    ambid.bearing.greybox.Signals
         u (n_samples, n_inputs), y (n_samples, n_outputs), SI.
     """
     import numpy as np
 
-    from ambid.identify.multistart import Signals
+    from ambid.bearing.multistart import Signals
 
     return Signals(
         u=np.stack([record[r] for r in plant.inputs], axis=1),

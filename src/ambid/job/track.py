@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Literal
 
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job._progress import Tick, silent
 from ambid.job.bench_rows import rows_of
 from ambid.job.follow import Flag, Pace, follow
 from ambid.job.track_settings import check_settings
 from ambid.job.track_start import start_of
 from ambid.record import Record
+from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig, load_rig
-from ambid.track.lines import Track, TrackHeader, TrackLine
 
 
 def track(
@@ -42,50 +42,12 @@ def track(
 ) -> Track:
     """Follow the physical parameters of a bench through a record.
 
-    Parameters
-    ----------
-    record : Record, str or Path
-        A file in the rig's columns, or a record whose channels are named by role. Gaps are met, not refused.
-    rig : Rig, str or Path, optional
-        What is known of the bench; default: columns voltage, current and position, of a turning rotor also speed and
-        angle, everything free.
-    start : Estimate, str or Path, optional
-        Where tracking begins; default: an identification of the first part of the record.
-    start_s : float, optional
-        Length of that part, s.
-    every_s : float
-        Reporting interval, s of record.
-    limit : float
-        Acceptable model error, in multiples of that at identification.
-    memory : float, "auto" or "all"
-        Time constant with which old data are forgotten, s; found from the data; or none is forgotten.
-    pace : {"fastest", "real-time"}
-        Replay as fast as possible, or as the record was taken.
-    flags : sequence of (float, str)
-        What an operator sets and when, s of record.
-    from_s, to_s : float, optional
-        Part of the record to use, s.
-    rate_hz : float, optional
-        Sampling rate for a file without a time column.
-    on_header : callable, optional
-        Called once, before the first line.
-    on_line : callable, optional
-        Called with each line as it comes; may return flags that an operator set meanwhile.
-    keep : bool
-        Keep the lines for the result; without, memory stays constant.
-    tick : callable, optional
-        Called with the name of the present stage now and then; may raise to interrupt.
-
-    Returns
-    -------
-    Track
-
-    Raises
-    ------
-    AmbidError
-        If record, rig or start break a rule.
-    EstimationError
-        If a setting makes no sense, or the start cannot be tracked from.
+    `start`: where tracking begins; default: an identification of the first part of the record; `start_s`: length of
+    that part, s; `every_s`: reporting interval, s of record; `limit`: acceptable model error, in multiples of that at
+    identification; `pace`: replay as fast as possible, or as the record was taken; `flags`: what an operator sets and
+    when, s of record; `from_s`, `to_s`: part of the record to use, s; `rate_hz`: sampling rate for a file without a
+    time column; `on_header`: called once, before the first line; `keep`: keep the lines for the result; without, memory
+    stays constant.
     """
     check_settings(
         record, start=start, start_s=start_s, every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags,

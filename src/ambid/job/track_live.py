@@ -20,15 +20,15 @@ from ambid.acquire.device import Device, DeviceEvent
 from ambid.acquire.session import Course, RunReport, Tap
 from ambid.acquire.view import BenchView
 from ambid.errors import AmbidError, DeviceError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.bench_rows import BenchRows
 from ambid.job.follow import Flag, follow
 from ambid.job.live_run import LOOK_S, LiveRun, RingTap
 from ambid.job.track_start import start_of
 from ambid.physics.models import model
 from ambid.record import Channel, Record
+from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig
-from ambid.track.lines import Track, TrackHeader, TrackLine
 from ambid.track.stream.block import Block
 from ambid.track.stream.replay import Replay
 from ambid.track.stream.ring import BlockRing
@@ -42,21 +42,11 @@ _IDENTIFIED_S, _IDENTIFIED_SAMPLES = 2.0, 10_000  # at least, where a start is t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveTrack:
-    """What came of live tracking.
+    """What came of live tracking."""
 
-    Attributes
-    ----------
-    track : Track
-        Header, lines where they were kept, summary.
-    run : RunReport
-        Of the device.
-    overruns : int
-        Blocks that found the ring full: they are gaps in the track, and counted there too.
-    """
-
-    track: Track
-    run: RunReport
-    overruns: int
+    track: Track  # header, lines where they were kept, summary
+    run: RunReport  # of the device
+    overruns: int  # blocks that found the ring full: they are gaps in the track, and counted there too
 
 
 def track_live(
@@ -81,43 +71,12 @@ def track_live(
 ) -> LiveTrack:
     """Let a device do a course, and follow the physical parameters of its bench meanwhile.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-    rig : Rig
-        Its bench.
-    course : Course
-        What the device is to do; tracking begins when it has settled.
-    start : Estimate, str or Path, optional
-        Where tracking begins; default: an identification of the first part of the stream.
-    start_s : float, optional
-        Length of that part, s.
-    every_s, limit, memory, flags, on_header, on_line, keep
-        As `ambid.job.track.track`; times count from the first sample that is tracked.
-    taps : sequence of Tap
-        Others who listen to the run, such as a recorder.
-    on_event : callable, optional
-        Told of the device's events, in the thread of the run.
-    on_run : callable, optional
-        Given what came of the run, also where tracking was interrupted.
-    on_trouble : callable, optional
-        Told why tracking cannot go on. The run does, to its end, where others listen: a recorder is not cut off by a
-        tracker. The error is raised after it.
-    stopped : callable, optional
-        Asked between blocks, in the thread of the run; True ends the run in an orderly way.
-
-    Returns
-    -------
-    LiveTrack
-        The track up to the end of the course, a fault, or an interrupt.
-
-    Raises
-    ------
-    DeviceError
-        If the device refuses, the line is lost, or the course is too short to begin tracking in it.
-    AmbidError
-        If the rig or the start break a rule.
+    `device`: opened, idle; `rig`: its bench; `course`: what the device is to do; tracking begins when it has settled;
+    `start`: where tracking begins; default: an identification of the first part of the stream; `start_s`: length of
+    that part, s; `every_s`, `limit`, `memory`, `flags`, `on_header`, `on_line`, `keep`: as `ambid.job.track.track`;
+    times count from the first sample that is tracked; `taps`: others who listen to the run, such as a recorder;
+    `on_event`: told of the device's events, in the thread of the run; `on_run`: given what came of the run, also where
+    tracking was interrupted. Returns the track up to the end of the course, a fault, or an interrupt.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))

@@ -30,15 +30,8 @@ def check_settings(
 ) -> None:
     """Refuse settings that make no sense, or that contradict one another.
 
-    Parameters
-    ----------
-    record, start, start_s, every_s, limit, memory, pace, flags, rate_hz, from_s, to_s : object
-        As `ambid.job.track.track` takes them.
-
-    Raises
-    ------
-    EstimationError
-        On one line: which, what it is, and the rule.
+    `record`, `start`, `start_s`, `every_s`, `limit`, `memory`, `pace`, `flags`, `rate_hz`, `from_s`, `to_s`: as
+    `ambid.job.track.track` takes them.
     """
     for name, x in (("every_s", every_s), ("limit", limit)):
         _positive(name, x)

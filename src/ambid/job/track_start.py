@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.bench_rows import BenchRows
 from ambid.job.estimates import read_estimate
 from ambid.job.physical import identify
@@ -32,22 +32,12 @@ _FAR = 4.0  # standard deviations between a prior and a start that contradicts i
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Start:
-    """Where tracking begins.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    numbers : TrackedNumbers
-    first : int
-        Number of the first sample that is tracked.
-    warnings : tuple of str
-        What to mistrust, one line each.
-    """
+    """Where tracking begins."""
 
     estimate: Estimate
     numbers: TrackedNumbers
-    first: int
-    warnings: tuple[str, ...]
+    first: int  # number of the first sample that is tracked
+    warnings: tuple[str, ...]  # what to mistrust, one line each
 
 
 def start_of(
@@ -60,27 +50,8 @@ def start_of(
 ) -> Start:
     """Take the estimate to begin with, or make one.
 
-    Parameters
-    ----------
-    source : BenchRows
-    rig : Rig
-    given : Estimate, str, Path or None
-        An estimate or its file; None: identify the beginning of the record.
-    start_s : float or None
-        Length of that beginning, s.
-    rig_speaks : bool
-        Whether the rig was given too: what it says of parameters and delay is compared with the estimate.
-
-    Returns
-    -------
-    Start
-
-    Raises
-    ------
-    AmbidError
-        If nothing can be identified from the beginning of the record.
-    EstimationError
-        If the estimate does not fit record or rig, or cannot be tracked from.
+    `given`: an estimate or its file; None: identify the beginning of the record; `start_s`: length of that beginning,
+    s.
     """
     warnings: list[str] = []
     if given is None:
@@ -110,18 +81,8 @@ def start_of(
 def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:
     """Refuse a start whose predictor would never say anything of the record.
 
-    Parameters
-    ----------
-    rpem : PhysicalRpem
-    duration_s : float
-        Of the whole record, s; infinite for a live stream.
-    first : int
-        Number of the first sample that is tracked.
-
-    Raises
-    ------
-    EstimationError
-        If settling takes too long.
+    `duration_s`: of the whole record, s; infinite for a live stream; `first`: number of the first sample that is
+    tracked.
     """
     rate = rpem.numbers.rate_hz
     settling_s, left_s = rpem.stream.settling_samples / rate, duration_s - first / rate
@@ -138,15 +99,7 @@ def credible_limits(source: BenchRows, estimate: Estimate) -> list[float]:
 
     An output is judged by its spread at identification, an input, of which an estimate keeps no spread, by the record.
 
-    Parameters
-    ----------
-    source : BenchRows
-    estimate : Estimate
-
-    Returns
-    -------
-    list of float
-        For each input, then each output, SI.
+    Returns for each input, then each output, SI.
     """
     plant, point = model(estimate.model), estimate.operating_point
     found = []

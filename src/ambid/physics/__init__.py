@@ -1,1 +1,21 @@
-"""Parameters, magnets, plant models and their discretisation, control loop and presets: no data in this room."""
+"""Parameters, magnets, models and their exact discretisation, control loop, presets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.physics.linear_model import LinearModel as LinearModel
+    from ambid.physics.loop import Limits as Limits
+    from ambid.physics.loop import Noise as Noise
+    from ambid.physics.loop import placed_loop as placed_loop
+    from ambid.physics.magnet import DifferentialPair as DifferentialPair
+    from ambid.physics.models import model as model
+    from ambid.physics.models import model_names as model_names
+    from ambid.physics.nonlinear import NonlinearPlant as NonlinearPlant
+    from ambid.physics.parameters import Parameter as Parameter
+    from ambid.physics.presets import preset as preset
+
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -23,12 +23,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.magnet import CoEnergy, Number
-
-Array = NDArray[np.float64]
 
 MAGNET_NUMBERS = ("strength", "length", "sigma", "L_leak", "L_rise", "i_knee", "i0", "k_asym", "i0_asym")
 """Places of a magnet's numbers in the vector `q`: strength is k or L_g, length is s or zeta."""
@@ -45,18 +43,9 @@ _SIGN = np.array([1.0, -1.0, 1.0, 1.0])  # k_x = -W_xx
 def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: bool, w: Array, dw: Array) -> None:
     """Write the derivatives of W' at one point; plain scalar code that the estimator's kernels compile.
 
-    Parameters
-    ----------
-    x, i : float
-        Position in m, axis current in A.
-    q : ndarray, shape (9,), SI
-        See `MAGNET_NUMBERS`.
-    exponential, pair : bool
-        Gap law, and whether two magnets oppose each other.
-    w : ndarray, shape (12,)
-        Written: the derivatives named in `ORDERS`.
-    dw : ndarray, shape (7, 9)
-        Written: derivatives by `q` of those named in `SLOPED`.
+    `x`, `i`: position in m, axis current in A; `q`: (9,), SI, see `MAGNET_NUMBERS`; `exponential`, `pair`: gap law, and
+    whether two magnets oppose each other; `w`: (12,), written: the derivatives named in `ORDERS`; `dw`: (7, 9),
+    written: derivatives by `q` of those named in `SLOPED`.
     """
     for a in range(12):
         w[a] = 0.0
@@ -132,26 +121,13 @@ def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MagnetLaw:
-    """Which co-energy, without its numbers.
+    """Which co-energy, without its numbers."""
 
-    Attributes
-    ----------
-    gap : {"hyperbolic", "exponential"}
-        How the inductance falls with the gap.
-    pair : bool
-        Two opposed magnets with currents i0 + i and i0 - i.
-    saturation : bool
-        Whether sigma may differ from zero.
-    rise : bool
-        Whether the leakage inductance may depend on the current.
-    asymmetric : bool
-        Whether the two magnets of a pair may differ: in strength (k_asym, between -1 and 1) and in bias (i0_asym).
-    """
-
-    gap: Literal["hyperbolic", "exponential"] = "hyperbolic"
-    pair: bool = False
-    saturation: bool = False
-    rise: bool = False
+    gap: Literal["hyperbolic", "exponential"] = "hyperbolic"  # how the inductance falls with the gap
+    pair: bool = False  # two opposed magnets with currents i0 + i and i0 - i
+    saturation: bool = False  # whether sigma may differ from zero
+    rise: bool = False  # whether the leakage inductance may depend on the current
+    # whether the two magnets of a pair may differ: in strength (k_asym, between -1 and 1) and in bias (i0_asym)
     asymmetric: bool = False
 
     def __post_init__(self) -> None:
@@ -175,14 +151,7 @@ class MagnetLaw:
     def vector(self, values: Mapping[str, float]) -> Array:
         """Write numbers as `q`, in shape (9,).
 
-        Parameters
-        ----------
-        values : Mapping[str, float]
-            By name, SI; what the law does not have may be absent.
-
-        Returns
-        -------
-        ndarray, shape (9,)
+        `values`: by name, SI; what the law does not have may be absent. Returns (9,).
         """
         neutral = {"sigma": 0.0, "L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0}
         return np.array([values[n] if n in values else neutral[n] for n in self.names])
@@ -190,16 +159,7 @@ class MagnetLaw:
     def value(self, x: Number, i: Number, values: Mapping[str, float]) -> Number:
         """Return W' in J, for real or complex arguments (of magnitude below the knee where complex).
 
-        Parameters
-        ----------
-        x, i : float or complex
-            Position in m, axis current in A.
-        values : Mapping[str, float]
-            As `vector`.
-
-        Returns
-        -------
-        float or complex
+        `x`, `i`: position in m, axis current in A; `values`: as `vector`.
         """
         k, s, sigma, leak, rise, knee, bias, more, other = self.vector(values).tolist()
         sides: tuple[tuple[float, Number, Number], ...] = ((k, x, i),)
@@ -216,15 +176,7 @@ class MagnetLaw:
     def force(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
         """Return the force dW'/dx at many points, by a complex step.
 
-        Parameters
-        ----------
-        x, i : ndarray, shape (n_points,), m and A
-        values : Mapping[str, float]
-            As `vector`.
-
-        Returns
-        -------
-        ndarray, shape (n_points,), N
+        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns (n_points,), N.
         """
         step = 1e-30
         energies: Any = self.value(cast(Any, x + 1j * step), cast(Any, i), values)
@@ -233,17 +185,8 @@ class MagnetLaw:
     def table(self, x: Array, i: Array, values: Mapping[str, float]) -> tuple[Array, Array]:
         """Return force, k_x, k_i, L at points, and their derivatives by `q`.
 
-        Parameters
-        ----------
-        x, i : ndarray, shape (n_points,), m and A
-        values : Mapping[str, float]
-            As `vector`.
-
-        Returns
-        -------
-        values : ndarray, shape (n_points, 4)
-            In N, N/m (k_x = -df/dx), N/A and H.
-        slopes : ndarray, shape (n_points, 4, 9)
+        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns `values`: (n_points, 4), in N, N/m (k_x =
+        -df/dx), N/A and H; `slopes`: (n_points, 4, 9).
         """
         found, slopes = self._derivatives(x, i, values)
         return found[:, :4] * _SIGN, slopes[:, :4] * _SIGN[:, None]
@@ -251,15 +194,7 @@ class MagnetLaw:
     def gradients(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
         """Return the derivatives of force, k_x, k_i, L by position and current.
 
-        Parameters
-        ----------
-        x, i : ndarray, shape (n_points,), m and A
-        values : Mapping[str, float]
-            As `vector`.
-
-        Returns
-        -------
-        ndarray, shape (n_points, 4, 2)
+        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns (n_points, 4, 2).
         """
         found, _ = self._derivatives(x, i, values)
         by_x, by_i = found[:, [1, 4, 5, 6]], found[:, [2, 5, 6, 7]]
@@ -277,20 +212,8 @@ class MagnetLaw:
 def law_numbers(coenergy: CoEnergy) -> dict[str, float]:
     """Return the numbers of the hyperbolic law that is a given ideal magnet.
 
-    Parameters
-    ----------
-    coenergy : CoEnergy
-        Of a `SingleMagnet` or of a `DifferentialPair`.
-
-    Returns
-    -------
-    dict of str to float
-        k in N m^2/A^2, s in m, L_leak in H, i0 and i0_asym in A, k_asym in 1.
-
-    Raises
-    ------
-    ModelError
-        If the gaps of a pair differ at x = 0: the law counts positions from where they are equal.
+    `coenergy`: of a `SingleMagnet` or of a `DifferentialPair`. Returns k in N m^2/A^2, s in m, L_leak in H, i0 and
+    i0_asym in A, k_asym in 1.
     """
     w = coenergy
     if w.k_a == 0.0:

@@ -13,15 +13,9 @@ from ambid.physics.parameters import ParameterSpec
 
 @dataclass(frozen=True, slots=True)
 class Coil:
-    """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'.
+    """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'."""
 
-    Attributes
-    ----------
-    name, summary, parameters, inputs, outputs, states, disturbances
-        As in `LinearModel`.
-    """
-
-    name: str = "coil"
+    name: str = "coil"  # as in `LinearModel`
     summary: str = "coil alone, rotor held at rest: voltage in, current out"
     parameters: tuple[ParameterSpec, ...] = (R, L)
     inputs: tuple[str, ...] = ("voltage",)
@@ -37,15 +31,7 @@ class Coil:
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A, B, E, C, each (1, 1), for R in ohm and L in H.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            R and L in SI units.
-
-        Returns
-        -------
-        StateSpace
-            All of shape (1, 1).
+        `theta`: R and L in SI units. Returns all of shape (1, 1).
         """
         r, ell = theta["R"], theta["L"]
         return StateSpace(
@@ -55,22 +41,7 @@ class Coil:
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return dA, dB, dE, dC for one parameter, each (1, 1).
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            R and L in SI units.
-        parameter : str
-            ``"R"`` or ``"L"``.
-
-        Returns
-        -------
-        StateSpace
-            All of shape (1, 1).
-
-        Raises
-        ------
-        ModelError
-            If the model has no such parameter.
+        `theta`: R and L in SI units; `parameter`: ``"R"`` or ``"L"``. Returns all of shape (1, 1).
         """
         r, ell = theta["R"], theta["L"]
         zero = np.zeros((1, 1))
@@ -86,15 +57,7 @@ class Coil:
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return no scales: neither R nor L may be zero.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            R and L in SI units.
-
-        Returns
-        -------
-        Mapping[str, float]
-            Empty.
+        `theta`: R and L in SI units. Returns empty.
         """
         del theta
         return {}

@@ -10,32 +10,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.physics.linear_model import StateSpace
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DiscreteSpace:
-    """Matrices of x[k+1] = A x[k] + B u[k-d] + B_late u[k-d-1] + E d[k], y[k] = C x[k].
+    """Matrices of x[k+1] = A x[k] + B u[k-d] + B_late u[k-d-1] + E d[k], y[k] = C x[k]."""
 
-    Attributes
-    ----------
-    A : ndarray, shape (n_states, n_states)
-    B, B_late : ndarray, shape (n_states, n_inputs)
-        `B_late` is zero where the delay is a whole number of samples.
-    E : ndarray, shape (n_states, n_disturbances)
-        Disturbances held over a sample.
-    C : ndarray, shape (n_outputs, n_states)
-    """
-
-    A: Array
-    B: Array
+    A: Array  # (n_states, n_states)
+    B: Array  # (n_states, n_inputs), `B_late` is zero where the delay is a whole number of samples
     B_late: Array
-    E: Array
-    C: Array
+    E: Array  # (n_states, n_disturbances), disturbances held over a sample
+    C: Array  # (n_outputs, n_states)
 
 
 def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
@@ -43,18 +31,8 @@ def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
 
     exp([[A, B], [0, 0]] T) holds both (Van Loan 1978).
 
-    Parameters
-    ----------
-    A : ndarray, shape (n_states, n_states)
-        Complex for a complex step.
-    B : ndarray, shape (n_states, n_inputs)
-    period_s : float
-        Sampling period in s.
-
-    Returns
-    -------
-    A_d : ndarray, shape (n_states, n_states)
-    B_d : ndarray, shape (n_states, n_inputs)
+    `A`: (n_states, n_states), complex for a complex step; `B`: (n_states, n_inputs); `period_s`: sampling period in s.
+    Returns `A_d`: (n_states, n_states); `B_d`: (n_states, n_inputs).
     """
     from scipy.linalg import expm
 
@@ -73,23 +51,9 @@ def discretise(
     exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the
     upper right block of exp([[M, dM], [0, M]] T) (Mathias 1996).
 
-    Parameters
-    ----------
-    space : StateSpace
-        Continuous-time matrices.
-    period_s : float
-        Sampling period in s.
-    fraction : float, optional
-        Part of a sample by which the input comes late, 0 <= fraction < 1; None: none, and no derivative along it.
-    derivatives : Sequence of StateSpace
-        Directions (dA, dB, dE); dC is passed on.
-
-    Returns
-    -------
-    discrete : DiscreteSpace
-        The discrete matrices.
-    directional : tuple of DiscreteSpace
-        Their derivatives, one for each direction; where `fraction` is given, one more: along the fraction itself.
+    `space`: continuous-time matrices; `period_s`: sampling period in s; `derivatives`: directions (dA, dB, dE); dC is
+    passed on. Returns `discrete`: the discrete matrices; `directional`: their derivatives, one for each direction;
+    where `fraction` is given, one more: along the fraction itself.
     """
     from scipy.linalg import expm
 

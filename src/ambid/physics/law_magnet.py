@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
-from ambid.physics.coenergy_law import MAGNET_NUMBERS, ORDERS, SLOPED, Array, MagnetLaw, coenergy_derivatives
+from ambid.physics.coenergy_law import MAGNET_NUMBERS, ORDERS, SLOPED, MagnetLaw, coenergy_derivatives
 from ambid.physics.magnet import Number
 
 _UNITS = {spec.name: spec.unit for spec in BEARING_NUMBERS}
@@ -27,20 +28,12 @@ class LawMagnet:
     """A `MagnetLaw` with numbers; it is its own co-energy.
 
     Positions are those of the sensor; the law's own are `x_offset` less. Arguments are real.
-
-    Attributes
-    ----------
-    law : MagnetLaw
-        Which co-energy.
-    values : Mapping[str, float]
-        Its numbers by name, SI; what the law does not have may be absent, and so may L_leak (0).
-    x_offset : float
-        What the position sensor shows at the law's zero, in m.
     """
 
-    law: MagnetLaw
+    law: MagnetLaw  # which co-energy
+    # its numbers by name, SI; what the law does not have may be absent, and so may L_leak (0)
     values: Mapping[str, float]
-    x_offset: float = 0.0
+    x_offset: float = 0.0  # what the position sensor shows at the law's zero, in m
 
     def __post_init__(self) -> None:
         law = self.law
@@ -120,22 +113,7 @@ class LawMagnet:
     def holding_current(self, x: float, load: float) -> float:
         """Return the axis current that holds a load at rest, of a pair with both magnets conducting.
 
-        Parameters
-        ----------
-        x : float
-            Position in m.
-        load : float
-            Constant force along +x in N, such as the weight.
-
-        Returns
-        -------
-        float
-            Current in A.
-
-        Raises
-        ------
-        ModelError
-            If the position closes a gap, or no current holds the load there.
+        `x`: position in m; `load`: constant force along +x in N, such as the weight. Returns current in A.
         """
         from scipy.optimize import brentq
 

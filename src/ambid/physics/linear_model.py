@@ -9,13 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ambid.arrays import Array
 from ambid.errors import ModelError, nearest
 from ambid.physics.parameters import ParameterSpec
-
-Array = NDArray[np.float64]
 
 UNITS = {  # of inputs, outputs, states and disturbances
     "voltage": "V",
@@ -35,22 +31,14 @@ C = ParameterSpec(name="c", unit="N s/m", meaning="mechanical damping", default=
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateSpace:
-    """Continuous-time matrices of x' = A x + B u + E d, y = C x.
+    """Continuous-time matrices of x' = A x + B u + E d, y = C x."""
 
-    Attributes
-    ----------
-    A : ndarray, shape (n_states, n_states), 1/s in SI state units
-    B : ndarray, shape (n_states, n_inputs)
-        Inputs, held constant over a sample.
-    E : ndarray, shape (n_states, n_disturbances)
-        Disturbances (force in N, voltage in V): process noise and constant offsets enter here.
-    C : ndarray, shape (n_outputs, n_states)
-    """
-
-    A: Array
-    B: Array
+    A: Array  # (n_states, n_states), 1/s in SI state units
+    B: Array  # (n_states, n_inputs), inputs, held constant over a sample
+    # (n_states, n_disturbances), disturbances (force in N, voltage in V): process noise and constant offsets enter
+    # here
     E: Array
-    C: Array
+    C: Array  # (n_outputs, n_states)
 
 
 class LinearModel(Protocol):
@@ -101,16 +89,7 @@ class LinearModel(Protocol):
 def unknown_parameter(of: LinearModel, parameter: str) -> ModelError:
     """Return the error for a parameter that a model does not have.
 
-    Parameters
-    ----------
-    of : LinearModel
-    parameter : str
-        What was asked for.
-
-    Returns
-    -------
-    ModelError
-        Names the nearest known parameter.
+    `parameter`: what was asked for. Returns names the nearest known parameter.
     """
     names = [p.name for p in of.parameters]
     return ModelError(

@@ -18,28 +18,19 @@ UNLIMITED: Interval = (-math.inf, math.inf)
 class Loop:
     """Discrete-time PID on the position, with current feedback, and the delay of its output.
 
-    u[k] = u0 + kp e[k] + I[k] + D[k] - kc (i[k] - i0) + excitation[k], with e = setpoint - x,
-    I[k+1] = I[k] + ki T e[k], D[k] = (tau D[k-1] - kd (x[k] - x[k-1])) / (tau + T), tau = 1/(2 pi cutoff).
-    While u is limited, I may only move back (anti-windup). All gains zero: open loop.
-    x and i are the logged values (with noise and quantisation); u[k] acts from t_k + delay on, held for a sample.
-
-    Attributes
-    ----------
-    kp, ki, kd : float
-        In V/m, V/(m s) and V s/m.
-    kc : float
-        In V/A; it acts as a resistance and makes the coil fast, as a transconductance amplifier does (thesis eq. 1.5).
-    derivative_cutoff_hz : float
-        Cut-off of the derivative filter in Hz; infinite for none.
-    delay : float
-        Delay between the logged voltage and the coil in samples; fractions allowed. It acts in open loop too.
+    u[k] = u0 + kp e[k] + I[k] + D[k] - kc (i[k] - i0) + excitation[k], with e = setpoint - x, I[k+1] = I[k] + ki T
+    e[k], D[k] = (tau D[k-1] - kd (x[k] - x[k-1])) / (tau + T), tau = 1/(2 pi cutoff). While u is limited, I may only
+    move back (anti-windup). All gains zero: open loop. x and i are the logged values (with noise and quantisation);
+    u[k] acts from t_k + delay on, held for a sample.
     """
 
-    kp: float = 0.0
+    kp: float = 0.0  # in V/m, V/(m s) and V s/m
     ki: float = 0.0
     kd: float = 0.0
+    # in V/A; it acts as a resistance and makes the coil fast, as a transconductance amplifier does (thesis eq. 1.5).
     kc: float = 0.0
-    derivative_cutoff_hz: float = math.inf
+    derivative_cutoff_hz: float = math.inf  # cut-off of the derivative filter in Hz; infinite for none
+    # delay between the logged voltage and the coil in samples; fractions allowed. It acts in open loop too.
     delay: float = 0.0
 
     def __post_init__(self) -> None:

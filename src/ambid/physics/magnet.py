@@ -34,28 +34,15 @@ class CoEnergy:
     """W'(x, i) = k_a (i0 + j)^2 / (2 (s_a - x)) + k_b (i0 - j)^2 / (2 (s_b + x)) + leakage i^2 / 2, j = i0_asym + i.
 
     Both magnets of this file are cases of it, so that one compiled loop simulates them all.
-
-    Attributes
-    ----------
-    k_a, k_b : float
-        Magnet constants in N m^2/A^2 of the magnet that pulls along +x and of the one along -x.
-    s_a, s_b : float
-        Their gaps in m at x = 0; infinite where there is no such magnet.
-    i0 : float
-        Bias current in A.
-    leakage : float
-        Inductance in H that does not depend on x.
-    i0_asym : float
-        Half the difference of the two bias currents in A.
     """
 
-    k_a: float
-    s_a: float
+    k_a: float  # magnet constants in N m^2/A^2 of the magnet that pulls along +x and of the one along -x
+    s_a: float  # their gaps in m at x = 0; infinite where there is no such magnet
     k_b: float
     s_b: float
-    i0: float
-    leakage: float
-    i0_asym: float = 0.0
+    i0: float  # bias current in A
+    leakage: float  # inductance in H that does not depend on x
+    i0_asym: float = 0.0  # half the difference of the two bias currents in A
 
     def value(self, x: Number, i: Number) -> Number:
         """Return W' in J at position `x` in m and axis current `i` in A."""
@@ -143,17 +130,10 @@ class SingleMagnet:
     """One attracting magnet; the position is its gap and grows away from it.
 
     f = -k (i/x)^2 / 2 along +x (thesis eq. 1.9, 2.7), lambda = (k/x + leakage) i, so k_i < 0 and k_x < 0.
-
-    Attributes
-    ----------
-    k : float
-        Magnet constant in N m^2/A^2; see `from_geometry`.
-    leakage : float
-        Inductance in H that does not depend on the gap.
     """
 
-    k: float
-    leakage: float = 0.0
+    k: float  # magnet constant in N m^2/A^2; see `from_geometry`
+    leakage: float = 0.0  # inductance in H that does not depend on the gap
 
     def __post_init__(self) -> None:
         _positive("k", self.k, "N m^2/A^2")
@@ -163,19 +143,8 @@ class SingleMagnet:
     def from_geometry(cls, *, turns: float, area: float, leakage: float = 0.0) -> SingleMagnet:
         """Return the magnet with k = mu0 n^2 A (thesis eq. 2.7).
 
-        Parameters
-        ----------
-        turns : float
-            Turns of the winding.
-        area : float
-            Area of the one gap in m^2.
-        leakage : float
-            Inductance in H that does not depend on the gap.
-
-        Returns
-        -------
-        SingleMagnet
-            The magnet.
+        `turns`: turns of the winding; `area`: area of the one gap in m^2; `leakage`: inductance in H that does not
+        depend on the gap. Returns the magnet.
         """
         _positive("turns", turns, "1")
         _positive("area", area, "m^2")
@@ -194,22 +163,7 @@ class SingleMagnet:
     def holding_current(self, x: float, load: float) -> float:
         """Return i = x sqrt(2 load / k), the current that holds `load` in N (away from the magnet) at gap `x` in m.
 
-        Parameters
-        ----------
-        x : float
-            Gap in m.
-        load : float
-            Constant force along +x in N, such as the weight.
-
-        Returns
-        -------
-        float
-            Current in A.
-
-        Raises
-        ------
-        ModelError
-            If the load does not pull away from the magnet: a magnet cannot push.
+        `x`: gap in m; `load`: constant force along +x in N, such as the weight. Returns current in A.
         """
         _open(x, self.range)
         if load <= 0.0:

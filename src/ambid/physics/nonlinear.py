@@ -17,15 +17,9 @@ from ambid.physics.power_stage import IDEAL, PowerStage
 
 
 class OperatingPoint(NamedTuple):
-    """Where a plant rests, and where a linear model holds.
+    """Where a plant rests, and where a linear model holds."""
 
-    Attributes
-    ----------
-    position, current, voltage : float
-        In m, A and V.
-    """
-
-    position: float = 0.0
+    position: float = 0.0  # in m, A and V
     current: float = 0.0
     voltage: float = 0.0
 

@@ -15,16 +15,11 @@ from ambid.physics.parameters import ParameterSpec
 class OneAxis:
     """Coil, magnet and mass on one axis (thesis eq. 4.4 and 4.8).
 
-    m x'' = k_i i - k_x x - c x' + f,  V = R i + L i' + k_i x'; both position and current are measured
-    (the printed C = [1 0 1]^T has to be two rows, theory.md sec. 1).
-
-    Attributes
-    ----------
-    name, summary, parameters, inputs, outputs, states, disturbances
-        As in `LinearModel`.
+    m x'' = k_i i - k_x x - c x' + f,  V = R i + L i' + k_i x'; both position and current are measured (the printed C =
+    [1 0 1]^T has to be two rows, theory.md sec. 1).
     """
 
-    name: str = "one-axis"
+    name: str = "one-axis"  # as in `LinearModel`
     summary: str = "coil + magnet + mass on one axis: voltage in, position and current out"
     parameters: tuple[ParameterSpec, ...] = (MASS, K_X, K_I, R, L, C)
     inputs: tuple[str, ...] = ("voltage",)
@@ -40,15 +35,7 @@ class OneAxis:
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A, B, E, C of thesis eq. 4.8 with damping.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            m, k_x, k_i, R, L, c in SI units.
-
-        Returns
-        -------
-        StateSpace
-            A (3, 3), B (3, 1), E (3, 2), C (2, 3).
+        `theta`: m, k_x, k_i, R, L, c in SI units. Returns a (3, 3), B (3, 1), E (3, 2), C (2, 3).
         """
         m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
         return StateSpace(
@@ -61,22 +48,8 @@ class OneAxis:
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            m, k_x, k_i, R, L, c in SI units.
-        parameter : str
-            Name of the parameter.
-
-        Returns
-        -------
-        StateSpace
-            Derivatives of A (3, 3), B (3, 1), E (3, 2), C (2, 3).
-
-        Raises
-        ------
-        ModelError
-            If the model has no such parameter.
+        `theta`: m, k_x, k_i, R, L, c in SI units; `parameter`: name of the parameter. Returns derivatives of A (3, 3),
+        B (3, 1), E (3, 2), C (2, 3).
         """
         m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
         d_a, d_b, d_e = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 2))
@@ -102,14 +75,7 @@ class OneAxis:
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return the scale against which a damping near zero is judged: that of critical damping.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            Parameters in SI units.
-
-        Returns
-        -------
-        Mapping[str, float]
-            ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's frequency.
+        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
+        frequency.
         """
         return {"c": float(np.sqrt(abs(theta["m"] * max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]))))}

@@ -12,23 +12,13 @@ Role = Literal["free", "fixed", "prior"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterSpec:
-    """A number that a model has.
+    """A number that a model has."""
 
-    Attributes
-    ----------
-    name, unit, meaning : str
-        Name in code, SI unit, and one line that says what it is (theory.md sec. 0).
-    positive : bool
-        Physics allows positive values only (mass, resistance, inductance).
-    default : float or None
-        Value taken as fixed when nothing is said of it; None: it is free.
-    """
-
-    name: str
+    name: str  # name in code, SI unit, and one line that says what it is (theory.md sec. 0).
     unit: str
     meaning: str
-    positive: bool = False
-    default: float | None = None
+    positive: bool = False  # physics allows positive values only (mass, resistance, inductance)
+    default: float | None = None  # value taken as fixed when nothing is said of it; None: it is free
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,24 +22,13 @@ from ambid.physics.magnet import Number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerStage:
-    """Limits, drop and offset of a power stage.
+    """Limits, drop and offset of a power stage."""
 
-    Attributes
-    ----------
-    limits : (float, float)
-        Between which the supply lets the voltage be, in V. The logged command may lie beyond.
-    v_drop : float
-        Voltage in V that is lost against the current.
-    i_drop : float
-        Current in A over which that loss changes its sign.
-    offset : float
-        Voltage in V that acts beside the one that is commanded.
-    """
-
+    # between which the supply lets the voltage be, in V. The logged command may lie beyond.
     limits: Interval = UNLIMITED
-    v_drop: float = 0.0
-    i_drop: float = 0.02
-    offset: float = 0.0
+    v_drop: float = 0.0  # voltage in V that is lost against the current
+    i_drop: float = 0.02  # current in A over which that loss changes its sign
+    offset: float = 0.0  # voltage in V that acts beside the one that is commanded
 
     def __post_init__(self) -> None:
         if not self.limits[0] < self.limits[1]:
@@ -55,15 +44,7 @@ class PowerStage:
     def drop(self, current: Number) -> Number:
         """Return the voltage that is lost.
 
-        Parameters
-        ----------
-        current : float or complex
-            In A.
-
-        Returns
-        -------
-        float or complex
-            In V.
+        `current`: in A. Returns in V.
         """
         lost: Number = self.v_drop * np.tanh(current / self.i_drop)
         return lost
@@ -71,15 +52,7 @@ class PowerStage:
     def slope(self, current: float) -> float:
         """Return d(drop)/di: what the drop adds to the resistance at a current.
 
-        Parameters
-        ----------
-        current : float
-            In A.
-
-        Returns
-        -------
-        float
-            In ohm.
+        `current`: in A. Returns in ohm.
         """
         return self.v_drop / self.i_drop / math.cosh(min(abs(current / self.i_drop), 350.0)) ** 2
 

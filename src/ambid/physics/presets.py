@@ -17,48 +17,21 @@ from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preset:
-    """A named bench.
+    """A named bench."""
 
-    Attributes
-    ----------
-    name, summary : str
-        Name for the command line, and one line that describes it.
-    parameters : Mapping[str, float]
-        Truth of the linear model `model` in SI units: m, k_x, k_i, R, L, c.
-    loop : Loop
-        Controller and delay; stable on the linear plant at `rate_hz`.
-    usually_closed : bool
-        Whether a record is taken in closed loop unless told otherwise.
-    noise : Noise
-        Sensor and process noise.
-    limits : Limits
-        Voltage, current and stops.
-    rate_hz : float
-        Sampling rate in Hz that the loop is designed for.
-    sources : Mapping[str, str]
-        Where each number comes from, or that it is chosen.
-    model : str
-        Name of the linear model.
-    plant : NonlinearPlant or None
-        The nonlinear plant whose linearisation `parameters` is, where there is one.
-    operating_point : OperatingPoint
-        Where the bench rests: m, A, V.
-    instruments : Mapping[str, (float, str)]
-        Gains of sensors and amplifiers with their units, where the source gives them.
-    """
-
-    name: str
+    name: str  # name for the command line, and one line that describes it
     summary: str
-    parameters: Mapping[str, float]
-    loop: Loop
-    usually_closed: bool
-    noise: Noise
-    limits: Limits
-    rate_hz: float
-    sources: Mapping[str, str]
-    model: str = "one-axis"
-    plant: NonlinearPlant | None = None
-    operating_point: OperatingPoint = field(default_factory=OperatingPoint)
+    parameters: Mapping[str, float]  # truth of the linear model `model` in SI units: m, k_x, k_i, R, L, c
+    loop: Loop  # controller and delay; stable on the linear plant at `rate_hz`
+    usually_closed: bool  # whether a record is taken in closed loop unless told otherwise
+    noise: Noise  # sensor and process noise
+    limits: Limits  # voltage, current and stops
+    rate_hz: float  # sampling rate in Hz that the loop is designed for
+    sources: Mapping[str, str]  # where each number comes from, or that it is chosen
+    model: str = "one-axis"  # name of the linear model
+    plant: NonlinearPlant | None = None  # the nonlinear plant whose linearisation `parameters` is, where there is one
+    operating_point: OperatingPoint = field(default_factory=OperatingPoint)  # where the bench rests: m, A, V
+    # gains of sensors and amplifiers with their units, where the source gives them
     instruments: Mapping[str, tuple[float, str]] = field(default_factory=lambda: MappingProxyType({}))
 
 

@@ -15,16 +15,11 @@ from ambid.physics.parameters import ParameterSpec
 class Rotor:
     """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f.
 
-    The current is the input, as with a transconductance amplifier; the data show only ratios to m
-    (theory.md sec. 1), so m wants a fixed value or a prior.
-
-    Attributes
-    ----------
-    name, summary, parameters, inputs, outputs, states, disturbances
-        As in `LinearModel`.
+    The current is the input, as with a transconductance amplifier; the data show only ratios to m (theory.md sec. 1),
+    so m wants a fixed value or a prior.
     """
 
-    name: str = "rotor"
+    name: str = "rotor"  # as in `LinearModel`
     summary: str = "magnet + mass, current-driven: current in, position out (shows ratios to m only)"
     parameters: tuple[ParameterSpec, ...] = (MASS, K_X, K_I, C)
     inputs: tuple[str, ...] = ("current",)
@@ -40,15 +35,7 @@ class Rotor:
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return A (2, 2), B (2, 1), E (2, 1), C (1, 2).
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            m, k_x, k_i, c in SI units.
-
-        Returns
-        -------
-        StateSpace
-            The continuous-time matrices.
+        `theta`: m, k_x, k_i, c in SI units. Returns the continuous-time matrices.
         """
         m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
         return StateSpace(
@@ -61,22 +48,7 @@ class Rotor:
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            m, k_x, k_i, c in SI units.
-        parameter : str
-            Name of the parameter.
-
-        Returns
-        -------
-        StateSpace
-            The derivatives.
-
-        Raises
-        ------
-        ModelError
-            If the model has no such parameter.
+        `theta`: m, k_x, k_i, c in SI units; `parameter`: name of the parameter. Returns the derivatives.
         """
         m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
         d_a, d_b, d_e = np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 1))
@@ -97,14 +69,7 @@ class Rotor:
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return the scale against which a damping near zero is judged: that of critical damping.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            Parameters in SI units.
-
-        Returns
-        -------
-        Mapping[str, float]
-            ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's frequency.
+        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
+        frequency.
         """
         return {"c": float(np.sqrt(abs(theta["m"] * theta["k_x"])))}

@@ -10,27 +10,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.physics.linear_model import LinearModel, StateSpace
 from ambid.physics.parameters import ParameterSpec
-
-Array = NDArray[np.float64]
 
 PREFIX = "gain_"
 
 
 @dataclass(frozen=True, slots=True)
 class SensorGains:
-    """A linear model with one more parameter for each output: ``gain_<output>``, 1 for a sensor as calibrated.
+    """A linear model with one more parameter for each output: ``gain_<output>``, 1 for a sensor as calibrated."""
 
-    Attributes
-    ----------
-    base : LinearModel
-        Its outputs are states of it.
-    """
-
-    base: LinearModel
+    base: LinearModel  # its outputs are states of it
 
     @property
     def name(self) -> str:
@@ -86,35 +77,14 @@ class SensorGains:
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
         """Return the matrices of the model in logged units.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            Parameters in SI units; a gain that is absent is 1.
-
-        Returns
-        -------
-        StateSpace
+        `theta`: parameters in SI units; a gain that is absent is 1.
         """
         return self._logged(self.base.matrices(theta), theta)
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return the derivative of the matrices by one parameter.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            Parameters in SI units.
-        parameter : str
-            Of the base model, or a gain.
-
-        Returns
-        -------
-        StateSpace
-
-        Raises
-        ------
-        ModelError
-            If the model has no such parameter.
+        `theta`: parameters in SI units; `parameter`: of the base model, or a gain.
         """
         if parameter not in self.gains:
             return self._logged(self.base.derivative(theta, parameter), theta)
@@ -130,14 +100,7 @@ class SensorGains:
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return the natural scales of the base model.
 
-        Parameters
-        ----------
-        theta : Mapping[str, float]
-            Parameters in SI units.
-
-        Returns
-        -------
-        Mapping[str, float]
+        `theta`: parameters in SI units.
         """
         return self.base.references(theta)
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array
 from ambid.record.sampling import GapPolicy
 
 _HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")

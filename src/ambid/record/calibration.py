@@ -11,10 +11,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import AmbidError, RecordError, UnitError
 from ambid.record._csv_text import data_rows, find_header, read_values
 from ambid.record.files import file_bytes, sha256_of, utf8_text
-from ambid.record.record import Array, Channel, Step
+from ambid.record.record import Channel, Step
 from ambid.units import Unit, parse_unit
 
 _EDGE = 1e-9  # of the table's span: rounding in the last digit is not outside the table
@@ -22,53 +23,23 @@ _EDGE = 1e-9  # of the table's span: rounding in the last digit is not outside t
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibration:
-    """A map from raw to physical values; all numbers in SI units.
+    """A map from raw to physical values; all numbers in SI units."""
 
-    Attributes
-    ----------
-    unit_in, unit_out : str
-        SI units of what goes in and comes out.
-    gain, offset : float
-        out = gain · raw + offset, gain in `unit_out` per `unit_in`, offset in `unit_out`. Not used with a table.
-    raw, out : ndarray, shape (n_points,), or None
-        Points of the table, `raw` increasing, in `unit_in` and `unit_out`.
-    extrapolate : bool
-        Continue the table's first and last piece outside it, instead of refusing values there.
-    source : str
-        Path of the table's file, as it was found.
-    sha256 : str
-        Of the table's file.
-    """
-
-    unit_in: str
+    unit_in: str  # SI units of what goes in and comes out
     unit_out: str
+    # out = gain · raw + offset, gain in `unit_out` per `unit_in`, offset in `unit_out`. Not used with a table.
     gain: float = 1.0
     offset: float = 0.0
-    raw: Array | None = None
+    raw: Array | None = None  # (n_points,), or None, points of the table, `raw` increasing, in `unit_in` and `unit_out`
     out: Array | None = None
-    extrapolate: bool = False
-    source: str = ""
-    sha256: str = ""
+    extrapolate: bool = False  # continue the table's first and last piece outside it, instead of refusing values there
+    source: str = ""  # path of the table's file, as it was found
+    sha256: str = ""  # of the table's file
 
     def apply(self, channel: Channel) -> Channel:
         """Calibrate a channel.
 
-        Parameters
-        ----------
-        channel : Channel
-            Raw values, shape (n_samples,), in `unit_in`.
-
-        Returns
-        -------
-        Channel
-            Of the same name and length, in `unit_out`.
-
-        Raises
-        ------
-        UnitError
-            If the channel is not in `unit_in`.
-        RecordError
-            If a value is outside the table and `extrapolate` is off; the first such sample is named.
+        `channel`: raw values, shape (n_samples,), in `unit_in`. Returns of the same name and length, in `unit_out`.
         """
         if channel.unit != self.unit_in:
             where = f"the table {self.source} begins with" if self.raw is not None else "its calibration is for"
@@ -82,15 +53,7 @@ class Calibration:
     def step(self, channel: str) -> Step:
         """Describe the calibration of one channel for a record's history.
 
-        Parameters
-        ----------
-        channel : str
-            Name of the calibrated channel.
-
-        Returns
-        -------
-        Step
-            With everything that is needed to repeat it.
+        `channel`: name of the calibrated channel. Returns with everything that is needed to repeat it.
         """
         settings: dict[str, object] = {"channel": channel, "from": self.unit_in, "to": self.unit_out}
         if self.raw is None or self.out is None:
@@ -121,22 +84,8 @@ class Calibration:
 def read_calibration_table(path: str | Path, *, extrapolate: bool = False) -> Calibration:
     """Read a calibration table: a CSV file with two columns of ``name [unit]``, raw and physical.
 
-    Parameters
-    ----------
-    path : str or Path
-        The table; its first column increases or decreases throughout.
-    extrapolate : bool
-        Continue the table's first and last piece outside it.
-
-    Returns
-    -------
-    Calibration
-        With `raw` increasing.
-
-    Raises
-    ------
-    RecordError
-        If the file breaks a rule of the format, has not two columns, or its first column is not monotone.
+    `path`: the table; its first column increases or decreases throughout; `extrapolate`: continue the table's first and
+    last piece outside it. Returns with `raw` increasing.
     """
     path = Path(path)
     data = file_bytes(path, RecordError, "calibration table")

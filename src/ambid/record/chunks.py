@@ -15,11 +15,12 @@ from zlib import error as ZlibError
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record._hdf5_file import new_hdf5
 from ambid.record.csv_format import head_lines
 from ambid.record.hdf5_format import add_channel, write_head
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 
 _PIECE = 1 << 17  # bytes, or values, that are read back at once
 
@@ -29,28 +30,10 @@ def write_chunks(
 ) -> Callable[[], None]:
     """Write a record whose values come in pieces.
 
-    Parameters
-    ----------
-    record : Record
-        Names, units, rate, start, history and provenance; without samples.
-    n_samples : int
-        Samples that will come.
-    chunks : iterable of ndarray, shape (n, n_channels)
-        In the order of time. NaN is a sample that was lost: in CSV an empty cell.
-    path : str or Path
-        ``.csv``, ``.csv.gz``, ``.h5`` or ``.hdf5``; overwritten if it exists.
-    texts : Mapping of str to str
-        For HDF5: further datasets, by name. CSV has no place for them.
-
-    Returns
-    -------
-    callable
-        Reads the file back, and raises RecordError if a value is not what was written.
-
-    Raises
-    ------
-    RecordError
-        If the pieces are more or fewer than announced, or the file cannot be written.
+    `record`: names, units, rate, start, history and provenance; without samples; `n_samples`: samples that will come;
+    `chunks`: (n, n_channels); `path`: ``.csv``, ``.csv.gz``, ``.h5`` or ``.hdf5``; overwritten if it exists; `texts`:
+    for HDF5: further datasets, by name. CSV has no place for them. Returns reads the file back, and raises RecordError
+    if a value is not what was written.
     """
     path = Path(path)
     write = _write_csv if path.name.lower().endswith((".csv", ".csv.gz")) else _write_hdf5
@@ -66,17 +49,8 @@ def check_chunks(
 ) -> None:
     """Hold a file against a record whose values come in pieces: whether it is what `write_chunks` would write.
 
-    Parameters
-    ----------
-    record, n_samples, path, texts
-        As `write_chunks` takes them. History and provenance are not looked at.
-    chunks : iterable of ndarray, shape (n, n_channels)
-        As `write_chunks` takes them.
-
-    Raises
-    ------
-    RecordError
-        If the file holds anything else, cannot be read, or the pieces are more or fewer than announced.
+    `record`, `n_samples`, `path`, `texts`: as `write_chunks` takes them. History and provenance are not looked at;
+    `chunks`: (n, n_channels), as `write_chunks` takes them.
     """
     path = Path(path)
     pieces = _counted(chunks, n_samples)

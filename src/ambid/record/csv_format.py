@@ -14,10 +14,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
 from ambid.record._csv_text import Header, data_rows, find_header, read_values
 from ambid.record.files import file_bytes, gunzipped, sha256_of, utf8_text
-from ambid.record.record import Array, Channel, Record, Step
+from ambid.record.record import Channel, Record, Step
 from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly, usual_rate
 from ambid.units import UNKNOWN, Unit, nearest_unit, parse_unit
 
@@ -28,24 +29,8 @@ _REFUSED_IN_NAMES = set(',;\t\n[]"#')
 def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:
     """Read a record from a CSV file, gzipped or not.
 
-    Parameters
-    ----------
-    path : str or Path
-        Ends in ``.gz`` if it is gzipped.
-    rate_hz : float, optional
-        Sampling rate in Hz, for a file without a column ``time [s]``.
-    gaps : {"error", "interpolate", "cut"}
-        What to do about missing or non-finite values and skipped rows, as `sample_uniformly` has it.
-
-    Returns
-    -------
-    Record
-        All columns but time, in SI units. A column whose unit is missing or unknown has the unit ``"?"``.
-
-    Raises
-    ------
-    RecordError
-        If the file or one of its rows breaks a rule of the format.
+    `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
+    Returns all columns but time, in SI units. A column whose unit is missing or unknown has the unit ``"?"``.
     """
     check_gap_policy(gaps)
     content = _content(Path(path), gaps)
@@ -56,24 +41,9 @@ def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy 
 def read_csv_rows(path: str | Path, *, rate_hz: float | None = None) -> tuple[Record, Array | None]:
     """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.rows`).
 
-    Parameters
-    ----------
-    path : str or Path
-        Ends in ``.gz`` if it is gzipped.
-    rate_hz : float, optional
-        Sampling rate in Hz, for a file without a column ``time [s]``.
-
-    Returns
-    -------
-    record : Record
-        NaN where a value is missing; the rate is that of the usual interval.
-    time_s : ndarray, shape (n_rows,), or None
-        The time column, s; None if there is none.
-
-    Raises
-    ------
-    RecordError
-        If a row breaks the format otherwise, or the rate is neither given nor found.
+    `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
+    Returns `record`: naN where a value is missing; the rate is that of the usual interval; `time_s`: (n_rows,), or
+    None, the time column, s; None if there is none.
     """
     content = _content(Path(path), "cut")
     rate, start_s = usual_rate(content.table, rate_hz)
@@ -139,19 +109,8 @@ def _record(content: _Content, values: Array, rate_hz: float, start_s: float, st
 def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
     """Make a channel in SI units from a column in file units.
 
-    Parameters
-    ----------
-    name : str
-        Column name.
-    unit_text : str or None
-        Unit as the file gives it; missing or unknown units give the unit ``"?"``.
-    raw : ndarray, shape (n_samples,)
-        Values in that unit.
-
-    Returns
-    -------
-    Channel
-        In SI units, or as it stands in the file where the unit is not known.
+    `name`: column name; `unit_text`: unit as the file gives it; missing or unknown units give the unit ``"?"``; `raw`:
+    (n_samples,), values in that unit. Returns in SI units, or as it stands in the file where the unit is not known.
     """
     try:
         unit = parse_unit(unit_text or "")
@@ -185,19 +144,8 @@ def _time_column(header: Header, path: Path) -> tuple[int | None, Unit | None]:
 def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:
     """Write a record as CSV in SI units; every value is read back to the last bit.
 
-    Parameters
-    ----------
-    record : Record
-        What to write; its history and provenance are not kept (HDF5 keeps them).
-    path : str or Path
-        Ends in ``.gz`` to be gzipped.
-    comments : sequence of str
-        Lines that go before the header row, each after ``#``.
-
-    Raises
-    ------
-    RecordError
-        If a value is not finite, a name would break the format, or the file cannot be written.
+    `record`: what to write; its history and provenance are not kept (HDF5 keeps them); `path`: ends in ``.gz`` to be
+    gzipped; `comments`: lines that go before the header row, each after ``#``.
     """
     path = Path(path)
     lines = head_lines(record, comments)
@@ -219,22 +167,8 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
 def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
     """Return what stands above the numbers.
 
-    Parameters
-    ----------
-    record : Record
-        Its values are not looked at.
-    comments : sequence of str
-        Lines that go before the header row, each after ``#``.
-
-    Returns
-    -------
-    list of str
-        The last one is the header row.
-
-    Raises
-    ------
-    RecordError
-        If a name would break the format.
+    `record`: its values are not looked at; `comments`: lines that go before the header row, each after ``#``. Returns
+    the last one is the header row.
     """
     for c in record.channels:
         if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in _TIME_NAMES:

@@ -14,24 +14,7 @@ from ambid.errors import AmbidError, RecordError
 def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> bytes:
     """Return the bytes of a file that exists, is a file, can be read and is not empty.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    error : type of AmbidError
-        What to raise.
-    what : str
-        What the file is, for messages.
-
-    Returns
-    -------
-    bytes
-        At least one.
-
-    Raises
-    ------
-    AmbidError
-        The given kind, if the file cannot be read or is empty; a missing file's nearest neighbour is named.
+    `path`: the file; `error`: what to raise; `what`: what the file is, for messages. Returns at least one.
     """
     try:
         data = path.read_bytes()
@@ -63,15 +46,7 @@ def _similar(path: Path) -> str:
 def sha256_of(data: bytes) -> str:
     """Return the SHA-256 of the bytes.
 
-    Parameters
-    ----------
-    data : bytes
-        Of a whole file.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
+    `data`: of a whole file. Returns 64 hexadecimal digits.
     """
     return hashlib.sha256(data).hexdigest()
 
@@ -79,22 +54,7 @@ def sha256_of(data: bytes) -> str:
 def gunzipped(data: bytes, path: Path) -> bytes:
     """Return what a gzip file holds.
 
-    Parameters
-    ----------
-    data : bytes
-        Of the gzip file.
-    path : Path
-        Its name, for messages.
-
-    Returns
-    -------
-    bytes
-        Unpacked.
-
-    Raises
-    ------
-    RecordError
-        If the file is truncated or damaged.
+    `data`: of the gzip file; `path`: its name, for messages. Returns unpacked.
     """
     try:
         return gzip.decompress(data)
@@ -107,26 +67,8 @@ def gunzipped(data: bytes, path: Path) -> bytes:
 def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> str:
     """Decode UTF-8; a byte order mark at the beginning is dropped, as it is no character.
 
-    Parameters
-    ----------
-    data : bytes
-        Of a text file.
-    path : Path
-        Its name, for messages.
-    error : type of AmbidError
-        What to raise.
-    what : str
-        What the file is, for messages.
-
-    Returns
-    -------
-    str
-        With lines ending in a line feed, whatever they ended in.
-
-    Raises
-    ------
-    AmbidError
-        The given kind, if the bytes are UTF-16, binary, or not UTF-8 (the row is named).
+    `data`: of a text file; `path`: its name, for messages; `error`: what to raise; `what`: what the file is, for
+    messages. Returns with lines ending in a line feed, whatever they ended in.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise error(f"{what} {path} is UTF-16; text must be UTF-8. Save it as UTF-8")

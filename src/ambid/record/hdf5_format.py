@@ -29,17 +29,7 @@ SCHEMA = "ambid.record/1"
 def write_hdf5(record: Record, path: str | Path) -> None:
     """Write a record with its history, provenance and units.
 
-    Parameters
-    ----------
-    record : Record
-        What to write; its history's settings must be JSON-able, as `Step` says.
-    path : str or Path
-        Overwritten if it exists.
-
-    Raises
-    ------
-    RecordError
-        If the history cannot be written as JSON, or the file cannot be written.
+    `record`: what to write; its history's settings must be JSON-able, as `Step` says; `path`: overwritten if it exists.
     """
     path = Path(path)
     history = _history_text(record)
@@ -56,14 +46,7 @@ def write_hdf5(record: Record, path: str | Path) -> None:
 def write_head(file: Any, record: Record, history: str | None = None) -> None:
     """Write everything but the channels.
 
-    Parameters
-    ----------
-    file : h5py.File
-        Empty.
-    record : Record
-        Its values are not looked at.
-    history : str, optional
-        Its history as JSON, if that is there already.
+    `file`: empty; `record`: its values are not looked at; `history`: its history as JSON, if that is there already.
     """
     file.attrs["schema"] = SCHEMA
     file.attrs["rate_hz"] = record.rate_hz
@@ -77,20 +60,8 @@ def write_head(file: Any, record: Record, history: str | None = None) -> None:
 def add_channel(file: Any, k: int, channel: Channel, **of: object) -> Any:
     """Make the dataset of a channel.
 
-    Parameters
-    ----------
-    file : h5py.File
-        With its head.
-    k : int
-        Place of the channel.
-    channel : Channel
-        Its name and units.
-    **of : object
-        ``data``, or ``shape`` and ``dtype`` where the values are still to come.
-
-    Returns
-    -------
-    h5py.Dataset
+    `file`: with its head; `k`: place of the channel; `channel`: its name and units; `**of`: ``data``, or ``shape`` and
+    ``dtype`` where the values are still to come.
     """
     dataset = file["channels"].create_dataset(str(k), compression="gzip", compression_opts=1, shuffle=True, **of)
     dataset.attrs["name"] = channel.name
@@ -111,24 +82,8 @@ def _history_text(record: Record) -> str:
 def read_hdf5_checked(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:
     """Read a record under the rules that hold for every format: one rate, and finite values unless gaps are treated.
 
-    Parameters
-    ----------
-    path : str or Path
-        HDF5 file of layout ``ambid.record/1``.
-    rate_hz : float, optional
-        Has to agree with the rate in the file, in Hz.
-    gaps : {"error", "interpolate", "cut"}
-        What to do about values that are not finite.
-
-    Returns
-    -------
-    Record
-        Finite throughout.
-
-    Raises
-    ------
-    RecordError
-        As :func:`read_hdf5`, and if a rule above is broken.
+    `path`: HDF5 file of layout ``ambid.record/1``; `rate_hz`: has to agree with the rate in the file, in Hz; `gaps`:
+    what to do about values that are not finite. Returns finite throughout.
     """
     record = read_hdf5(path)
     check_gap_policy(gaps)
@@ -156,21 +111,8 @@ def read_hdf5_checked(path: str | Path, *, rate_hz: float | None = None, gaps: G
 def read_hdf5(path: str | Path) -> Record:
     """Read a record that :func:`write_hdf5` wrote.
 
-    Parameters
-    ----------
-    path : str or Path
-        HDF5 file of layout ``ambid.record/1``.
-
-    Returns
-    -------
-    Record
-        Equal to the one written, bit for bit; ``file`` and ``sha256`` in the provenance are of this file where the
-        record had none.
-
-    Raises
-    ------
-    RecordError
-        If the file is no HDF5, is damaged, or has another layout.
+    `path`: HDF5 file of layout ``ambid.record/1``. Returns equal to the one written, bit for bit; ``file`` and
+    ``sha256`` in the provenance are of this file where the record had none.
     """
     import h5py
 

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
 from ambid.record.csv_format import column_channel
 from ambid.record.files import file_bytes, sha256_of
-from ambid.record.record import Array, Record, Step
+from ambid.record.record import Record, Step
 from ambid.record.sampling import GapPolicy, Table, check_gap_policy, sample_uniformly
 from ambid.units import UNKNOWN, parse_unit
 
@@ -34,27 +35,8 @@ def read_mat(
 ) -> Record:
     """Read a record from a MATLAB file.
 
-    Parameters
-    ----------
-    path : str or Path
-        A ``.mat`` file of version 5 or 7.3.
-    variables : Mapping of channel name to (variable, unit), optional
-        ``time`` maps to the time variable. Without a mapping every numeric vector of the file becomes a channel of
-        unknown unit, and a vector called ``time`` or ``t`` is the time in s.
-    rate_hz : float, optional
-        Sampling rate in Hz, for a file without a time variable.
-    gaps : {"error", "interpolate", "cut"}
-        What to do about values that are not finite.
-
-    Returns
-    -------
-    Record
-        In SI units where the units are known.
-
-    Raises
-    ------
-    RecordError
-        If the file is damaged, a variable is missing or is not a vector, or the samples are not uniform.
+    `path`: a ``.mat`` file of version 5 or 7.3; `rate_hz`: sampling rate in Hz, for a file without a time variable;
+    `gaps`: what to do about values that are not finite. Returns in SI units where the units are known.
     """
     path = Path(path)
     check_gap_policy(gaps)

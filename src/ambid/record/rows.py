@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.csv_format import read_csv_rows
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Step
+from ambid.record.record import Step
 
 GapPolicy = Literal["error", "interpolate", "cut"]
 GAP_POLICIES: tuple[GapPolicy, ...] = ("error", "interpolate", "cut")
@@ -23,72 +24,29 @@ JITTER = 0.01  # of a sampling period
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Columns as read from a file, not yet known to be uniform.
+    """Columns as read from a file, not yet known to be uniform."""
 
-    Attributes
-    ----------
-    where : str
-        The file, for messages.
-    names : tuple of str
-        Column names.
-    values : ndarray, shape (n_rows, n_columns)
-        In file units; NaN where a value is missing.
-    first_row : int
-        Line of the file in which the first row stands, counted from 1.
-    time : int or None
-        Which column is time (in seconds); None if there is none.
-    """
-
-    where: str
-    names: tuple[str, ...]
-    values: Array
-    first_row: int
-    time: int | None
+    where: str  # the file, for messages
+    names: tuple[str, ...]  # column names
+    values: Array  # (n_rows, n_columns), in file units; NaN where a value is missing
+    first_row: int  # line of the file in which the first row stands, counted from 1
+    time: int | None  # which column is time (in seconds); None if there is none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampled:
-    """A table on a uniform grid.
+    """A table on a uniform grid."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_samples, n_columns)
-        Finite throughout; the time column is still there.
-    rate_hz, start_s : float
-        Sampling rate in Hz and time of the first sample in s.
-    steps : tuple of Step
-        What was done about gaps.
-    """
-
-    values: Array
-    rate_hz: float
+    values: Array  # (n_samples, n_columns), finite throughout; the time column is still there
+    rate_hz: float  # sampling rate in Hz and time of the first sample in s
     start_s: float
-    steps: tuple[Step, ...]
+    steps: tuple[Step, ...]  # what was done about gaps
 
 
 def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sampled:
     """Find the rate and treat the gaps.
 
-    Parameters
-    ----------
-    table : Table
-        Columns of a file; all values finite if `gaps` is ``"error"``.
-    rate_hz : float or None
-        Rate in Hz for a table without time; beside a time column it has to agree with it.
-    gaps : {"error", "interpolate", "cut"}
-        Refuse gaps; fill them by linear interpolation; or keep the longest stretch without any. A gap is a missing or
-        non-finite value, or a jump of the time column.
-
-    Returns
-    -------
-    Sampled
-        At least 8 samples.
-
-    Raises
-    ------
-    RecordError
-        If there are fewer than 8 rows, no rate, two rates that differ, time that stands still or runs backwards,
-        irregular sampling, or a gap that the policy cannot treat.
+    `table`: columns of a file; all values finite if `gaps` is ``"error"``. Returns at least 8 samples.
     """
     check_gap_policy(gaps)
     _check_rate(table, rate_hz)
@@ -112,24 +70,8 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
 def usual_rate(table: Table, rate_hz: float | None) -> tuple[float, float]:
     """Find the rate of rows that need not be uniform: that of their usual interval.
 
-    Parameters
-    ----------
-    table : Table
-        Columns of a file; NaN where a value is missing.
-    rate_hz : float or None
-        Rate in Hz for a table without time; beside a time column it has to agree with it.
-
-    Returns
-    -------
-    rate_hz : float
-        In Hz.
-    start_s : float
-        First stamp, s; 0 without time.
-
-    Raises
-    ------
-    RecordError
-        If there is no rate, two rates that differ, or time that does not increase from row to row.
+    `table`: columns of a file; NaN where a value is missing. Returns `rate_hz`: in Hz; `start_s`: first stamp, s; 0
+    without time.
     """
     _check_rate(table, rate_hz)
     if table.time is None:
@@ -164,15 +106,7 @@ def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
 def check_gap_policy(gaps: str) -> None:
     """Refuse a gap policy that does not exist.
 
-    Parameters
-    ----------
-    gaps : str
-        What was asked for.
-
-    Raises
-    ------
-    RecordError
-        If it is none of error, interpolate and cut.
+    `gaps`: what was asked for.
     """
     if gaps not in GAP_POLICIES:
         raise RecordError(f"gaps = {gaps!r} is not known; choose one of {', '.join(GAP_POLICIES)}")

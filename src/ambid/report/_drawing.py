@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.report.numbers import prefixed, quantity
 from ambid.report.response import Pole, Response
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 MEASURED, PREDICTED, BAND, BOUND = "#444444", "#0b6fb8", "#9ecae8", "#c0392b"
 NORMAL_95, NORMAL_99 = 1.959963984540054, 2.5758293035489004
@@ -45,17 +45,8 @@ def worst_stretch(e: Array) -> tuple[int, int]:
 def autocorrelation(e: Array, n_lags: int) -> Array:
     """Return the autocorrelation coefficients of a signal of mean near zero.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_samples,)
-        Such as innovations.
-    n_lags : int
-        Largest lag; at most n_samples - 1 are given.
-
-    Returns
-    -------
-    ndarray, shape (n_lags + 1,)
-        The first is 1.
+    `e`: (n_samples,), such as innovations; `n_lags`: largest lag; at most n_samples - 1 are given. Returns (n_lags +
+    1,), the first is 1.
     """
     power = float(e @ e)
     lags = range(1, min(n_lags, e.size - 1) + 1)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.report._drawing import (
     BAND,
     BOUND,
@@ -25,34 +25,21 @@ from ambid.report.numbers import prefixed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
 
 _LAGS = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Traces:
-    """Outputs beside what a model says of them, SI.
+    """Outputs beside what a model says of them, SI."""
 
-    Attributes
-    ----------
-    time_s : ndarray, shape (n_samples,), s
-    names, units : tuple of str
-        Of the outputs.
-    measured, predicted : ndarray, shape (n_samples, n_outputs)
-        Predicted one step ahead.
-    simulated : ndarray, shape (n_samples, n_outputs), or None
-    innovation_sd : ndarray, shape (n_outputs,)
-        As the model says.
-    """
-
-    time_s: Array
-    names: tuple[str, ...]
+    time_s: Array  # (n_samples,), s
+    names: tuple[str, ...]  # of the outputs
     units: tuple[str, ...]
-    measured: Array
+    measured: Array  # (n_samples, n_outputs), predicted one step ahead
     predicted: Array
-    simulated: Array | None
-    innovation_sd: Array
+    simulated: Array | None  # (n_samples, n_outputs), or None
+    innovation_sd: Array  # (n_outputs,), as the model says
 
 
 def signals_panel(figure: Figure | SubFigure, traces: Traces) -> None:

@@ -65,15 +65,7 @@ class Finished(Protocol):
 def progress_line(now: Under) -> str:
     """Write how an acquisition goes: time, rate, gaps, signal-to-noise ratio, saturation.
 
-    Parameters
-    ----------
-    now : Progress
-        So far.
-
-    Returns
-    -------
-    str
-        One short line.
+    `now`: so far. Returns one short line.
     """
     q = now.quality
     parts = [f"{q.seconds:.1f} s", _rate(q), f"{q.lost} lost"]
@@ -99,21 +91,8 @@ def _rate(q: QualityReport) -> str:
 def acquired_text(done: Finished, path: Path, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write what an acquisition gave, for people.
 
-    Parameters
-    ----------
-    done : Acquired
-        From `ambid.job.acquire.acquire`.
-    path : Path
-        The record.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Lines without the last line's end.
+    `done`: from `ambid.job.acquire.acquire`; `path`: the record; `width`: columns of the terminal; `paint`: adds
+    colour; the layout does not depend on it. Returns lines without the last line's end.
     """
     q, counters = done.quality, done.counters
     stored = done.run.samples - done.not_stored - q.repeated

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.nonlinear_bearing.problem import BearingRecord
-from ambid.identify.nonlinear_bearing.result import Curve, Curves, NonlinearBearingEstimate
+from ambid.arrays import Array
+from ambid.bearing.magnet.problem import BearingRecord
+from ambid.bearing.magnet.result import Curve, Curves, NonlinearBearingEstimate
 from ambid.report._drawing import BOUND, MEASURED, NORMAL_99, PREDICTED, curve, grid, note
 from ambid.report.numbers import prefixed
 from ambid.validate.nonlinear_bearing import replay
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
 
 _LEVELS = 3  # currents or positions for which a curve is drawn
 _POINTS = 121
@@ -30,22 +30,13 @@ _ROW = 1.5  # height of a record, inches
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingTrace:
-    """One record beside what the model says of it.
-
-    Attributes
-    ----------
-    name : str
-    held : bool
-        Whether the rotor was held, so that its position is not predicted.
-    time_s : ndarray, shape (n_used,), s
-    measured, predicted, sd : ndarray, shape (n_used, 2)
-        Position in m and current in A: measured, predicted from all samples before, and the standard deviation that
-        the predictor expects of the difference; NaN for what is not predicted.
-    """
+    """One record beside what the model says of it."""
 
     name: str
-    held: bool
-    time_s: Array
+    held: bool  # whether the rotor was held, so that its position is not predicted
+    time_s: Array  # (n_used,), s
+    # (n_used, 2), position in m and current in A: measured, predicted from all samples before, and the standard
+    # deviation that the predictor expects of the difference; NaN for what is not predicted
     measured: Array
     predicted: Array
     sd: Array
@@ -53,39 +44,16 @@ class BearingTrace:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingEvidence:
-    """What the figures of a nonlinear bearing show.
-
-    Attributes
-    ----------
-    estimate : NonlinearBearingEstimate
-    traces : tuple of BearingTrace
-        One for each of its records.
-    """
+    """What the figures of a nonlinear bearing show."""
 
     estimate: NonlinearBearingEstimate
-    traces: tuple[BearingTrace, ...]
+    traces: tuple[BearingTrace, ...]  # one for each of its records
 
 
 def bearing_evidence(
     estimate: NonlinearBearingEstimate, records: Sequence[tuple[BearingRecord, float]]
 ) -> BearingEvidence:
-    """Run the records of an estimate through it again.
-
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    records : sequence of (BearingRecord, float)
-        Those that it came from, in its order, each with the time of its first sample in s.
-
-    Returns
-    -------
-    BearingEvidence
-
-    Raises
-    ------
-    EstimationError
-        If they are not the estimate's.
-    """
+    """Run the records of an estimate through it again."""
     traces = []
     for name, (record, start_s) in zip(estimate.noise, records, strict=True):
         run = replay(estimate, record, noise_of=name)
@@ -105,14 +73,7 @@ def bearing_evidence(
 def bearing_overview(evidence: BearingEvidence) -> Figure:
     """Draw all figures on one page.
 
-    Parameters
-    ----------
-    evidence : BearingEvidence
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Curves; where the records were; every record with its one-step errors.
+    Returns curves; where the records were; every record with its one-step errors.
     """
     from matplotlib.figure import Figure
 
@@ -129,14 +90,7 @@ def bearing_overview(evidence: BearingEvidence) -> Figure:
 def bearing_figures(evidence: BearingEvidence) -> dict[str, Figure]:
     """Draw the figures one by one, as a report shows them.
 
-    Parameters
-    ----------
-    evidence : BearingEvidence
-
-    Returns
-    -------
-    dict of str to matplotlib.figure.Figure
-        ``curves``, ``map`` and ``records``.
+    Returns ``curves``, ``map`` and ``records``.
     """
     from matplotlib.figure import Figure
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
+from ambid.bearing.magnet.result import NonlinearBearingEstimate
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.models import model
 from ambid.report.bearing_figure import BearingEvidence, bearing_figures
@@ -34,16 +34,7 @@ _CAPTIONS = {
 def bearing_html(evidence: BearingEvidence, *, made: str = "") -> str:
     """Write the report of an estimate.
 
-    Parameters
-    ----------
-    evidence : BearingEvidence
-    made : str
-        Date of the report, for its provenance; left out where empty.
-
-    Returns
-    -------
-    str
-        HTML; figures are inside it.
+    `made`: date of the report, for its provenance; left out where empty. Returns HTML; figures are inside it.
     """
     return rendered(_content(evidence, made))
 

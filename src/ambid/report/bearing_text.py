@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ambid.identify.estimate import Check
-from ambid.identify.nonlinear_bearing.result import Curve, NonlinearBearingEstimate
+from ambid.bearing.magnet.result import Curve, NonlinearBearingEstimate
+from ambid.estimation.estimate import Check
 from ambid.report.numbers import prefixed, quantity, sized
 from ambid.report.text import (
     WIDTH,
@@ -29,19 +29,8 @@ _UNITS = {"position": "m", "current": "A"}
 def bearing_text(estimate: NonlinearBearingEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write an estimate for people.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, warnings, numbers, curves, delay, fit by record, checks, validation and timing, without a final line
-        feed.
+    `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns header, warnings,
+    numbers, curves, delay, fit by record, checks, validation and timing, without a final line feed.
     """
     blocks = [
         header_lines(estimate, width=width, paint=paint),
@@ -60,18 +49,8 @@ def bearing_text(estimate: NonlinearBearingEstimate, *, width: int = WIDTH, pain
 def header_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Say what was identified from what, and whether the search converged.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        The law and how long the records are; their names, those of a held rotor apart.
+    `width`: columns of the terminal; `paint`: adds colour. Returns the law and how long the records are; their names,
+    those of a held rotor apart.
     """
     records = estimate.records
     seconds = sum(float(str(r["samples"])) / float(str(r["rate_hz"])) for r in records)
@@ -89,16 +68,7 @@ def header_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH, pain
 
 
 def other_warnings(estimate: NonlinearBearingEstimate) -> list[str]:
-    """Return the warnings that say more than the detail of a failed check, which stands with the checks.
-
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-
-    Returns
-    -------
-    list of str
-    """
+    """Return the warnings that say more than the detail of a failed check, which stands with the checks."""
     said = {c.detail for c in estimate.checks.values()}
     return [w for w in estimate.warnings if w not in said]
 
@@ -106,17 +76,8 @@ def other_warnings(estimate: NonlinearBearingEstimate) -> list[str]:
 def curve_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH) -> list[str]:
     """Write k_i, k_x and L over gap and current, each with its standard deviation.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    width : int
-        Columns of the terminal; where they are too few, the middle current stands alone.
-
-    Returns
-    -------
-    list of str
-        A table for each, over positions and currents where the free rotor usually was; * marks points that no record
-        came to.
+    `width`: columns of the terminal; where they are too few, the middle current stands alone. Returns a table for each,
+    over positions and currents where the free rotor usually was; * marks points that no record came to.
     """
     x = np.linspace(*estimate.usual["position"], _POSITIONS)
     i = np.linspace(*estimate.usual["current"], _CURRENTS)
@@ -136,16 +97,7 @@ def curve_rows(
 ) -> list[list[tuple[str, ...]]]:
     """Make tables of k_i, k_x and L over position and current.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    position : ndarray, shape (n_positions,), m
-    current : ndarray, shape (n_currents,), A
-
-    Returns
-    -------
-    list of list of tuple of str
-        Three tables, each with a header.
+    `position`: (n_positions,), m; `current`: (n_currents,), A. Returns three tables, each with a header.
     """
     grid = np.meshgrid(position, current, indexing="ij")
     found = estimate.curves(grid[0].ravel(), grid[1].ravel())
@@ -175,16 +127,7 @@ def _cells(curve: Curve, inside: np.ndarray) -> tuple[list[str], str]:
 
 
 def delay_lines(estimate: NonlinearBearingEstimate) -> list[str]:
-    """Say by how much the voltage is delayed, at each sampling rate.
-
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-
-    Returns
-    -------
-    list of str
-    """
+    """Say by how much the voltage is delayed, at each sampling rate."""
     lines = []
     for rate, d in estimate.delay.items():
         total = d.samples + d.fraction
@@ -198,14 +141,7 @@ def delay_lines(estimate: NonlinearBearingEstimate) -> list[str]:
 def fit_rows(estimate: NonlinearBearingEstimate) -> list[tuple[str, ...]]:
     """Make a table of the one-step fit of each output on each record.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-
-    Returns
-    -------
-    list of tuple of str
-        A header and a row for each record; of a held rotor the position is not predicted.
+    Returns a header and a row for each record; of a held rotor the position is not predicted.
     """
     rows: list[tuple[str, ...]] = [("one-step fit", "position", "innovations", "current", "innovations")]
     for name, fits in estimate.fit.items():
@@ -220,19 +156,8 @@ def fit_rows(estimate: NonlinearBearingEstimate) -> list[tuple[str, ...]]:
 def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write how an estimate does on a further record.
 
-    Parameters
-    ----------
-    validation : Mapping[str, object]
-        As `ambid.validate.nonlinear_bearing.validation` gives it.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        Fits of each output, then the checks.
+    `validation`: as `ambid.validate.nonlinear_bearing.validation` gives it; `width`: columns of the terminal; `paint`:
+    adds colour. Returns fits of each output, then the checks.
     """
     checks = {
         name: Check(passed=bool(c["passed"]), detail=str(c["detail"]), p=c.get("p"))
@@ -248,14 +173,7 @@ def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint
 def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Make a table of the fit of each output on a further record.
 
-    Parameters
-    ----------
-    validation : Mapping[str, object]
-        As `ambid.validate.nonlinear_bearing.validation` gives it.
-
-    Returns
-    -------
-    list of tuple of str
+    `validation`: as `ambid.validate.nonlinear_bearing.validation` gives it.
     """
     rows: list[tuple[str, ...]] = [("fit", "one step", "innovations", "of those at identification")]
     for role, f in validation["fit"].items():

@@ -56,21 +56,8 @@ class StepLike(Protocol):
 def step_text(step: StepLike, number: int, of: int, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a step for people.
 
-    Parameters
-    ----------
-    step : Step
-        Done.
-    number, of : int
-        Which of how many.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Lines without the last line's end.
+    `step`: done; `number`, `of`: which of how many; `width`: columns of the terminal; `paint`: adds colour; the layout
+    does not depend on it. Returns lines without the last line's end.
     """
     mark = paint("✗", "bad") if step.reasons else paint("✓", "good")
     lines = [f"{mark} {number}/{of} {paint(step.name, 'strong')}"]
@@ -83,23 +70,8 @@ def step_text(step: StepLike, number: int, of: int, *, width: int = WIDTH, paint
 def next_text(passed: bool, step: str, number: int, of: int, folder: str, *, width: int = WIDTH) -> str:
     """Say where a commissioning ended, and what to do next.
 
-    Parameters
-    ----------
-    passed : bool
-        Whether it came to its end.
-    step : str
-        The last one.
-    number, of : int
-        Which of how many it is.
-    folder : str
-        Where the files are.
-    width : int
-        Columns of the terminal.
-
-    Returns
-    -------
-    str
-        Lines without the last line's end.
+    `passed`: whether it came to its end; `step`: the last one; `number`, `of`: which of how many it is; `folder`: where
+    the files are; `width`: columns of the terminal. Returns lines without the last line's end.
     """
     if passed:
         said = [

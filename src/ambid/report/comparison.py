@@ -11,19 +11,8 @@ from ambid.validate.comparison import Comparison, Entry
 def text(comparison: Comparison, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a comparison for people, best structure first.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        Any.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, table, what failed, and what the differences mean, without a final line feed.
+    `comparison`: any; `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns
+    header, table, what failed, and what the differences mean, without a final line feed.
     """
     name = comparison.record.get("file") or "record"
     signals = f"{', '.join(comparison.inputs)} → " if comparison.inputs else ""

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.estimate import Estimate
+from ambid.arrays import Array
+from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
 from ambid.report._drawing import (
     BOUND,
@@ -31,25 +31,14 @@ from ambid.validate.second_record import Replay
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evidence:
-    """What the figures of an estimate show beside it.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    run : Replay
-        A record run through the estimate's predictor.
-    start_s : float
-        Time of the record's first sample in s.
-    """
+    """What the figures of an estimate show beside it."""
 
     estimate: Estimate
-    run: Replay
-    start_s: float = 0.0
+    run: Replay  # a record run through the estimate's predictor
+    start_s: float = 0.0  # time of the record's first sample in s
 
     @property
     def rate_hz(self) -> float:
@@ -84,15 +73,7 @@ class Evidence:
 def overview(evidence: Evidence) -> Figure:
     """Draw all figures on one page.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        Estimate and replayed record.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Signals, residuals, Bode and poles, one below the other.
+    `evidence`: estimate and replayed record. Returns signals, residuals, Bode and poles, one below the other.
     """
     from matplotlib.figure import Figure
 
@@ -110,15 +91,7 @@ def overview(evidence: Evidence) -> Figure:
 def figures(evidence: Evidence) -> dict[str, Figure]:
     """Draw the figures one by one, as a report shows them.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        Estimate and replayed record.
-
-    Returns
-    -------
-    dict of str to matplotlib.figure.Figure
-        ``signals``, ``residuals``, ``bode`` and ``poles``.
+    `evidence`: estimate and replayed record. Returns ``signals``, ``residuals``, ``bode`` and ``poles``.
     """
     from matplotlib.figure import Figure
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.response import one_step, simulation
-from ambid.identify.blackbox.spread import pole_covariance, zero_covariance
-from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.response import one_step, simulation
+from ambid.blackbox.spread import pole_covariance, zero_covariance
+from ambid.blackbox.transfer_model import TransferModel
 from ambid.report._drawing import BOUND, MEASURED, PREDICTED, grid, magnitude_axis, phase_axis, pole_region
 from ambid.report._panels import Traces, residuals_panel, signals_panel
 from ambid.report.fit_text import pole_lines
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
 
 _PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
 
@@ -30,15 +29,7 @@ _PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn
 def overview(fit: BlackBoxFit, data: IOData) -> Figure:
     """Draw all figures of a fit on one page.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-        The record that it came from, or another.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
+    `data`: the record that it came from, or another.
     """
     from matplotlib.figure import Figure
 
@@ -61,17 +52,7 @@ def overview(fit: BlackBoxFit, data: IOData) -> Figure:
 
 
 def traces_of(fit: BlackBoxFit, data: IOData) -> Traces:
-    """Run a record through a fit.
-
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-
-    Returns
-    -------
-    Traces
-    """
+    """Run a record through a fit."""
     model = innovations_form(fit)
     return Traces(
         time_s=np.arange(data.n_samples, dtype=np.float64) * data.dt,
@@ -87,16 +68,7 @@ def traces_of(fit: BlackBoxFit, data: IOData) -> Traces:
 def responses(fit: BlackBoxFit, n_frequencies: int = 600) -> tuple[Response, ...]:
     """Compute the frequency response of every pair with its uncertainty, up to half the sampling rate.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    n_frequencies : int
-        Spaced evenly in the logarithm, with more points at lightly damped poles.
-
-    Returns
-    -------
-    tuple of Response
-        Output by output.
+    `n_frequencies`: spaced evenly in the logarithm, with more points at lightly damped poles. Returns output by output.
     """
     frequency = _frequencies(fit, n_frequencies)
     omega = 2 * np.pi * frequency

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.spread import pole_covariance
-from ambid.identify.blackbox.structures import structure
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.spread import pole_covariance
+from ambid.blackbox.structures import structure
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain, timing_line, warning_lines
 
 if TYPE_CHECKING:
-    from ambid.identify.physical import PhysicalFit
+    from ambid.bearing.physical import PhysicalFit
 
 _SHOWN = 24  # coefficients that a terminal shows; the file has all
 
@@ -23,18 +23,8 @@ _SHOWN = 24  # coefficients that a terminal shows; the file has all
 def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a fit for people.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, coefficients, poles, fit, validation, criteria, checks, warnings and timing, without a final line feed.
+    `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns header,
+    coefficients, poles, fit, validation, criteria, checks, warnings and timing, without a final line feed.
     """
     blocks = [
         _header(fit, width, paint),
@@ -53,18 +43,8 @@ def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> s
 def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write the physical parameters that follow from a fit.
 
-    Parameters
-    ----------
-    found : PhysicalFit
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    str
-        Parameters, delay, whether the fit can be this physics, and warnings, without a final line feed.
+    `width`: columns of the terminal; `paint`: adds colour. Returns parameters, delay, whether the fit can be this
+    physics, and warnings, without a final line feed.
     """
     d = found.delay
     total = d.samples + d.fraction
@@ -98,16 +78,7 @@ def _order(value: int | tuple[int, ...]) -> str:
 
 
 def coefficient_lines(fit: BlackBoxFit) -> list[str]:
-    """Write the coefficients that are not fixed by the structure, each with its standard deviation.
-
-    Parameters
-    ----------
-    fit : BlackBoxFit
-
-    Returns
-    -------
-    list of str
-    """
+    """Write the coefficients that are not fixed by the structure, each with its standard deviation."""
     theta, sd = fit.model.theta, fit.sd
     free = np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0]
     rows = [
@@ -138,15 +109,7 @@ def _coefficient(value: float, sd: float) -> str:
 def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
     """Write the poles with frequency, damping and standard deviation, one of each pair.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
+    `paint`: adds colour.
     """
     poles, discrete = fit.model.poles(), fit.model.dt is not None
     shown = [k for k in range(poles.size) if poles[k].imag >= 0][: _SHOWN // 2]
@@ -187,15 +150,8 @@ def _simulation(fit: float | None) -> str:
 def validation_lines(validation: Mapping[str, Any]) -> list[str]:
     """Write how a fit does on a second record.
 
-    Parameters
-    ----------
-    validation : Mapping[str, object]
-        By output, as `ambid.validate.blackbox.validation` gives it.
-
-    Returns
-    -------
-    list of str
-        A header and a line for each output; errors in SI.
+    `validation`: by output, as `ambid.validate.blackbox.validation` gives it. Returns a header and a line for each
+    output; errors in SI.
     """
     rows = [("fit", "one step", "rmse", "simulation", "rmse")]
     for output, found in validation.items():

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.frequency.measured import Measured, ModelResponse, model_responses
+from ambid.arrays import Array
+from ambid.blackbox.frequency.measured import Measured, ModelResponse, model_responses
 from ambid.report._drawing import BAND, BOUND, MEASURED, PREDICTED, grid, magnitude_axis, phase_axis, unwrapped
 from ambid.report.frf_text import response_unit
 from ambid.report.response import Response
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _PAIRS = 6  # diagrams beside each other; of more pairs the first are drawn, and the title says so
 _NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
@@ -28,16 +28,7 @@ _GRID = 800  # frequencies at which a model is drawn
 
 
 def figure(measured: Measured) -> Figure:
-    """Draw magnitude and phase of every pair.
-
-    Parameters
-    ----------
-    measured : Measured
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Draw magnitude and phase of every pair."""
     from matplotlib.figure import Figure
 
     frf = measured.response

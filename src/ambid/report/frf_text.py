@@ -7,22 +7,21 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.model import BlackBoxModel
-from ambid.identify.blackbox.structures import any_structure
-from ambid.identify.blackbox.transfer_model import TransferModel
-from ambid.identify.frequency.measured import Measured
+from ambid.arrays import Array
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.frequency.measured import Measured
+from ambid.blackbox.model import BlackBoxModel
+from ambid.blackbox.structures import any_structure
+from ambid.blackbox.transfer_model import TransferModel
 from ambid.report.fit_text import coefficient_lines, pole_lines
 from ambid.report.numbers import prefixed, quantity, sized
 from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain, timing_line, warning_lines
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
-    from ambid.identify.frequency.physical_estimate import FrequencyEstimate
+    from ambid.blackbox.frequency.physical_estimate import FrequencyEstimate
 
-Array = NDArray[np.float64]
 
 _SHOWN = 8  # singular values that a line has room for
 
@@ -30,19 +29,8 @@ _SHOWN = 8  # singular values that a line has room for
 def frf_text(measured: Measured, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a measured response for people.
 
-    Parameters
-    ----------
-    measured : Measured
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, table of the pairs, distortion levels, fit, physical parameters, warnings and timing, without a final
-        line feed.
+    `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns header, table of
+    the pairs, distortion levels, fit, physical parameters, warnings and timing, without a final line feed.
     """
     fit, estimate = measured.fit, measured.estimate
     blocks = [
@@ -82,16 +70,8 @@ def _periods(details: Any) -> str:
 def pair_lines(measured: Measured, *, width: int = WIDTH) -> list[str]:
     """Write size and quality of the response of every pair.
 
-    Parameters
-    ----------
-    measured : Measured
-    width : int
-        Columns of the terminal; where they are too few, the range of the magnitude is left out, then names stand apart.
-
-    Returns
-    -------
-    list of str
-        A header, a line for each pair and what the columns are: medians over the lines, in percent of the magnitude.
+    Returns a header, a line for each pair and what the columns are: medians over the lines, in percent of the
+    magnitude.
     """
     frf, noise, distortion = measured.response, measured.response.noise_sd, measured.distortion_sd
     size = frf.magnitude
@@ -124,15 +104,7 @@ def pair_lines(measured: Measured, *, width: int = WIDTH) -> list[str]:
 def response_unit(units: Any, output: str, source: str) -> str:
     """Return the unit of a response, such as ``"m/V"``.
 
-    Parameters
-    ----------
-    units : Mapping[str, str]
-        By name; a name that is missing has an unknown unit.
-    output, source : str
-
-    Returns
-    -------
-    str
+    `units`: by name; a name that is missing has an unknown unit.
     """
     above, below = str(units.get(output, UNKNOWN)), str(units.get(source, UNKNOWN))
     if above == below:
@@ -253,14 +225,7 @@ def _estimate_lines(estimate: FrequencyEstimate, width: int, paint: Paint) -> li
 def warnings_of(measured: Measured) -> list[str]:
     """Return all warnings, each once, without what only repeats a failed check.
 
-    Parameters
-    ----------
-    measured : Measured
-
-    Returns
-    -------
-    list of str
-        Those of the response first, as all that follows rests on it.
+    Returns those of the response first, as all that follows rests on it.
     """
     found = [*measured.response.warnings]
     for x in (measured.fit, measured.estimate):

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.report._drawing import BAND, MEASURED, grid
 from ambid.report._panels import Traces, residuals_panel, signals_panel
 from ambid.report.nonlinear_panels import (
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
 
 _ACROSS = 5  # correlations beside each other
 _MOST = 20
@@ -40,23 +38,7 @@ _RECORDS = 6  # that are drawn
 def nonlinear_overview(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None = None) -> Figure:
     """Draw all figures of a nonlinear fit on one page.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With a model.
-    records : sequence of IOData
-        What it was fitted to; the first six are drawn, all of them are in the correlations.
-    second : IOData, optional
-        A further record that it was judged on.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    EstimationError
-        If the fit has failed, a record does not belong to it, or there is none.
+    `fit`: with a model; `second`: a further record that it was judged on.
     """
     from matplotlib.figure import Figure
 
@@ -120,15 +102,7 @@ def _signals(panels: list[Panel]) -> list[tuple[float, Any]]:
 def traces_of(fit: NonlinearFit, data: IOData) -> Traces:
     """Run a record through a fit, without the samples at the start that are not predicted.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    data : IOData
-
-    Returns
-    -------
-    Traces
-        No simulation where it diverges, or without inputs.
+    Returns no simulation where it diverges, or without inputs.
     """
     found = run(fit, data)
     first = found.lag
@@ -147,15 +121,7 @@ def traces_of(fit: NonlinearFit, data: IOData) -> Traces:
 def correlations_of(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correlation]:
     """Correlate the errors with what the residual tests look at.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    records : sequence of IOData
-
-    Returns
-    -------
-    list of Correlation
-        Over all records; empty where they are too short, or errors are not finite.
+    Returns over all records; empty where they are too short, or errors are not finite.
     """
     found = [run(fit, x) for x in records]
     if not all(x.finite for x in found):

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.report._drawing import (
     BAND,
     BOUND,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-Array = NDArray[np.float64]
 
 MOST_COEFFICIENTS = 25
 _ROWS = 13  # of coefficients below each other
@@ -41,51 +41,26 @@ _LEAD = 500  # samples in which derivatives that are recursions settle
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Panel:
-    """One record as it is drawn.
-
-    Attributes
-    ----------
-    title : str
-    traces : Traces
-    second : bool
-        Whether the fit has not seen it.
-    """
+    """One record as it is drawn."""
 
     title: str
     traces: Traces
-    second: bool = False
+    second: bool = False  # whether the fit has not seen it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bars:
-    """Coefficients as they are drawn, the most significant first.
-
-    Attributes
-    ----------
-    names : tuple of str
-    theta, half_width : ndarray, shape (n_shown,), SI
-        Values, and half of their 95 % intervals.
-    n_more : int
-        Coefficients that are not shown.
-    n_others : int
-        Estimated numbers that are no coefficients: weights of a network.
-    """
+    """Coefficients as they are drawn, the most significant first."""
 
     names: tuple[str, ...]
-    theta: Array
+    theta: Array  # (n_shown,), SI, values, and half of their 95 % intervals
     half_width: Array
-    n_more: int
-    n_others: int
+    n_more: int  # coefficients that are not shown
+    n_others: int  # estimated numbers that are no coefficients: weights of a network
 
 
 def records_panel(figure: Figure | SubFigure, panels: Sequence[Panel]) -> None:
-    """Draw several records beside each other, each output with its errors below.
-
-    Parameters
-    ----------
-    figure : matplotlib Figure or SubFigure
-    panels : sequence of Panel
-    """
+    """Draw several records beside each other, each output with its errors below."""
     across = columns_of(len(panels))
     n_y, down = len(panels[0].traces.names), -(-len(panels) // across)
     axes = figure.subplots(2 * n_y * down, across, squeeze=False, height_ratios=(1.7, 1.0) * (n_y * down))
@@ -101,16 +76,7 @@ def records_panel(figure: Figure | SubFigure, panels: Sequence[Panel]) -> None:
 
 
 def columns_of(n_panels: int) -> int:
-    """Return how many records stand beside each other.
-
-    Parameters
-    ----------
-    n_panels : int
-
-    Returns
-    -------
-    int
-    """
+    """Return how many records stand beside each other."""
     return n_panels if n_panels <= 3 else 2 if n_panels == 4 else 3
 
 
@@ -156,15 +122,8 @@ def _limits(y: Array, free: Array) -> tuple[float, float]:
 def bars_of(fit: NonlinearFit) -> Bars | None:
     """Return the coefficients that are worth a bar each.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-
-    Returns
-    -------
-    Bars or None
-        None where there are no standard deviations, or the numbers say nothing one by one: more than 25 that are not
-        named after terms, or weights of a network. Of a model with terms only these are shown.
+    Returns none where there are no standard deviations, or the numbers say nothing one by one: more than 25 that are
+    not named after terms, or weights of a network. Of a model with terms only these are shown.
     """
     sd, model = fit.sd, fit.model
     if sd is None or model is None:
@@ -191,15 +150,7 @@ def bars_of(fit: NonlinearFit) -> Bars | None:
 def term_names(fit: NonlinearFit) -> set[str]:
     """Return the names of the parameters that belong to chosen terms.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With a model.
-
-    Returns
-    -------
-    set of str
-        Empty for a structure without terms.
+    `fit`: with a model. Returns empty for a structure without terms.
     """
     terms = fit.details.get("terms")
     if not isinstance(terms, Mapping) or fit.model is None:
@@ -215,27 +166,12 @@ def term_names(fit: NonlinearFit) -> set[str]:
 
 
 def bars_height(bars: Bars) -> float:
-    """Return the height of `bars_panel` in inches.
-
-    Parameters
-    ----------
-    bars : Bars
-
-    Returns
-    -------
-    float
-    """
+    """Return the height of `bars_panel` in inches."""
     return 1.1 + 0.21 * min(len(bars.names), _ROWS)
 
 
 def bars_panel(figure: Figure | SubFigure, bars: Bars) -> None:
-    """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude.
-
-    Parameters
-    ----------
-    figure : matplotlib Figure or SubFigure
-    bars : Bars
-    """
+    """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude."""
     columns = -(-len(bars.names) // _ROWS)
     per = -(-len(bars.names) // columns)
     axes = figure.subplots(1, columns, squeeze=False)[0]
@@ -266,14 +202,7 @@ def _bars(axes: Axes, bars: Bars, part: slice, rows: int) -> None:
 def band_panel(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, where: str) -> None:
     """Draw the predicted outputs with their 95 % bands, where the errors are largest.
 
-    Parameters
-    ----------
-    figure : matplotlib Figure or SubFigure
-    fit : NonlinearFit
-        With a covariance.
-    data : IOData
-    where : str
-        Which record it is, for the title.
+    `fit`: with a covariance; `where`: which record it is, for the title.
     """
     model = model_of(fit, data)
     predicted = model.predict(data.u, data.y)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.numbers import quantity
 from ambid.report.text import columns
 
@@ -26,15 +26,8 @@ _SOURCES = {
 def parameter_table(fit: NonlinearFit) -> list[str]:
     """Write what a user wants of a model's numbers, and where their standard deviations come from.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-
-    Returns
-    -------
-    list of str
-        Terms with their error reduction ratios; the poles of a model with a schedule along it; parameters with names,
-        if they are no more than twenty; of a network how many numbers it has. Empty for a failed fit.
+    Returns terms with their error reduction ratios; the poles of a model with a schedule along it; parameters with
+    names, if they are no more than twenty; of a network how many numbers it has. Empty for a failed fit.
     """
     if fit.model is None:
         return []
@@ -48,16 +41,7 @@ def parameter_table(fit: NonlinearFit) -> list[str]:
 
 
 def is_weight(name: str) -> bool:
-    """Return whether a parameter is a weight of a network's unit, which says nothing by itself.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether a parameter is a weight of a network's unit, which says nothing by itself."""
     return _WEIGHT.search(name) is not None
 
 
@@ -79,16 +63,8 @@ def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
 def term_lines(fit: NonlinearFit) -> list[str]:
     """Write the first terms with coefficient, standard deviation and error reduction ratio.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With ``terms`` in its details.
-
-    Returns
-    -------
-    list of str
-        A header and a line for each term, in the order of choice; ratios in percent of the output's energy, where there
-        are any. Weights of a network beside them are counted.
+    `fit`: with ``terms`` in its details. Returns a header and a line for each term, in the order of choice; ratios in
+    percent of the output's energy, where there are any. Weights of a network beside them are counted.
     """
     assert fit.model is not None
     several, terms = len(fit.outputs) > 1, fit.details["terms"]
@@ -112,15 +88,7 @@ def term_lines(fit: NonlinearFit) -> list[str]:
 def named_lines(fit: NonlinearFit) -> list[str]:
     """Write parameters that have a meaning of their own.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With a model.
-
-    Returns
-    -------
-    list of str
-        A header and a line each; empty for a network with weights, and for more than twenty.
+    `fit`: with a model. Returns a header and a line each; empty for a network with weights, and for more than twenty.
     """
     assert fit.model is not None
     sd = fit.sd
@@ -133,16 +101,8 @@ def named_lines(fit: NonlinearFit) -> list[str]:
 def schedule_lines(fit: NonlinearFit) -> list[str]:
     """Write what a model with a schedule is where the schedule stands still: at its ends and in the middle.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With ``schedule`` and ``frozen`` in its details.
-
-    Returns
-    -------
-    list of str
-        What the schedule is, then a header and a line for each place: poles in rad/s, gains at 0 Hz in SI, ± standard
-        deviations.
+    `fit`: with ``schedule`` and ``frozen`` in its details. Returns what the schedule is, then a header and a line for
+    each place: poles in rad/s, gains at 0 Hz in SI, ± standard deviations.
     """
     schedule, table = fit.details["schedule"], fit.details.get("frozen")
     assert isinstance(schedule, Mapping)
@@ -198,15 +158,7 @@ def _percent(err: object) -> str:
 def coefficient_text(value: float, sd: float | None) -> str:
     """Write value ± sd; in a power of ten where decimals would be too many to read.
 
-    Parameters
-    ----------
-    value : float
-    sd : float or None
-        Standard deviation, or another spread.
-
-    Returns
-    -------
-    str
+    `sd`: standard deviation, or another spread.
     """
     largest = max(abs(value), sd or 0.0)
     exponent = int(np.floor(np.log10(largest))) if largest else 0

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ambid.identify.nonlinear.fit import LearningCurve, NonlinearFit
-from ambid.identify.nonlinear.structures import nonlinear_structure
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.structures import nonlinear_structure
 from ambid.report.fit_text import validation_lines
 from ambid.report.nonlinear_parameters import parameter_table
 from ambid.report.numbers import sized
@@ -21,19 +21,9 @@ _CURVES = 6  # learning curves that a terminal shows
 def nonlinear_text(fit: NonlinearFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a nonlinear fit for people.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, settings, terms or sizes, fit, validation, criteria, learning curves, checks, warnings and timing,
-        without a final line feed. Of a failed fit: header, settings, reason.
+    `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns header, settings,
+    terms or sizes, fit, validation, criteria, learning curves, checks, warnings and timing, without a final line feed.
+    Of a failed fit: header, settings, reason.
     """
     blocks = [
         _header(fit, width, paint),
@@ -70,15 +60,7 @@ def _header(fit: NonlinearFit, width: int, paint: Paint) -> list[str]:
 def setting_text(value: object) -> str:
     """Write a setting as the command line takes it.
 
-    Parameters
-    ----------
-    value : object
-        A number, a word or several numbers.
-
-    Returns
-    -------
-    str
-        Several with a slash between.
+    `value`: a number, a word or several numbers. Returns several with a slash between.
     """
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "/".join(map(str, value))
@@ -100,15 +82,8 @@ def _validation(found: Mapping[str, Any], paint: Paint) -> list[str]:
 def second_record_lines(found: Mapping[str, Any]) -> list[str]:
     """Write how a nonlinear fit does on a second record.
 
-    Parameters
-    ----------
-    found : Mapping[str, object]
-        As `ambid.validate.nonlinear.validation` gives it.
-
-    Returns
-    -------
-    list of str
-        A header, a line for each output, and which part is extrapolated; errors in SI.
+    `found`: as `ambid.validate.nonlinear.validation` gives it. Returns a header, a line for each output, and which part
+    is extrapolated; errors in SI.
     """
     share = float(next(iter(found.values()))["extrapolated"])
     return [*validation_lines(found), f"outside the training data: {100 * share:.2g} % of it"]
@@ -124,14 +99,7 @@ def _criteria_lines(fit: NonlinearFit, width: int) -> list[str]:
 def curve_lines(curves: Sequence[LearningCurve]) -> list[str]:
     """Say in a line each how the trainings went.
 
-    Parameters
-    ----------
-    curves : sequence of LearningCurve
-
-    Returns
-    -------
-    list of str
-        Of many the first and the last ones, and how many stand between.
+    Returns of many the first and the last ones, and how many stand between.
     """
     said = [curve_line(c) for c in curves]
     between = len(said) - _CURVES
@@ -143,14 +111,7 @@ def curve_lines(curves: Sequence[LearningCurve]) -> list[str]:
 def curve_line(curve: LearningCurve) -> str:
     """Say in one line how a training went.
 
-    Parameters
-    ----------
-    curve : LearningCurve
-
-    Returns
-    -------
-    str
-        Method, iterations, time, errors at begin and end in multiples of the outputs' standard deviations.
+    Returns method, iterations, time, errors at begin and end in multiples of the outputs' standard deviations.
     """
     if not curve.training.size:
         return f"{curve.method}: no iterations"

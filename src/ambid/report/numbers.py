@@ -12,25 +12,16 @@ _LOST = 1e4  # standard deviation over value from which a number says nothing
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantity:
-    """A number made ready for print.
+    """A number made ready for print."""
 
-    Attributes
-    ----------
-    value, sd, low, high : str
-        Value, standard deviation (empty where it is zero) and the ends of the interval, all in `unit` and with the same
-        number of decimals.
-    unit : str
-        With its prefix, e.g. ``"mH"``.
-    si : str
-        The value in the SI unit, with as many digits as its uncertainty leaves.
-    """
-
+    # value, standard deviation (empty where it is zero) and the ends of the interval, all in `unit` and with the same
+    # number of decimals
     value: str
     sd: str
     low: str
     high: str
-    unit: str
-    si: str
+    unit: str  # with its prefix, e.g. ``"mH"``.
+    si: str  # the value in the SI unit, with as many digits as its uncertainty leaves
 
     @property
     def text(self) -> str:
@@ -42,19 +33,8 @@ class Quantity:
 def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | None = None) -> Quantity:
     """Make a number and its standard deviation ready for print: two digits of the sd, and as many decimals for all.
 
-    Parameters
-    ----------
-    value, sd : float
-        In `unit`; `sd` is 0 for a number that is known exactly.
-    unit : str
-        SI unit.
-    ci95 : (float, float), optional
-        Interval, in `unit`.
-
-    Returns
-    -------
-    Quantity
-        In the prefix in which the larger of value and sd lies between 1 and 1000.
+    `value`, `sd`: in `unit`; `sd` is 0 for a number that is known exactly; `unit`: SI unit; `ci95`: interval, in
+    `unit`. Returns in the prefix in which the larger of value and sd lies between 1 and 1000.
     """
     lost = not math.isfinite(sd) or sd > _LOST * abs(value) > 0
     if sd == 0 or lost:  # known exactly, or not at all: digits of the value alone
@@ -81,19 +61,8 @@ def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | 
 def prefixed(size: float, unit: str) -> tuple[float, str]:
     """Choose the prefix in which a size lies between 1 and 1000.
 
-    Parameters
-    ----------
-    size : float
-        In `unit`; its sign does not matter.
-    unit : str
-        SI unit.
-
-    Returns
-    -------
-    scale : float
-        Value in `unit` of one of the returned unit.
-    text : str
-        The unit with its prefix; kilograms become grams below one.
+    `size`: in `unit`; its sign does not matter; `unit`: SI unit. Returns `scale`: value in `unit` of one of the
+    returned unit; `text`: the unit with its prefix; kilograms become grams below one.
     """
     first, rest = _first_symbol(unit)
     if size == 0 or not math.isfinite(size) or first in _UNPREFIXED:
@@ -110,19 +79,7 @@ def prefixed(size: float, unit: str) -> tuple[float, str]:
 def si_text(value: float, digits: int, unit: str) -> str:
     """Write a value in its SI unit.
 
-    Parameters
-    ----------
-    value : float
-        In `unit`.
-    digits : int
-        Significant digits.
-    unit : str
-        SI unit.
-
-    Returns
-    -------
-    str
-        Such as ``"-1.287e5 N/m"``.
+    `value`: in `unit`; `digits`: significant digits; `unit`: SI unit. Returns such as ``"-1.287e5 N/m"``.
     """
     size = math.floor(math.log10(abs(value))) if value else 0
     if -3 <= size <= 5:
@@ -135,19 +92,7 @@ def si_text(value: float, digits: int, unit: str) -> str:
 def sized(value: float, unit: str, digits: int = 3) -> str:
     """Write one number with a prefix, without uncertainty.
 
-    Parameters
-    ----------
-    value : float
-        In `unit`.
-    unit : str
-        SI unit.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-        Such as ``"104 nm"``.
+    `value`: in `unit`; `unit`: SI unit; `digits`: significant digits. Returns such as ``"104 nm"``.
     """
     scale, shown = prefixed(float(f"{value:.{digits}g}"), unit)
     return f"{value / scale:.{digits}g} {shown}"

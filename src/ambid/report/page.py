@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.estimate import Estimate, EstimatedParameter
+from ambid.estimation.estimate import Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.figures import Evidence, figures, save
 from ambid.report.numbers import quantity
@@ -42,17 +42,8 @@ _LIBRARIES = ("ambid", "numpy", "scipy", "numba")
 def report_html(evidence: Evidence, *, made: str = "") -> str:
     """Write the report of an estimate.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        Estimate and the replayed record it came from.
-    made : str
-        Date of the report, for its provenance; left out where empty.
-
-    Returns
-    -------
-    str
-        HTML; figures are inside it.
+    `evidence`: estimate and the replayed record it came from; `made`: date of the report, for its provenance; left out
+    where empty. Returns HTML; figures are inside it.
     """
     return rendered(_content(evidence, made))
 
@@ -60,15 +51,7 @@ def report_html(evidence: Evidence, *, made: str = "") -> str:
 def rendered(content: Mapping[str, Any]) -> str:
     """Fill the page.
 
-    Parameters
-    ----------
-    content : Mapping[str, object]
-        What its template names.
-
-    Returns
-    -------
-    str
-        HTML; texts are escaped.
+    `content`: what its template names. Returns HTML; texts are escaped.
     """
     from jinja2 import Environment, StrictUndefined
 
@@ -108,18 +91,8 @@ def parameter_cells(
 ) -> list[dict[str, str]]:
     """Make the rows of the table of parameters.
 
-    Parameters
-    ----------
-    parameters : sequence of EstimatedParameter
-    meaning : Mapping[str, str]
-        What each is, in a line.
-    finished : bool
-        Whether the search converged.
-
-    Returns
-    -------
-    list of dict
-        ``name``, ``meaning``, ``text``, ``interval``, ``si``, ``verdict`` and ``style`` of each.
+    `meaning`: what each is, in a line; `finished`: whether the search converged. Returns ``name``, ``meaning``,
+    ``text``, ``interval``, ``si``, ``verdict`` and ``style`` of each.
     """
     rows = []
     for p in parameters:
@@ -136,13 +109,7 @@ def parameter_cells(
 def correlations(covariance: NDArray[np.float64]) -> list[list[str]]:
     """Write a covariance as correlations.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, n)
-
-    Returns
-    -------
-    list of list of str
+    `covariance`: (n, n).
     """
     sd = np.sqrt(np.diag(covariance))
     return [[f"{x:.3f}" for x in row] for row in covariance / np.outer(sd, sd)]
@@ -156,16 +123,7 @@ def _validation(validation: Mapping[str, Any]) -> dict[str, Any]:
 def embedded(drawn: Mapping[str, Figure], captions: Mapping[str, tuple[str, str]]) -> list[dict[str, str]]:
     """Put figures into the page.
 
-    Parameters
-    ----------
-    drawn : Mapping[str, matplotlib.figure.Figure]
-    captions : Mapping[str, (str, str)]
-        Title and caption of each.
-
-    Returns
-    -------
-    list of dict
-        ``title``, ``caption`` and ``png`` of each.
+    `captions`: title and caption of each. Returns ``title``, ``caption`` and ``png`` of each.
     """
     found = []
     for name, figure in drawn.items():
@@ -177,12 +135,7 @@ def embedded(drawn: Mapping[str, Figure], captions: Mapping[str, tuple[str, str]
 
 
 def library_versions() -> str:
-    """Name the libraries that a result hangs on, with their versions.
-
-    Returns
-    -------
-    str
-    """
+    """Name the libraries that a result hangs on, with their versions."""
     return ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
 
 

@@ -21,19 +21,8 @@ _LONGEST = 100_000  # samples from which the order of excitation is told
 def record_text(record: Record, *, inputs: Sequence[str] = (), paint: Paint = plain) -> str:
     """Describe a record.
 
-    Parameters
-    ----------
-    record : Record
-        Any.
-    inputs : sequence of str
-        Channels that drive the others; their part of the others is then not counted as noise.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    str
-        Header, table of the channels, a sentence for each thing found, and the history.
+    `record`: any; `paint`: adds colour. Returns header, table of the channels, a sentence for each thing found, and the
+    history.
     """
     name = record.provenance.get("file", "record")
     head = (

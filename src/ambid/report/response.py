@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.estimate import Estimate
+from ambid.arrays import Array
+from ambid.estimation.estimate import Estimate
 from ambid.physics.linear_model import StateSpace
 from ambid.physics.models import model
-
-Array = NDArray[np.float64]
 
 _LOWEST_HZ = 0.1
 _DEFECTIVE = 1e-6  # |wᴴ v| of unit vectors under which a pole counts as multiple: its derivative does not exist
@@ -24,57 +23,30 @@ _DEFECTIVE = 1e-6  # |wᴴ v| of unit vectors under which a pole counts as multi
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Response:
-    """Frequency response from one input to one output.
+    """Frequency response from one input to one output."""
 
-    Attributes
-    ----------
-    source, output : str
-        Roles.
-    frequency_hz : ndarray, shape (n_frequencies,), Hz
-    value : ndarray, shape (n_frequencies,), complex, output unit per input unit
-    log_sd : ndarray, shape (n_frequencies,), dimensionless
-        Standard deviation of the natural logarithm of the magnitude.
-    phase_sd : ndarray, shape (n_frequencies,), rad
-        Standard deviation of the phase.
-    """
-
-    source: str
+    source: str  # roles
     output: str
-    frequency_hz: Array
-    value: NDArray[np.complex128]
-    log_sd: Array
-    phase_sd: Array
+    frequency_hz: Array  # (n_frequencies,), Hz
+    value: NDArray[np.complex128]  # (n_frequencies,), complex, output unit per input unit
+    log_sd: Array  # (n_frequencies,), dimensionless, standard deviation of the natural logarithm of the magnitude
+    phase_sd: Array  # (n_frequencies,), rad, standard deviation of the phase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pole:
-    """A pole of the identified plant.
-
-    Attributes
-    ----------
-    value : complex, rad/s
-    covariance : ndarray, shape (2, 2), (rad/s)^2, or None
-        Of its real and imaginary part; None for a multiple pole.
-    """
+    """A pole of the identified plant."""
 
     value: complex
-    covariance: Array | None
+    covariance: Array | None  # (2, 2), (rad/s)^2, or None, of its real and imaginary part; None for a multiple pole
 
 
 def responses(estimate: Estimate, *, n_frequencies: int = 600) -> tuple[Response, ...]:
     """Compute the frequency response from the input to every output, from 0.1 Hz to half the sampling rate.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Its continuous-time plant; the delay of the input is not in it.
-    n_frequencies : int
-        Spaced evenly in the logarithm, with more points at lightly damped poles.
-
-    Returns
-    -------
-    tuple of Response
-        In the order of the model's outputs, for each of its inputs.
+    `estimate`: its continuous-time plant; the delay of the input is not in it; `n_frequencies`: spaced evenly in the
+    logarithm, with more points at lightly damped poles. Returns in the order of the model's outputs, for each of its
+    inputs.
     """
     plant = model(estimate.model)
     space = plant.matrices(estimate.values)
@@ -105,17 +77,8 @@ def responses(estimate: Estimate, *, n_frequencies: int = 600) -> tuple[Response
 def frequency_grid(estimate: Estimate, n_frequencies: int = 600) -> Array:
     """Return frequencies from 0.1 Hz to half the sampling rate that do not miss a resonance.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Gives the rate and the poles.
-    n_frequencies : int
-        Spaced evenly in the logarithm.
-
-    Returns
-    -------
-    ndarray, shape (n_frequencies + 41 n_resonances,), Hz
-        In rising order.
+    `estimate`: gives the rate and the poles; `n_frequencies`: spaced evenly in the logarithm. Returns (n_frequencies +
+    41 n_resonances,), Hz, in rising order.
     """
     nyquist = 0.5 * float(str(estimate.record["rate_hz"]))
     grid = [np.geomspace(min(_LOWEST_HZ, 0.01 * nyquist), nyquist, n_frequencies)]
@@ -129,15 +92,7 @@ def frequency_grid(estimate: Estimate, n_frequencies: int = 600) -> Array:
 def poles(estimate: Estimate) -> tuple[Pole, ...]:
     """Compute the poles of the identified plant with the covariance of their real and imaginary parts.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-
-    Returns
-    -------
-    tuple of Pole
-        Sorted by real part, the slowest last.
+    `estimate`: any. Returns sorted by real part, the slowest last.
     """
     plant = model(estimate.model)
     space = plant.matrices(estimate.values)

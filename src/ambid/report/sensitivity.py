@@ -16,18 +16,8 @@ _SHOWN = 24
 def sensitivity_text(found: SensitivityAnalysis, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a sensitivity analysis for people.
 
-    Parameters
-    ----------
-    found : SensitivityAnalysis
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    str
-        A line for each number, those that matter most to the fit first; which belong together; what is seen least.
+    `width`: columns of the terminal; `paint`: adds colour. Returns a line for each number, those that matter most to
+    the fit first; which belong together; what is seen least.
     """
     rows = [("", "value ± sd", "fit alone", "fit free", "poles", "response")]
     for x in found.influences[:_SHOWN]:

@@ -20,15 +20,8 @@ _WIDE = 100.0  # largest over smallest frequency from which the axis is logarith
 def stabilisation_figure(found: Stabilisation) -> Figure:
     """Draw a stabilisation diagram.
 
-    Parameters
-    ----------
-    found : Stabilisation
-        Any.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Poles by order over frequency, above them damping over frequency, beside them the singular values.
+    `found`: any. Returns poles by order over frequency, above them damping over frequency, beside them the singular
+    values.
     """
     from matplotlib.figure import Figure
 

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
-from ambid.identify.estimate import Check, Estimate, EstimatedParameter
+from ambid.estimation.estimate import Check, Estimate, EstimatedParameter
 from ambid.physics.models import model
 from ambid.report.numbers import Quantity, quantity, sized
 
@@ -17,12 +17,7 @@ WIDTH = 80
 
 
 class Parameters(Protocol):
-    """Anything that has estimated parameters.
-
-    Attributes
-    ----------
-    parameters : tuple of EstimatedParameter
-    """
+    """Anything that has estimated parameters."""
 
     @property
     def parameters(self) -> tuple[EstimatedParameter, ...]: ...  # noqa: D102
@@ -31,17 +26,7 @@ class Parameters(Protocol):
 def plain(text: str, style: Style) -> str:
     """Return a text without any colour; the default way of painting.
 
-    Parameters
-    ----------
-    text : str
-        Anything.
-    style : {"good", "bad", "dim", "strong"}
-        Not used.
-
-    Returns
-    -------
-    str
-        `text`.
+    `text`: anything; `style`: not used. Returns `text`.
     """
     del style
     return text
@@ -50,19 +35,8 @@ def plain(text: str, style: Style) -> str:
 def estimate_text(estimate: Estimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write an estimate for people.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Header, parameters, delay, fit, checks, validation, warnings and timing, without a final line feed.
+    `estimate`: any; `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns
+    header, parameters, delay, fit, checks, validation, warnings and timing, without a final line feed.
     """
     blocks = [
         [header_line(estimate, paint)],
@@ -80,17 +54,7 @@ def estimate_text(estimate: Estimate, *, width: int = WIDTH, paint: Paint = plai
 def header_line(estimate: Estimate, paint: Paint = plain) -> str:
     """Say what was identified from what, and whether the search converged.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    str
-        One line.
+    `estimate`: any; `paint`: adds colour. Returns one line.
     """
     record = estimate.record
     name = record.get("file") or "record"
@@ -107,21 +71,8 @@ def parameter_lines(
 ) -> list[str]:
     """Write the table of the parameters.
 
-    Parameters
-    ----------
-    estimate : Parameters
-        Anything that has estimated parameters.
-    width : int
-        Columns of the terminal; where they are too few, the column of SI values is left out.
-    paint : callable
-        Adds colour.
-    finished : bool
-        Whether the search converged: otherwise nothing is called identified.
-
-    Returns
-    -------
-    list of str
-        A header and a line for each parameter.
+    `estimate`: anything that has estimated parameters; `paint`: adds colour; `finished`: whether the search converged:
+    otherwise nothing is called identified. Returns a header and a line for each parameter.
     """
     shown = [quantity(p.value, p.sd, p.unit, ci95=p.ci95) for p in estimate.parameters]
     rows = [_row(p, q, finished) for p, q in zip(estimate.parameters, shown, strict=True)]
@@ -142,15 +93,7 @@ def _row(p: EstimatedParameter, q: Quantity, finished: bool) -> tuple[str, ...]:
 def style_of(p: EstimatedParameter, *, finished: bool = True) -> Style:
     """Return how a parameter is painted.
 
-    Parameters
-    ----------
-    p : EstimatedParameter
-    finished : bool
-        Whether the search converged.
-
-    Returns
-    -------
-    {"dim", "good", "bad"}
+    `finished`: whether the search converged.
     """
     return "dim" if p.role == "fixed" else "good" if p.identifiable and finished else "bad"
 
@@ -158,18 +101,8 @@ def style_of(p: EstimatedParameter, *, finished: bool = True) -> Style:
 def verdict(p: EstimatedParameter, *, finished: bool = True) -> str:
     """Say in a word or two where a parameter's value comes from.
 
-    Parameters
-    ----------
-    p : EstimatedParameter
-        Any.
-    finished : bool
-        Whether the search converged.
-
-    Returns
-    -------
-    str
-        ``"identified"``, ``"NOT SHOWN"``, ``"fixed"`` or ``"prior, 87 % data"``; ``"UNFINISHED"`` of a search that did
-        not end where it should.
+    `p`: any; `finished`: whether the search converged. Returns ``"identified"``, ``"NOT SHOWN"``, ``"fixed"`` or
+    ``"prior, 87 % data"``; ``"UNFINISHED"`` of a search that did not end where it should.
     """
     if p.role == "fixed":
         return "fixed"
@@ -188,17 +121,8 @@ def _painted_end(line: str, end: str, style: Style, paint: Paint) -> str:
 def columns(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list[str]:
     """Lay cells out in columns that are two spaces apart.
 
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        Cells; all rows of the same length.
-    right : sequence of int
-        Columns that are aligned to the right.
-
-    Returns
-    -------
-    list of str
-        One line for each row, without spaces at its end.
+    `rows`: cells; all rows of the same length; `right`: columns that are aligned to the right. Returns one line for
+    each row, without spaces at its end.
     """
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
     cells = [
@@ -211,15 +135,7 @@ def columns(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list
 def delay_lines(estimate: Estimate) -> list[str]:
     """Say by how much each input is delayed.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-
-    Returns
-    -------
-    list of str
-        One sentence for each input.
+    `estimate`: any. Returns one sentence for each input.
     """
     rate = float(str(estimate.record["rate_hz"]))
     lines = []
@@ -235,15 +151,7 @@ def delay_lines(estimate: Estimate) -> list[str]:
 def fit_rows(estimate: Estimate) -> list[tuple[str, ...]]:
     """Make a table of the fit of each output.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-
-    Returns
-    -------
-    list of tuple of str
-        A header and a row for each output.
+    `estimate`: any. Returns a header and a row for each output.
     """
     units = model(estimate.model).units
     rows: list[tuple[str, ...]] = [("fit", "one step", "simulation", "innovations")]
@@ -261,19 +169,8 @@ def _simulation(fit: float | None) -> str:
 def check_lines(checks: Mapping[str, Check], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write checks, one after the other, each with its mark and what it found.
 
-    Parameters
-    ----------
-    checks : Mapping[str, Check]
-        By name.
-    width : int
-        Columns of the terminal; longer details go on under themselves.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        Lines.
+    `checks`: by name; `width`: columns of the terminal; longer details go on under themselves; `paint`: adds colour.
+    Returns lines.
     """
     wide = max((len(name) for name in checks), default=0)
     lines: list[str] = []
@@ -288,19 +185,8 @@ def check_lines(checks: Mapping[str, Check], *, width: int = WIDTH, paint: Paint
 def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write how an estimate does on a second record.
 
-    Parameters
-    ----------
-    validation : Mapping[str, object]
-        As `ambid.validate.second_record.validation` gives it.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        Fits of each output, then the checks.
+    `validation`: as `ambid.validate.second_record.validation` gives it; `width`: columns of the terminal; `paint`: adds
+    colour. Returns fits of each output, then the checks.
     """
     checks = {
         name: Check(passed=bool(c["passed"]), detail=str(c["detail"]), p=c.get("p"))
@@ -317,15 +203,7 @@ def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint
 def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Make a table of the fit of each output on a second record.
 
-    Parameters
-    ----------
-    validation : Mapping[str, object]
-        As `ambid.validate.second_record.validation` gives it.
-
-    Returns
-    -------
-    list of tuple of str
-        A header and a row for each output.
+    `validation`: as `ambid.validate.second_record.validation` gives it. Returns a header and a row for each output.
     """
     horizons = list(next(iter(validation["fit"].values()))["k_step"])
     rows = [("fit", *(f"{k} ahead" for k in horizons), "simulation")]
@@ -345,18 +223,7 @@ def _wrapped(text: str, width: int, indent: int) -> list[str]:
 def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write warnings, one after the other.
 
-    Parameters
-    ----------
-    warnings : sequence of str
-    width : int
-        Columns of the terminal; longer ones go on under themselves.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        Lines.
+    `width`: columns of the terminal; longer ones go on under themselves; `paint`: adds colour. Returns lines.
     """
     lines: list[str] = []
     for warning in warnings:
@@ -368,15 +235,7 @@ def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint =
 def other_warnings(estimate: Estimate) -> list[str]:
     """Return the warnings that say more than the detail of a failed check, which stands with the checks.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Any.
-
-    Returns
-    -------
-    list of str
-        In their order.
+    `estimate`: any. Returns in their order.
     """
     said = {c.detail for c in estimate.checks.values()}
     return [warning for warning in estimate.warnings if warning not in said]
@@ -385,14 +244,7 @@ def other_warnings(estimate: Estimate) -> list[str]:
 def timing_line(timing_s: Mapping[str, float]) -> str:
     """Say how long each stage took, and all together.
 
-    Parameters
-    ----------
-    timing_s : Mapping[str, float], s
-
-    Returns
-    -------
-    str
-        One line.
+    Returns one line.
     """
     parts = [f"{name} {seconds:.2g} s" for name, seconds in timing_s.items()]
     return f"{', '.join(parts)}; {sum(timing_s.values()):.2g} s in all"

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.recursive.lines import Event, Track
 from ambid.report._drawing import BAND, MEASURED, NORMAL_95, PREDICTED, grid
 from ambid.report.numbers import prefixed
 from ambid.report.track_history import STATES, TrackHistory
-from ambid.track.lines import Event, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 Truth = Mapping[str, tuple[Array, Array]]
 
 _TRUTH, _MARK, _STALE, _OVER = "#000000", "#d55e00", "#d9d9d9", "#d55e00"
@@ -176,17 +176,8 @@ def _thinned(t: Array, value: Array, half: Array) -> _Curve:
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
     """Say how a track keeps to the truth.
 
-    Parameters
-    ----------
-    t, value, sd : ndarray, shape (n_lines,), s and SI
-    stale : ndarray, shape (n_lines,)
-        Lines that are left out.
-    truth : (t, values), ndarrays, shape (n,)
-
-    Returns
-    -------
-    str
-        Share of the lines whose interval holds the truth, and the median distance; empty where nothing can be said.
+    `t`, `value`, `sd`: (n_lines,), s and SI; `stale`: (n_lines,), lines that are left out; `truth`: (n,). Returns share
+    of the lines whose interval holds the truth, and the median distance; empty where nothing can be said.
     """
     use = ~stale & np.isfinite(value) & np.isfinite(sd) & (t >= truth[0][0]) & (t <= truth[0][-1] + 1e-9)
     if not use.any():
@@ -234,14 +225,7 @@ def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: 
 def event_words(event: Event) -> str:
     """Name an event in a few words.
 
-    Parameters
-    ----------
-    event : Event
-
-    Returns
-    -------
-    str
-        Such as ``"k_i change at 20.03 s"``.
+    Returns such as ``"k_i change at 20.03 s"``.
     """
     who = f"{event.parameter} " if event.parameter else ""
     return f"{who}{event.kind} at {event.t:.4g} s"
@@ -325,14 +309,7 @@ def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequenc
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
     """Yield the stretches in which a flag is set.
 
-    Parameters
-    ----------
-    flags : ndarray, shape (n,)
-
-    Yields
-    ------
-    first, last : int
-        Both inside the stretch.
+    `flags`: (n,). Returns `first, last`: both inside the stretch.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     for k in range(0, edges.size, 2):

@@ -8,20 +8,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.track.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
+from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 
 STATES = ("tracking", "changed", "hold", "frozen")
 
 
 class TrackHistory:
-    """A track that is added to line by line.
-
-    Parameters
-    ----------
-    header : TrackHeader
-    """
+    """A track that is added to line by line."""
 
     def __init__(self, header: TrackHeader) -> None:
         """Begin before the first line."""
@@ -32,16 +26,7 @@ class TrackHistory:
 
     @classmethod
     def of(cls, track: Track) -> Self:
-        """Take over a whole track.
-
-        Parameters
-        ----------
-        track : Track
-
-        Returns
-        -------
-        TrackHistory
-        """
+        """Take over a whole track."""
         history = cls(track.header)
         for line in track.lines:
             history.add(line)
@@ -50,10 +35,7 @@ class TrackHistory:
     def add(self, line: TrackLine) -> None:
         """Add one line.
 
-        Parameters
-        ----------
-        line : TrackLine
-            Numbers of `extra` stand behind the parameters; before their first line they are NaN.
+        `line`: numbers of `extra` stand behind the parameters; before their first line they are NaN.
         """
         self._t.append(line.t)
         self._error.append(line.error)
@@ -106,17 +88,8 @@ class TrackHistory:
     def values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return one track.
 
-        Parameters
-        ----------
-        name : str
-            One of `names`.
-
-        Returns
-        -------
-        value, sd : ndarray, shape (n_lines,), SI
-            NaN where it was not given.
-        stale : ndarray, shape (n_lines,)
-            Whether it was frozen for want of information.
+        `name`: one of `names`. Returns `value, sd`: (n_lines,), SI, naN where it was not given; `stale`: (n_lines,),
+        whether it was frozen for want of information.
         """
         value, sd, stale = self._columns[name]
         missing = self.n_lines - len(value)

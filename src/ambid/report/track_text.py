@@ -6,9 +6,9 @@ import math
 import textwrap
 from collections.abc import Sequence
 
+from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import WIDTH, Paint, columns, plain, warning_lines
-from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.lines_json import NORMAL_95
 
 _MOST = 20  # events that are listed one by one
@@ -26,25 +26,9 @@ def track_text(
 ) -> str:
     """Write what a track came to.
 
-    Parameters
-    ----------
-    header : TrackHeader
-    last : TrackLine
-        The last one.
-    summary : TrackSummary
-    events : sequence of Event
-        Decisions that are told in their order, beside the changes of the summary.
-    troubles : sequence of str
-        As `troubles_of` gives them.
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour; the layout does not depend on it.
-
-    Returns
-    -------
-    str
-        Without a final line feed.
+    `last`: the last one; `events`: decisions that are told in their order, beside the changes of the summary;
+    `troubles`: as `troubles_of` gives them; `width`: columns of the terminal; `paint`: adds colour; the layout does not
+    depend on it. Returns without a final line feed.
     """
     told = events or summary.changes
     blocks = [
@@ -62,17 +46,7 @@ def track_text(
 def header_line(header: TrackHeader, summary: TrackSummary, paint: Paint = plain) -> str:
     """Say what was tracked, how, and how far.
 
-    Parameters
-    ----------
-    header : TrackHeader
-    summary : TrackSummary
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    str
-        One line.
+    `paint`: adds colour. Returns one line.
     """
     name = str(header.record.get("file") or "record")
     stopped = "" if summary.complete else paint(" – stopped before its end", "bad")
@@ -85,19 +59,8 @@ def header_line(header: TrackHeader, summary: TrackSummary, paint: Paint = plain
 def parameter_lines(header: TrackHeader, last: TrackLine, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write the table of the parameters at the end of a track.
 
-    Parameters
-    ----------
-    header : TrackHeader
-    last : TrackLine
-    width : int
-        Columns of the terminal; where they are too few, the interval is left out.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        A header and a line for each parameter.
+    `width`: columns of the terminal; where they are too few, the interval is left out; `paint`: adds colour. Returns a
+    header and a line for each parameter.
     """
     rows = [("", "value ± sd", "95 % interval", "from start", "verdict")]
     for name, v in last.parameters.items():
@@ -115,16 +78,8 @@ def parameter_lines(header: TrackHeader, last: TrackLine, *, width: int = WIDTH,
 def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
     """Write a tracked value and its interval.
 
-    Parameters
-    ----------
-    v : TrackedValue
-    unit : str
-        SI unit.
-
-    Returns
-    -------
-    value, interval : str
-        ``"4.002 ± 0.016 kg"`` and ``"3.971 … 4.033"``; the interval is empty where there is none.
+    `unit`: SI unit. Returns `value, interval`: ``"4.002 ± 0.016 kg"`` and ``"3.971 … 4.033"``; the interval is empty
+    where there is none.
     """
     if not math.isfinite(v.value):
         return "not known", ""
@@ -138,15 +93,7 @@ def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
 def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
     """Say by how much a value has moved since the start.
 
-    Parameters
-    ----------
-    v : TrackedValue
-    start : TrackedValue or None
-
-    Returns
-    -------
-    str
-        Such as ``"-15.1 %"``; empty where it cannot be said.
+    Returns such as ``"-15.1 %"``; empty where it cannot be said.
     """
     if start is None or not math.isfinite(v.value) or not math.isfinite(start.value) or start.value == 0:
         return ""
@@ -156,17 +103,7 @@ def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
 
 
 def extra_lines(header: TrackHeader, last: TrackLine) -> list[str]:
-    """Write what is tracked beside the parameters.
-
-    Parameters
-    ----------
-    header : TrackHeader
-    last : TrackLine
-
-    Returns
-    -------
-    list of str
-    """
+    """Write what is tracked beside the parameters."""
     rows = [(name, value_words(v, header.units.get(name, ""))[0]) for name, v in last.extra.items()]
     return columns(rows) if rows else []
 
@@ -174,17 +111,7 @@ def extra_lines(header: TrackHeader, last: TrackLine) -> list[str]:
 def troubles_of(header: TrackHeader, last: TrackLine, open_changes: Sequence[Event]) -> tuple[str, ...]:
     """Say what is wrong at the end of a track: what ``--strict`` ends with code 3 for.
 
-    Parameters
-    ----------
-    header : TrackHeader
-    last : TrackLine
-    open_changes : sequence of Event
-        Changes that were found, and not answered by accepted values.
-
-    Returns
-    -------
-    tuple of str
-        Empty where nothing is.
+    `open_changes`: changes that were found, and not answered by accepted values. Returns empty where nothing is.
     """
     found = []
     for e in open_changes:
@@ -214,19 +141,7 @@ def state_lines(
 ) -> list[str]:
     """Write state and error at the end, and what is wrong there.
 
-    Parameters
-    ----------
-    header : TrackHeader
-    last : TrackLine
-    troubles : sequence of str
-    width : int
-        Columns of the terminal.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
+    `width`: columns of the terminal; `paint`: adds colour.
     """
     error = "not known" if math.isnan(last.error) else f"{last.error:.3g}"
     lines = [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"]
@@ -239,18 +154,8 @@ def state_lines(
 def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write events, one after the other: when, what, why.
 
-    Parameters
-    ----------
-    events : sequence of Event
-    width : int
-        Columns of the terminal; longer reasons go on under themselves.
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
-        At most the last twenty, and how many came before.
+    `width`: columns of the terminal; longer reasons go on under themselves; `paint`: adds colour. Returns at most the
+    last twenty, and how many came before.
     """
     shown = events[-_MOST:]
     lines = [f"{len(events) - len(shown)} earlier events are not shown"] if len(shown) < len(events) else []
@@ -268,15 +173,7 @@ def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = p
 def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
     """Write counts, throughput and latency.
 
-    Parameters
-    ----------
-    summary : TrackSummary
-    paint : callable
-        Adds colour.
-
-    Returns
-    -------
-    list of str
+    `paint`: adds colour.
     """
     places = summary.counts.get("rejected", 0)
     rejected = _counted(summary.rejected_samples, "sample") + " rejected"
@@ -300,15 +197,7 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
 def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> str:
     """Say how fast a record went by.
 
-    Parameters
-    ----------
-    samples : int
-    seconds_of_record, computing_s : float
-
-    Returns
-    -------
-    str
-        Such as ``"1.2 million samples/s, 60 times real time"``; empty where it is not known.
+    Returns such as ``"1.2 million samples/s, 60 times real time"``; empty where it is not known.
     """
     if not (computing_s > 0 and samples > 0):
         return ""

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from ambid.recursive.lines import Event, TrackHeader, TrackLine
 from ambid.report.numbers import sized
 from ambid.report.track_text import change_words, speed_words, value_words
-from ambid.track.lines import Event, TrackHeader, TrackLine
 from ambid.track.lines_json import NORMAL_95
 
 if TYPE_CHECKING:
@@ -32,65 +32,29 @@ _DECISIONS = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackView:
-    """What a live view shows.
-
-    Attributes
-    ----------
-    header : TrackHeader
-    line : TrackLine
-        The last one.
-    errors : tuple of float
-        Model errors of recent lines, oldest first.
-    decisions : tuple of Event
-        Recent events, oldest first.
-    ranges : Mapping of parameter to (low, high)
-        Between which its bar is drawn, SI.
-    begin_s : float
-        Begin of the first reporting interval, s of record.
-    length_s : float or None
-        Of the record, s; None where it is not known.
-    wall_s : float
-        Since tracking began, s.
-    behind_s : float or None
-        By how much tracking is behind a record that is replayed in real time, s.
-    rejected, updates : int
-    open_changes : int
-        Changes that are not answered by accepted values.
-    keys : bool
-        Whether the operator can press keys.
-    pressed : str
-        The flag that the operator set last; empty without.
-    """
+    """What a live view shows."""
 
     header: TrackHeader
-    line: TrackLine
-    errors: tuple[float, ...] = ()
-    decisions: tuple[Event, ...] = ()
+    line: TrackLine  # the last one
+    errors: tuple[float, ...] = ()  # model errors of recent lines, oldest first
+    decisions: tuple[Event, ...] = ()  # recent events, oldest first
+    # between which its bar is drawn, SI
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
-    begin_s: float = 0.0
-    length_s: float | None = None
-    wall_s: float = 0.0
-    behind_s: float | None = None
+    begin_s: float = 0.0  # begin of the first reporting interval, s of record
+    length_s: float | None = None  # of the record, s; None where it is not known
+    wall_s: float = 0.0  # since tracking began, s
+    behind_s: float | None = None  # by how much tracking is behind a record that is replayed in real time, s
     rejected: int = 0
     updates: int = 0
-    open_changes: int = 0
-    keys: bool = False
-    pressed: str = ""
+    open_changes: int = 0  # changes that are not answered by accepted values
+    keys: bool = False  # whether the operator can press keys
+    pressed: str = ""  # the flag that the operator set last; empty without
 
 
 def live_view(view: TrackView, *, ascii_only: bool = False) -> Group:
     """Make what is shown.
 
-    Parameters
-    ----------
-    view : TrackView
-    ascii_only : bool
-        For a terminal whose encoding has no blocks.
-
-    Returns
-    -------
-    rich.console.Group
-        About 80 columns wide.
+    `ascii_only`: for a terminal whose encoding has no blocks. Returns about 80 columns wide.
     """
     from rich.console import Group
     from rich.text import Text
@@ -161,19 +125,8 @@ def interval_bar(
 ) -> str:
     """Draw an interval between two ends: the value, its 95 % interval, and where it started.
 
-    Parameters
-    ----------
-    value, sd, start : float
-    low, high : float
-        The ends.
-    width : int
-        Columns.
-    ascii_only : bool
-
-    Returns
-    -------
-    str
-        Of `width` letters; blank where there is nothing to draw. An arrow stands where the value is beyond an end.
+    `low`, `high`: the ends; `width`: columns. Returns of `width` letters; blank where there is nothing to draw. An
+    arrow stands where the value is beyond an end.
     """
     if not (math.isfinite(value) and high > low):
         return " " * width
@@ -201,20 +154,8 @@ def interval_bar(
 def sparkline(values: Sequence[float], limit: float, *, width: int = _SPARK, ascii_only: bool = False) -> str:
     """Draw recent values as blocks, the largest of each stretch; half height is the limit.
 
-    Parameters
-    ----------
-    values : sequence of float
-        NaN where one is not known.
-    limit : float
-        Positive.
-    width : int
-        Most columns.
-    ascii_only : bool
-
-    Returns
-    -------
-    str
-        A letter for each stretch, a blank for one without values; at twice the limit it is full.
+    `values`: naN where one is not known; `limit`: positive; `width`: most columns. Returns a letter for each stretch, a
+    blank for one without values; at twice the limit it is full.
     """
     blocks = _PLAIN_BLOCKS if ascii_only else _BLOCKS
     n = len(values)

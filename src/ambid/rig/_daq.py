@@ -29,30 +29,9 @@ def daq_of(
 ) -> Daq:
     """Check the entries of ``[daq]`` against each other and the rest of the rig.
 
-    Parameters
-    ----------
-    entry : DaqEntry
-        As written.
-    channels : sequence of RigChannel
-        Of the rig.
-    plant : LinearModel
-        Its model.
-    limits : Limits or None
-        Its limits, SI.
-    record_rate_hz : float or None
-        ``record.rate_hz``, the default of the rate, Hz.
-    where : str
-        The file, for messages.
-
-    Returns
-    -------
-    Daq
-        All numbers SI, counts or ms.
-
-    Raises
-    ------
-    RigError
-        For the first entry that breaks a rule.
+    `entry`: as written; `channels`: of the rig; `plant`: its model; `limits`: its limits, SI; `record_rate_hz`:
+    ``record.rate_hz``, the default of the rate, Hz; `where`: the file, for messages. Returns all numbers SI, counts or
+    ms.
     """
     place = f"{where}: daq"
     if entry.duty is not None and not entry.duty[0] < entry.duty[1]:

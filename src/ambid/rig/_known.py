@@ -20,24 +20,7 @@ _EXPONENTIAL, _HYPERBOLIC = ("L_g", "zeta"), ("k", "s")
 def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
     """Convert one parameter to SI and check it against what it is.
 
-    Parameters
-    ----------
-    spec : ParameterSpec
-        What it is.
-    entry : ParameterEntry
-        As written.
-    place : str
-        Where it stands, for messages.
-
-    Returns
-    -------
-    Parameter
-        SI.
-
-    Raises
-    ------
-    RigError
-        If unit, role, value and sd do not go together.
+    `spec`: what it is; `entry`: as written; `place`: where it stands, for messages. Returns SI.
     """
     unit = None
     if entry.unit is not None:
@@ -65,24 +48,7 @@ def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Para
 def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
     """Check ``[magnet]`` against the model and itself.
 
-    Parameters
-    ----------
-    entry : MagnetEntry
-        As written.
-    plant : LinearModel
-        The rig's model.
-    where : str
-        The file, for messages.
-
-    Returns
-    -------
-    RigMagnet
-        SI.
-
-    Raises
-    ------
-    RigError
-        If the model has no magnet with a coil and a position, a number is not known, or two entries exclude each other.
+    `entry`: as written; `plant`: the rig's model; `where`: the file, for messages. Returns SI.
     """
     if plant.name != "one-axis":
         raise RigError(
@@ -138,19 +104,7 @@ def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"]
 def unit_of(text: str, place: str) -> Unit:
     """Read a unit of a rig file.
 
-    Parameters
-    ----------
-    text, place : str
-        The unit, and where it stands, for messages.
-
-    Returns
-    -------
-    Unit
-
-    Raises
-    ------
-    RigError
-        If it is not known.
+    `text`, `place`: the unit, and where it stands, for messages.
     """
     try:
         return parse_unit(text)

@@ -105,15 +105,7 @@ def default_rig(model_name: str = "one-axis") -> Rig:
 def role_units(plant: LinearModel) -> dict[str, str]:
     """Return the roles that a rig of this model may name, with their SI units.
 
-    Parameters
-    ----------
-    plant : LinearModel
-        A model.
-
-    Returns
-    -------
-    dict of str to str
-        Its inputs, its outputs, and `OPTIONAL_ROLES`.
+    `plant`: a model. Returns its inputs, its outputs, and `OPTIONAL_ROLES`.
     """
     return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **OPTIONAL_ROLES}
 

@@ -196,20 +196,7 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
 def read_rig_file(path: Path) -> RigFile:
     """Read a rig file and check its shape.
 
-    Parameters
-    ----------
-    path : Path
-        TOML, UTF-8.
-
-    Returns
-    -------
-    RigFile
-        As written: units are not yet converted.
-
-    Raises
-    ------
-    RigError
-        If the file cannot be read, is no TOML, or has an unknown key, a wrong type or a number that is not finite.
+    `path`: TOML, UTF-8. Returns as written: units are not yet converted.
     """
     return parse_rig(utf8_text(file_bytes(path, RigError, "rig"), path, RigError, "rig"), path)
 
@@ -217,22 +204,7 @@ def read_rig_file(path: Path) -> RigFile:
 def parse_rig(text: str, path: Path) -> RigFile:
     """Check the shape of a rig's text.
 
-    Parameters
-    ----------
-    text : str
-        TOML.
-    path : Path
-        Where it stands or stood, for messages.
-
-    Returns
-    -------
-    RigFile
-        As written: units are not yet converted.
-
-    Raises
-    ------
-    RigError
-        As `read_rig_file`.
+    `text`: TOML; `path`: where it stands or stood, for messages. Returns as written: units are not yet converted.
     """
     if not text.strip():
         raise RigError(
@@ -248,22 +220,7 @@ def parse_rig(text: str, path: Path) -> RigFile:
 def checked(content: dict[str, Any], where: str) -> RigFile:
     """Check the shape of a rig given as nested tables.
 
-    Parameters
-    ----------
-    content : dict
-        What the TOML file holds.
-    where : str
-        The file, for messages.
-
-    Returns
-    -------
-    RigFile
-        The same, typed.
-
-    Raises
-    ------
-    RigError
-        For the first entry that breaks a rule.
+    `content`: what the TOML file holds; `where`: the file, for messages. Returns the same, typed.
     """
     given = content.get("schema")
     if given != SCHEMA:

@@ -86,15 +86,7 @@ def rig_text(rig: Rig, folder: Path) -> str:
 def toml_text(text: str) -> str:
     """Quote a text for TOML.
 
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-        A TOML basic string.
+    `text`: any text. Returns a TOML basic string.
     """
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 

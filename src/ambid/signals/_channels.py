@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record, Step
+from ambid.record.record import Record, Step
 
 
 def chosen(record: Record, names: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.record.record import Array
+from ambid.arrays import Array
 from ambid.signals._periodicity import Lines
 from ambid.signals.frf import Complex
 

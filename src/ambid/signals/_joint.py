@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals.frf import Complex
 
 FEEDBACK = (

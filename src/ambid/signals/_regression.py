@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals.lagged import lagged_triangle
 
 

@@ -7,33 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array
 from ambid.signals.spectra import PowerSpectrum
 
 
 def blackman_tukey(x: Array, rate_hz: float, *, lags: int | None = None) -> PowerSpectrum:
     """Estimate the power spectral density from the correlation function under a Hann window (Ljung 1999, sec. 6.4).
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples; their mean is removed.
-    rate_hz : float
-        Sampling rate in Hz.
-    lags : int, optional
-        Lags of the window: more resolve finer, fewer smooth more. By default a tenth of the record, at most 30 plus a
-        hundredth of it.
-
-    Returns
-    -------
-    PowerSpectrum
-        The density in the unit of `x` squared per Hz, with its standard deviation and confidence bounds; no segments.
-
-    Raises
-    ------
-    RecordError
-        If the lags do not fit the record.
+    `x`: (n_samples,), any unit, samples; their mean is removed; `rate_hz`: sampling rate in Hz. Returns the density in
+    the unit of `x` squared per Hz, with its standard deviation and confidence bounds; no segments.
     """
     from scipy.fft import irfft, next_fast_len, rfft
 

@@ -11,8 +11,8 @@ from math import erf, sqrt
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals._regression import fit_arx
 
 _SIGNIFICANT = 4.0  # standard deviations

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 from ambid.signals._channels import equal_runs, finite
 from ambid.signals.resolution import level_spacing
 from ambid.signals.saturation import find_saturation
@@ -115,17 +116,8 @@ def longest_chance_run(x: Array, false_alarm: float = 1e-4) -> int:
     With p the probability that a sample repeats the one before it, a run of r samples begins at a given place with
     probability p^(r-1); over n places it stays under `false_alarm` for r > 1 + log(false_alarm/n)/log(p).
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples.
-    false_alarm : float
-        Probability over the whole record.
-
-    Returns
-    -------
-    int
-        Samples, at least 3; n_samples - 1 at most, so that a channel that never changes is always one run too long.
+    `x`: (n_samples,), any unit, samples; `false_alarm`: probability over the whole record. Returns samples, at least 3;
+    n_samples - 1 at most, so that a channel that never changes is always one run too long.
     """
     p = 1.0 - equal_runs(x)[0].size / x.size
     if p == 0.0 or x.size < 5:

@@ -11,8 +11,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.record.record import Array
 from ambid.signals.multisine import multisine
 from ambid.signals.waveforms import checked, checked_band, chirp, gaussian, prbs, steps
 

@@ -9,8 +9,9 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record, Step
+from ambid.record.record import Record, Step
 from ambid.signals._channels import chosen, finite, mapped
 
 
@@ -55,28 +56,9 @@ def zero_phase(
 ) -> Array:
     """Filter forwards and backwards with a Butterworth filter in second-order sections.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-    corner_hz : float
-        Frequency in Hz where the two passes together give -6 dB.
-    kind : {"lowpass", "highpass"}
-        What passes.
-    order : int
-        Order of one pass, 1 to 12.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `x`
-        Filtered samples, not delayed.
-
-    Raises
-    ------
-    RecordError
-        If the corner, the order or the length is out of range.
+    `x`: (n_samples,), any unit, samples; `rate_hz`: sampling rate in Hz; `corner_hz`: frequency in Hz where the two
+    passes together give -6 dB; `kind`: what passes; `order`: order of one pass, 1 to 12. Returns (n_samples,), unit of
+    `x`, filtered samples, not delayed.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -150,17 +132,8 @@ def resample(record: Record, rate_hz: float, *, allow_upsampling: bool = False) 
 def resampled(x: Array, ratio: Fraction) -> Array:
     """Change the rate of samples by a rational factor with a polyphase anti-alias filter.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples.
-    ratio : Fraction
-        New rate over old rate.
-
-    Returns
-    -------
-    ndarray, shape (ceil(n_samples * ratio),), unit of `x`
-        Samples at the new rate, the first one at the same instant.
+    `x`: (n_samples,), any unit, samples; `ratio`: new rate over old rate. Returns (ceil(n_samples * ratio), ), unit of
+    `x`, samples at the new rate, the first one at the same instant.
     """
     from scipy.signal import resample_poly
 

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 
 Complex = NDArray[np.complex128]
 Hold = Literal["zoh", "band-limited"]
@@ -276,14 +276,7 @@ def frequency_response(
 def repeats(x: object) -> bool:
     """Tell whether one excitation repeats at least twice.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,) or (n_samples, 1), any unit
-        More than one column never does, nor does a constant.
-
-    Returns
-    -------
-    bool
+    `x`: more than one column never does, nor does a constant.
     """
     from ambid.signals._periodicity import find_period
 

@@ -13,8 +13,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals._joint import FEEDBACK, checked, labels, ratio, weak_inputs
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
 

@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals._distortion import at_excited, detected, distortions
 from ambid.signals._joint import FEEDBACK, checked, labels, right_inverse
 from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio, without_strays

@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 from ambid.signals._joint import FEEDBACK, checked, labels, product_covariance, ratio, weak_inputs
 from ambid.signals.frf import Complex, FrequencyResponse, Hold
 from ambid.signals.spectra import CrossSpectra, cross_spectra

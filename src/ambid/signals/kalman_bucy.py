@@ -11,8 +11,8 @@ from math import exp, expm1, isfinite, pi, sqrt
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 
 
 def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float = 60.0, r: float = 1.0) -> float:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 _ROWS = 8192  # of a block that fits the processor's cache
 
@@ -15,17 +14,9 @@ _ROWS = 8192  # of a block that fits the processor's cache
 def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
     """Return R of the QR factorisation of [x(t - lag) of every column] for t >= first.
 
-    Parameters
-    ----------
-    columns : sequence of (ndarray, shape (n_samples,), and int)
-        Signal x and its lag; a constant is a signal of ones without lag.
-    first : int
-        First row, at least the largest lag.
-
-    Returns
-    -------
-    ndarray, shape (n_columns, n_columns)
-        Rows of zeros at the end where there are fewer rows than columns.
+    `columns`: (n_samples,), and int), signal x and its lag; a constant is a signal of ones without lag; `first`: first
+    row, at least the largest lag. Returns (n_columns, n_columns), rows of zeros at the end where there are fewer rows
+    than columns.
     """
     n, width = columns[0][0].size, len(columns)
     R = np.zeros((0, width))

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.record.record import Array
 from ambid.signals.waveforms import AmplitudeIs, checked, checked_band, scaled
 
 

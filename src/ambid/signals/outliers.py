@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 from ambid.signals._channels import equal_runs, finite
 from ambid.signals._regression import fit_arx
 
@@ -105,19 +106,9 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0, width: i
 def outlier_sizes(x: Array, threshold: float = 6.0, width: int = 1) -> Array:
     """Return the prediction error of each outlier in robust standard deviations, 0 for samples that are none.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples, finite.
-    threshold : float
-        Error that makes an outlier, in local robust standard deviations.
-    width : int
-        Longest group of outliers in samples.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), dimensionless
-        Sizes; 0 where there is no outlier.
+    `x`: (n_samples,), any unit, samples, finite; `threshold`: error that makes an outlier, in local robust standard
+    deviations; `width`: longest group of outliers in samples. Returns (n_samples,), dimensionless, sizes; 0 where there
+    is no outlier.
     """
     spread = float(np.std(x))
     if spread == 0.0:

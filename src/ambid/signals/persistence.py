@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.record.record import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

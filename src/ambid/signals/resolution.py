@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.record.record import Array, Record
+from ambid.arrays import Array
+from ambid.record.record import Record
 from ambid.signals._channels import finite
 
 
@@ -98,15 +99,7 @@ def level_spacing(x: Array) -> float:
     The median of the spacings up to 1.5 times their 10 % quantile, which neither a few odd pairs of levels
     (calibration, clipping) nor missing levels move.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples.
-
-    Returns
-    -------
-    float
-        Spacing in the unit of `x`; 0 if all samples are equal.
+    `x`: (n_samples,), any unit, samples. Returns spacing in the unit of `x`; 0 if all samples are equal.
     """
     spacings = _spacings(x)
     if not spacings.size:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 from ambid.signals._channels import equal_runs, finite, runs
 
 _FEWEST = 5  # samples at a limit that count as evidence

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record
+from ambid.record.record import Record
 from ambid.signals._channels import finite
 from ambid.signals._regression import fit_arx
 
@@ -139,17 +140,8 @@ def noise_between_periods(y: Array, period: int) -> float:
 
     The whole periods at the end of `y` are used; transients of the first one count as noise unless they are cut.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples,), any unit
-        Response to a periodic excitation.
-    period : int
-        Period in samples.
-
-    Returns
-    -------
-    float
-        Noise variance in the unit of `y` squared.
+    `y`: (n_samples,), any unit, response to a periodic excitation; `period`: period in samples. Returns noise variance
+    in the unit of `y` squared.
     """
     count = y.size // period
     periods = y[y.size - count * period :].reshape(count, period)
@@ -159,24 +151,8 @@ def noise_between_periods(y: Array, period: int) -> float:
 def noise_of_prediction(y: Array, inputs: Sequence[Array] = (), order: int = 20) -> float:
     """Return the variance of the one-step prediction error of an autoregression with inputs, fitted by QR.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples,), any unit
-        Channel.
-    inputs : sequence of ndarray, shape (n_samples,) each
-        Inputs; lags 0 … `order` are used.
-    order : int
-        Lags.
-
-    Returns
-    -------
-    float
-        Innovations variance in the unit of `y` squared.
-
-    Raises
-    ------
-    EstimationError
-        If the record is too short.
+    `y`: (n_samples,), any unit, channel; `inputs`: inputs; lags 0 … `order` are used; `order`: lags. Returns
+    innovations variance in the unit of `y` squared.
     """
     spread = float(np.std(y))
     if spread == 0.0:
@@ -189,17 +165,8 @@ def noise_of_prediction(y: Array, inputs: Sequence[Array] = (), order: int = 20)
 def noise_at_floor(y: Array, rate_hz: float) -> float:
     """Return the variance of white noise with the median density over 0.8 to 0.95 of half the rate.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n_samples,), any unit
-        Channel whose signal lies under 0.8 of half the rate.
-    rate_hz : float
-        Sampling rate in Hz.
-
-    Returns
-    -------
-    float
-        Noise variance in the unit of `y` squared.
+    `y`: (n_samples,), any unit, channel whose signal lies under 0.8 of half the rate; `rate_hz`: sampling rate in Hz.
+    Returns noise variance in the unit of `y` squared.
     """
     from ambid.signals.spectra import power_spectrum
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array
 
 _CHUNK = 64  # segments transformed at a time: memory does not grow with the record
 

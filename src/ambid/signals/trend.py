@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Array, Record, Step
+from ambid.record.record import Record, Step
 from ambid.signals._channels import chosen, finite, mapped
 from ambid.signals.filters import zero_phase
 
@@ -93,17 +94,8 @@ def remove_trend(
 def polynomial_trend(x: Array, degree: int) -> Array:
     """Return the least-squares polynomial through equally spaced samples.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,), any unit
-        Samples.
-    degree : int
-        Degree of the polynomial.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `x`
-        The polynomial at the sampling instants.
+    `x`: (n_samples,), any unit, samples; `degree`: degree of the polynomial. Returns (n_samples,), unit of `x`, the
+    polynomial at the sampling instants.
     """
     # Legendre polynomials on [-1, 1]: nearly orthogonal, so that the problem stays well conditioned at any length.
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, x.size), degree)

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.record.record import Array
 
 AmplitudeIs = Literal["peak", "rms"]
 
@@ -16,24 +16,8 @@ AmplitudeIs = Literal["peak", "rms"]
 def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
     """Scale samples so that their largest absolute value, or their rms, is `amplitude`.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,)
-        Samples, not all zero.
-    amplitude : float
-        Wanted peak or rms, in the unit of the result; over 0.
-    amplitude_is : {"peak", "rms"}
-        What `amplitude` means.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `amplitude`
-        Scaled samples.
-
-    Raises
-    ------
-    AmbidError
-        If the amplitude is not positive, or its meaning unknown.
+    `x`: (n_samples,), samples, not all zero; `amplitude`: wanted peak or rms, in the unit of the result; over 0;
+    `amplitude_is`: what `amplitude` means. Returns (n_samples,), unit of `amplitude`, scaled samples.
     """
     if not (np.isfinite(amplitude) and amplitude > 0):
         raise AmbidError(f"excitation amplitude {amplitude}; it must be a positive number. Give another")
@@ -46,17 +30,7 @@ def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
 def checked(n_samples: int, rate_hz: float) -> None:
     """Refuse a length under two samples or a rate that is not positive.
 
-    Parameters
-    ----------
-    n_samples : int
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-
-    Raises
-    ------
-    AmbidError
-        If one of them is unusable.
+    `n_samples`: samples; `rate_hz`: sampling rate in Hz.
     """
     if n_samples < 2 or not (np.isfinite(rate_hz) and rate_hz > 0):
         raise AmbidError(
@@ -68,22 +42,7 @@ def checked(n_samples: int, rate_hz: float) -> None:
 def checked_band(band: tuple[float, float], rate_hz: float) -> tuple[float, float]:
     """Return a band (low, high) in Hz after checking 0 <= low < high <= rate/2.
 
-    Parameters
-    ----------
-    band : (float, float)
-        Ends in Hz.
-    rate_hz : float
-        Sampling rate in Hz.
-
-    Returns
-    -------
-    (float, float)
-        The same band in Hz.
-
-    Raises
-    ------
-    AmbidError
-        If it is not such a band.
+    `band`: ends in Hz; `rate_hz`: sampling rate in Hz. Returns the same band in Hz.
     """
     low, high = float(band[0]), float(band[1])
     if not 0.0 <= low < high <= rate_hz / 2:

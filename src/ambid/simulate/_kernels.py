@@ -6,19 +6,19 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.compiled import compiled
 from ambid.physics.coenergy_law import coenergy_derivatives
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
-_energy: Callable[..., None] = njit(cache=True, nogil=True)(coenergy_derivatives)
+_energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
     """Return force, k_i and L of a `CoEnergy` (7 numbers) or a `LawMagnet` (12), as `Standing.nonlinear` has them."""
     if magnet.size > 7:
@@ -33,7 +33,7 @@ def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
     return pull, motional, magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rate_of_change(
     x: float, v: float, i: float, p: float, voltage: float, force: float, magnet: Array, body: Array
 ) -> tuple[float, float, float]:
@@ -49,7 +49,7 @@ def rate_of_change(
     return acceleration, (voltage - body[2] * i - motional * v) / inductance, lag
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def runge_kutta(
     x: float, v: float, i: float, p: float, voltage: float, force: float, h: float, magnet: Array, body: Array
 ) -> tuple[float, float, float, float]:
@@ -71,7 +71,7 @@ def runge_kutta(
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, body: Array) -> tuple[float, float]:
     """Return current and lagging force a step later of a rotor that lies on a stop: without speed no voltage by it."""
     _, c1, p1 = rate_of_change(x, 0.0, i, p, voltage, 0.0, magnet, body)
@@ -81,7 +81,7 @@ def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, b
     return i + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), p + h / 6.0 * (p1 + 2.0 * (p2 + p3) + p4)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, bool]:
     """Stop the rotor at the ends of its range, without rebound; the flag says that it touched."""
     if x >= high:
@@ -91,13 +91,13 @@ def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, boo
     return x, v, False
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def quantise(value: float, step: float) -> float:
     """Return `value` on the grid of `step`; a step of zero leaves it."""
     return math.floor(value / step + 0.5) * step if step > 0.0 else value
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def advance_nonlinear(
     x: Array,
     late: float,
@@ -137,7 +137,7 @@ def advance_nonlinear(
     return touched
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def advance_linear(
     x: Array,
     centre: Array,
@@ -166,7 +166,7 @@ def advance_linear(
         x[row] = s
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(
     linear: bool,
     excitation: Array,
@@ -198,11 +198,6 @@ def run(
 
     `outputs` are the states that are measured, `roles` the columns among them of position and current (-1: none),
     `gains` kp, ki T, kd, kc, tau, T, and `input_limits` low, high and resolution of the command.
-
-    Returns
-    -------
-    measured (n, n_outputs), command (n,), states (n, n_states), first contact (-1: none), first saturated command (-1:
-    none), number of saturated commands, first sample that is not finite or not in `gap` (-1: none).
     """
     n, ny = sensor_noise.shape
     measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))

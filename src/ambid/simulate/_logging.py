@@ -8,14 +8,12 @@ from dataclasses import asdict
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.plant import Standing
-
-Array = NDArray[np.float64]
 
 
 def drawn_noise(

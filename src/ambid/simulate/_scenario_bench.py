@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
@@ -23,7 +23,6 @@ from ambid.simulate.rig_bench import parts_of_rig
 if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
     from ambid.rig.rig import Rig
 
-Array = NDArray[np.float64]
 
 _PERIOD = 20_000  # samples in which the excitation repeats
 _FLATTEN = 40  # iterations that lower the peaks of an excitation

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.compiled import compiled
 from ambid.simulate._kernels import advance_linear, quantise, stop
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run_varying(
     excitation: Array,
     noise: Array,

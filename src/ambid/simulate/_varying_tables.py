@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
 from ambid.simulate.schedule import Schedule
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _DEGREE = 14  # at a norm of 0.5 the Taylor polynomial of the exponential is right to 3e-17

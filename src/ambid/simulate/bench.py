@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
@@ -25,8 +26,6 @@ from ambid.simulate._logging import drawn_noise, logged, written
 from ambid.simulate.plant import LinearPlant, Standing
 from ambid.simulate.poles import closed_loop_poles
 from ambid.simulate.rig_magnet import nonlinear_truth
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

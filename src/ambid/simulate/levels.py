@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.loop import Limits, Noise
 from ambid.physics.nonlinear import OperatingPoint
 from ambid.simulate.bench import Simulation
-
-Array = NDArray[np.float64]
 
 
 def noise_at_snr(clean: Simulation, snr_db: float) -> Noise:

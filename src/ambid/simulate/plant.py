@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.discretise import discretise
 from ambid.physics.law_magnet import LawMagnet
@@ -17,8 +17,6 @@ from ambid.physics.linear_model import LinearModel
 from ambid.physics.magnet import CoEnergy
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,27 +49,15 @@ class LinearPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Standing:
-    """A plant at its operating point: what the simulation loop needs to know, linear or not.
+    """A plant at its operating point: what the simulation loop needs to know, linear or not."""
 
-    Attributes
-    ----------
-    plant : LinearPlant or NonlinearPlant
-        The plant itself.
-    model : LinearModel
-        Its linear model, or the one that it linearises to.
-    point : OperatingPoint
-        Where it stands, SI.
-    centre : Array, shape (n_states,), SI
-        The states at `point`; after those of the model the force behind the eddy pole, where there is one.
-    centre_input : float
-        The input at `point`, SI.
-    """
-
-    plant: LinearPlant | NonlinearPlant
-    model: LinearModel
-    point: OperatingPoint
+    plant: LinearPlant | NonlinearPlant  # the plant itself
+    model: LinearModel  # its linear model, or the one that it linearises to
+    point: OperatingPoint  # where it stands, SI
+    # (n_states,), SI, the states at `point`; after those of the model the force behind the eddy pole, where there is
+    # one
     centre: Array
-    centre_input: float
+    centre_input: float  # the input at `point`, SI
 
     @classmethod
     def of(cls, plant: LinearPlant | NonlinearPlant, point: OperatingPoint | None) -> Standing:
@@ -111,17 +97,8 @@ class Standing:
     def matrices(self, period: float, fraction: float) -> tuple[Array, Array, Array, Array]:
         """Return A, B, B_late and E over a period; zeros for a nonlinear plant.
 
-        Parameters
-        ----------
-        period : float
-            In s.
-        fraction : float
-            Part of the period by which the input is late, 0 to 1.
-
-        Returns
-        -------
-        tuple of Array
-            Shapes (n_states, n_states), (n_states,), (n_states,), (n_states, n_disturbances).
+        `period`: in s; `fraction`: part of the period by which the input is late, 0 to 1. Returns shapes (n_states,
+        n_states), (n_states,), (n_states,), (n_states, n_disturbances).
         """
         if not isinstance(self.plant, LinearPlant):
             return np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros((3, 2))
@@ -132,17 +109,8 @@ class Standing:
     def nonlinear(self) -> tuple[Array, Array]:
         """Return the numbers of the magnet, and of body and stage, for compiled loops; zeros for a linear plant.
 
-        Returns
-        -------
-        magnet : ndarray, shape (7,) or (12,)
-            k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a `CoEnergy`, or `LawMagnet.vector`; SI.
-        body : ndarray, shape (10,)
-            m, c, R, gravity, eddy pole, v_drop, i_drop, the stage's limits and its offset; SI.
-
-        Raises
-        ------
-        ModelError
-            If the co-energy is neither.
+        Returns `magnet`: k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a `CoEnergy`, or `LawMagnet.vector`; SI;
+        `body`: (10,), m, c, R, gravity, eddy pole, v_drop, i_drop, the stage's limits and its offset; SI.
         """
         if isinstance(self.plant, LinearPlant):
             return np.zeros(7), np.zeros(10)

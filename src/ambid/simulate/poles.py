@@ -8,12 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.discretise import discretise
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
-
-Array = NDArray[np.float64]
 
 
 def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> Array:

@@ -7,8 +7,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import RigError
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
@@ -18,8 +19,6 @@ from ambid.simulate.bench import Simulation, simulate
 from ambid.simulate.plant import LinearPlant
 from ambid.simulate.rig_magnet import current_offset, enough_steps, plant_of_rig, rest_of_rig
 from ambid.units import parse_unit
-
-Array = NDArray[np.float64]
 
 TURNING = {"speed": "rad/s", "angle": "rad"}
 """Columns of a turning rotor, with their units."""
@@ -115,28 +114,9 @@ def parts_of_rig(
 ) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]:
     """Return what a rig gives a simulation.
 
-    Parameters
-    ----------
-    rig : Rig
-        Every parameter needs a value, whatever its role.
-    closed : bool or None
-        Closed or open loop; None: closed where the rig has a loop and does not say ``open_loop``.
-    nonlinear : bool
-        The nonlinear plant and its rest point, as `simulate_rig`.
-
-    Returns
-    -------
-    plant : LinearPlant or NonlinearPlant
-        With the rig's parameters.
-    loop : Loop or None
-        The controller, or its delay alone.
-    point : OperatingPoint
-        A value that the rig does not give is zero; a voltage that it does not give is R times the current.
-
-    Raises
-    ------
-    RigError
-        If a parameter has no value, or a closed loop is asked for and the rig has none.
+    `rig`: every parameter needs a value, whatever its role; `nonlinear`: the nonlinear plant and its rest point, as
+    `simulate_rig`. Returns `plant`: with the rig's parameters; `loop`: the controller, or its delay alone; `point`: a
+    value that the rig does not give is zero; a voltage that it does not give is R times the current.
     """
     loop = rig.loop
     if closed and (loop is None or not loop.closed):
@@ -164,24 +144,7 @@ def parts_of_rig(
 def as_columns(record: Record, rig: Rig, setpoint: Array) -> Record:
     """Name the roles by the rig's columns and undo their calibrations.
 
-    Parameters
-    ----------
-    record : Record
-        Channels named by role; others, such as the truth, are passed on as they are.
-    rig : Rig
-        Its channels. Speed and angle are zero where the record has none: the rotor does not turn.
-    setpoint : ndarray, shape (n_samples,), in m
-        The role ``reference``.
-
-    Returns
-    -------
-    Record
-        The rig's columns, then what has no role.
-
-    Raises
-    ------
-    RigError
-        If a calibration cannot be undone.
+    `setpoint`: (n_samples,), in m, the role ``reference``. Returns the rig's columns, then what has no role.
     """
     roles = {c.name: c for c in record.channels}
     roles["reference"] = Channel(name="reference", unit="m", values=setpoint)

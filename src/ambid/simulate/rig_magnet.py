@@ -26,21 +26,7 @@ _FINE = 0.25  # largest rate of the plant at rest times a Runge-Kutta step
 def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
     """Return the law that a rig's ``[magnet]`` names, and the numbers of it that have a value.
 
-    Parameters
-    ----------
-    rig : Rig
-        With ``[magnet]``. Of what its keys leave open, a law has what is named under ``[magnet.parameters]``.
-
-    Returns
-    -------
-    law : MagnetLaw
-    values : dict of str to float
-        All numbers of ``[magnet.parameters]`` with a value, whatever their role, and m, R and c; SI.
-
-    Raises
-    ------
-    RigError
-        If there is no ``[magnet]``, its kind is left to the records, or a number that a simulation needs has no value.
+    Returns `values`: all numbers of ``[magnet.parameters]`` with a value, whatever their role, and m, R and c; SI.
     """
     known = rig.magnet
     if known is None:
@@ -138,36 +124,17 @@ def plant_of_rig(rig: Rig) -> NonlinearPlant:
 def current_offset(rig: Rig) -> float:
     """Return what the rig's current sensor shows without current.
 
-    Parameters
-    ----------
-    rig : Rig
-
-    Returns
-    -------
-    float
-        In A.
+    Returns in A.
     """
     known = None if rig.magnet is None else rig.magnet.known("i_offset")
     return 0.0 if known is None or known.value is None else known.value
 
 
 def rest_of_rig(rig: Rig, plant: NonlinearPlant) -> OperatingPoint:
-    """Return where the loop holds the plant: the declared position, and what current and voltage the law needs there.
+    """Return where the loop holds the plant: the declared position, and what current and voltage the law needs
+    there.
 
-    Parameters
-    ----------
-    rig : Rig
-        The position of its operating point is used, 0 where it gives none.
-    plant : NonlinearPlant
-
-    Returns
-    -------
-    OperatingPoint
-
-    Raises
-    ------
-    ModelError
-        If the magnet cannot hold the rotor there.
+    `rig`: the position of its operating point is used, 0 where it gives none.
     """
     return plant.equilibrium(rig.operating_point.get("position", 0.0))
 
@@ -175,16 +142,7 @@ def rest_of_rig(rig: Rig, plant: NonlinearPlant) -> OperatingPoint:
 def enough_steps(plant: NonlinearPlant, point: OperatingPoint, rate_hz: float) -> int:
     """Return how many Runge-Kutta steps a sample wants, by the fastest rate of the plant at rest.
 
-    Parameters
-    ----------
-    plant : NonlinearPlant
-    point : OperatingPoint
-    rate_hz : float
-
-    Returns
-    -------
-    int
-        At least 1.
+    Returns at least 1.
     """
     p = plant.linearise(point.position)
     resistance = p["R"] + abs(plant.stage.slope(0.0))  # the drop is steepest where the current passes zero
@@ -196,14 +154,7 @@ def enough_steps(plant: NonlinearPlant, point: OperatingPoint, rate_hz: float) -
 def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
     """Return the numbers of a nonlinear plant by the names of ``[magnet.parameters]``.
 
-    Parameters
-    ----------
-    plant : NonlinearPlant
-
-    Returns
-    -------
-    Mapping[str, float]
-        SI: those of the law and g, of the others those that are not zero; and R, without what a drop adds to it.
+    Returns SI: those of the law and g, of the others those that are not zero; and R, without what a drop adds to it.
     """
     magnet, stage, w = plant.magnet, plant.stage, plant.magnet.coenergy
     if isinstance(magnet, LawMagnet):

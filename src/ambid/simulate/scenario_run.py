@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
@@ -24,7 +25,6 @@ from ambid.simulate.varying import TRUE, Stretch, VaryingLoop, gathered
 if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
     from ambid.rig.rig import Rig
 
-Array = NDArray[np.float64]
 
 _CHUNK = 16384  # samples that are simulated at once
 _LARGEST = 10**8  # samples of one record: it has to fit into memory

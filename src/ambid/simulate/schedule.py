@@ -11,9 +11,8 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
-
-Array = NDArray[np.float64]
 
 _PER_TIME_CONSTANT = 50  # corners of a warm-up: the lines leave the exponential by 5e-5 of its rise at most
 

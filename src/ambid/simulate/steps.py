@@ -5,16 +5,12 @@ Import it only from a module that is itself imported inside a function: it loads
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
-from numpy.typing import NDArray
-
+from ambid.arrays import Array
+from ambid.compiled import compiled
 from ambid.simulate._kernels import advance_linear, advance_nonlinear, stop
 
-Array = NDArray[np.float64]
 
-
-@njit(cache=True, nogil=True)
+@compiled
 def advance_plant(
     linear: bool,
     x: Array,
@@ -30,33 +26,12 @@ def advance_plant(
 ) -> bool:
     """Carry the state of a plant over one sample, in place.
 
-    Parameters
-    ----------
-    linear : bool
-        Which equations: the matrices, or magnet and body.
-    x : ndarray, shape (n_states,), SI
-        State; position and velocity come first where the plant has them.
-    centre : ndarray, shape (n_states,), SI
-        Where the matrices hold.
-    voltages : (float, float, float)
-        Before and after the delay's fraction has passed, and that at `centre`, V.
-    disturbance : ndarray, shape (n_disturbances,), SI
-        Held over the sample; of the nonlinear plant force, then voltage.
-    matrices : tuple of ndarray
-        A (n_states, n_states), B and B_late (n_states,), E (n_states, n_disturbances), as `Standing.matrices` has them.
-    magnet, body : ndarray, shapes (7,) or (12,), and (10,)
-        As `Standing.nonlinear` has them.
-    timing : (float, float, int)
-        Fraction of the period in which the earlier voltage acts, period in s, Runge-Kutta steps.
-    stops : (float, float)
-        Where the rotor is stopped, m.
-    room : ndarray, shape (n_states,)
-        To work in.
-
-    Returns
-    -------
-    bool
-        Whether the rotor touched a stop.
+    `linear`: which equations: the matrices, or magnet and body; `x`: (n_states,), SI, state; position and velocity come
+    first where the plant has them; `centre`: (n_states,), SI, where the matrices hold; `voltages`: before and after the
+    delay's fraction has passed, and that at `centre`, V; `disturbance`: (n_disturbances,), SI, held over the sample; of
+    the nonlinear plant force, then voltage; `matrices`: a (n_states, n_states), B and B_late (n_states,), E (n_states,
+    n_disturbances), as `Standing.matrices` has them; `magnet`, `body`: as `Standing.nonlinear` has them; `stops`: where
+    the rotor is stopped, m; `room`: (n_states,), to work in. Returns whether the rotor touched a stop.
     """
     late, now, rest = voltages
     if not linear:

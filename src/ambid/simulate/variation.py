@@ -62,17 +62,7 @@ class Variation:
 def check_variation(variation: Variation, of: LinearModel) -> None:
     """Refuse what a model does not have.
 
-    Parameters
-    ----------
-    variation : Variation
-        What is to change.
-    of : LinearModel
-        The model that is simulated.
-
-    Raises
-    ------
-    ModelError
-        If something varies that the model does not have, or a positive parameter reaches zero.
+    `variation`: what is to change; `of`: the model that is simulated.
     """
     specs = {s.name: s for s in of.parameters}
     for name, schedule in variation.parameters.items():

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.nonlinear import OperatingPoint
@@ -25,8 +26,6 @@ from ambid.simulate.bench import Simulation
 from ambid.simulate.plant import LinearPlant, Standing
 from ambid.simulate.poles import closed_loop_poles
 from ambid.simulate.variation import Variation, check_variation
-
-Array = NDArray[np.float64]
 
 GRID_S = 1e-3
 """Longest stretch of equal parameters while they drift, in s."""
@@ -313,19 +312,8 @@ def simulate_varying(
 def gathered(running: VaryingLoop, stretches: Iterable[Stretch], seed: int | np.random.Generator) -> Simulation:
     """Return all stretches of a run as one simulation.
 
-    Parameters
-    ----------
-    running : VaryingLoop
-        The bench, after it has made the stretches.
-    stretches : iterable of Stretch
-        All of them, in order.
-    seed : int or numpy.random.Generator
-        For the record's history.
-
-    Returns
-    -------
-    Simulation
-        As `simulate_varying`.
+    `running`: the bench, after it has made the stretches; `stretches`: all of them, in order; `seed`: for the record's
+    history. Returns as `simulate_varying`.
     """
     parts = list(stretches)
     standing, loop, rate_hz = running.standing, running.loop, running.rate_hz

@@ -1,1 +1,14 @@
-"""On-line identification: recursive estimators, filters, supervised tracking of a bench's physical parameters."""
+"""On-line identification under supervision: evidence, filter, change detection, gate, stream."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.track.lines_read import read_track as read_track
+    from ambid.track.physical.rpem import PhysicalRpem as PhysicalRpem
+    from ambid.track.physical.window import MovingWindow as MovingWindow
+
+__getattr__, __dir__, __all__ = exports(__name__)

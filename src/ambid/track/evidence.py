@@ -10,41 +10,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evidence:
-    """One block's evidence. All tracked numbers are in units of their own magnitude, so that they are of order one.
+    """One block's evidence. All tracked numbers are in units of their own magnitude, so that they are of order one."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The tracked numbers: physical parameters, then offsets and the like.
-    at : ndarray, shape (p,)
-        Where the predictor was linearised.
-    J : ndarray, shape (p, p)
-        Upper triangle; J^T J is the information of the block.
-    r : ndarray, shape (p,)
-        Explainable part of the weighted innovations at `at`, with unit covariance.
-    rest : float
-        Squared length of what no change of q explains: chi-squared with `freedom` degrees if the model is right.
-    n_samples, n_outputs : int
-        Samples used, and outputs of each.
-    first, last : int
-        Sample numbers of the stream: the block is first <= k < last.
-    """
-
-    names: tuple[str, ...]
-    at: Array
-    J: Array
-    r: Array
+    names: tuple[str, ...]  # the tracked numbers: physical parameters, then offsets and the like
+    at: Array  # (p,), where the predictor was linearised
+    J: Array  # (p, p), upper triangle; J^T J is the information of the block
+    r: Array  # (p,), explainable part of the weighted innovations at `at`, with unit covariance
+    # squared length of what no change of q explains: chi-squared with `freedom` degrees if the model is right
     rest: float
-    n_samples: int
+    n_samples: int  # samples used, and outputs of each
     n_outputs: int
-    first: int
+    first: int  # sample numbers of the stream: the block is first <= k < last
     last: int
 
     @property
@@ -60,26 +42,14 @@ class Evidence:
     def residual(self, q: Array) -> Array:
         """Return r + J (q - at), shape (p,), unit covariance if `q` is the truth.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        ndarray, shape (p,)
+        `q`: (p,). Returns (p,).
         """
         return np.asarray(self.r + self.J @ (q - self.at))
 
     def loss(self, q: Array) -> float:
         """Return the sum of squared weighted innovations at `q`, to second order around `at`.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        float
+        `q`: (p,).
         """
         left = self.residual(q)
         return float(self.rest + left @ left)

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self, TextIO
 
 from ambid.errors import AmbidError, RecordError
-from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.tally import most_important
 
 SCHEMA = "ambid.track/1"
@@ -27,14 +27,7 @@ _dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, check_circular=Fa
 def header_json(header: TrackHeader) -> dict[str, Any]:
     """Return the first line of a track.
 
-    Parameters
-    ----------
-    header : TrackHeader
-
-    Returns
-    -------
-    dict
-        With ``schema``; a number that is not finite is None.
+    Returns with ``schema``; a number that is not finite is None.
     """
     return {
         "schema": SCHEMA,
@@ -53,15 +46,8 @@ def header_json(header: TrackHeader) -> dict[str, Any]:
 def line_json(line: TrackLine) -> dict[str, Any]:
     """Return the line of one reporting interval.
 
-    Parameters
-    ----------
-    line : TrackLine
-
-    Returns
-    -------
-    dict
-        ``event`` is the most important of ``events``, None without any; ``ci95`` is value ± 1.96 sd; a number that is
-        not known is None.
+    Returns ``event`` is the most important of ``events``, None without any; ``ci95`` is value ± 1.96 sd; a number that
+    is not known is None.
     """
     found: dict[str, Any] = {
         "t": _number(line.t),
@@ -80,14 +66,7 @@ def line_json(line: TrackLine) -> dict[str, Any]:
 def event_json(event: Event) -> dict[str, Any]:
     """Return one event.
 
-    Parameters
-    ----------
-    event : Event
-
-    Returns
-    -------
-    dict
-        ``kind``, ``t`` and ``why``; ``parameter``, ``samples`` and ``values`` where there are any.
+    Returns ``kind``, ``t`` and ``why``; ``parameter``, ``samples`` and ``values`` where there are any.
     """
     found: dict[str, Any] = {"kind": event.kind, "t": _number(event.t), "why": event.why}
     if event.parameter is not None:
@@ -102,14 +81,7 @@ def event_json(event: Event) -> dict[str, Any]:
 def summary_json(summary: TrackSummary) -> dict[str, Any]:
     """Return the last line of a track.
 
-    Parameters
-    ----------
-    summary : TrackSummary
-
-    Returns
-    -------
-    dict
-        One key, ``summary``.
+    Returns one key, ``summary``.
     """
     latency = summary.latency
     waits = ("median", "p99", "largest")
@@ -156,10 +128,7 @@ class TrackWriter:
 
     The file is opened with the header, not before: a run that is refused leaves an older file as it was.
 
-    Parameters
-    ----------
-    target : Path, str or text file
-        A stream is not closed.
+    `target`: a stream is not closed.
     """
 
     def __init__(self, target: str | Path | TextIO) -> None:
@@ -174,17 +143,7 @@ class TrackWriter:
         return self._begun
 
     def header(self, header: TrackHeader) -> None:
-        """Open the file and write the first line.
-
-        Parameters
-        ----------
-        header : TrackHeader
-
-        Raises
-        ------
-        AmbidError
-            If the system does not let it be written.
-        """
+        """Open the file and write the first line."""
         if self._stream is None and self._path is not None:
             try:
                 self._stream = self._path.open("w", encoding="utf-8", newline="\n")
@@ -194,31 +153,11 @@ class TrackWriter:
         self._put(header_json(header))
 
     def line(self, line: TrackLine) -> None:
-        """Write the line of one reporting interval.
-
-        Parameters
-        ----------
-        line : TrackLine
-
-        Raises
-        ------
-        AmbidError
-            If the system does not let it be written.
-        """
+        """Write the line of one reporting interval."""
         self._put(line_json(line))
 
     def summary(self, summary: TrackSummary) -> None:
-        """Write the last line.
-
-        Parameters
-        ----------
-        summary : TrackSummary
-
-        Raises
-        ------
-        AmbidError
-            If the system does not let it be written.
-        """
+        """Write the last line."""
         self._put(summary_json(summary))
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, get_args
 
 from ambid.errors import RecordError
 from ambid.record.files import file_bytes
-from ambid.track.lines import (
+from ambid.recursive.lines import (
     Event,
     EventKind,
     Latency,

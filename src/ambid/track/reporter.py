@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ambid.track.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.track.physical.signals import Samples
 from ambid.track.supervise.supervisor import Supervisor
 
 if TYPE_CHECKING:
-    from ambid.track.lines import Latency
+    from ambid.recursive.lines import Latency
     from ambid.track.stream.outcome import Rejection
 
 
@@ -26,27 +26,12 @@ _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 class Reporter:
     """Feeds a supervisor and makes lines of what it says.
 
-    Parameters
-    ----------
-    supervisor : Supervisor
-        Its `log` calls `Reporter.note`.
-    every_s : float
-        Reporting interval, s.
-    on_line : callable
-        Called with each line; may return flags that an operator set.
-    flags : sequence of (float, str)
-        What an operator sets and when, s of record.
-    t0 : float
-        Time of sample 0, s of record.
-    first : int
-        Number of the first sample that is tracked.
+    `supervisor`: its `log` calls `Reporter.note`; `every_s`: reporting interval, s; `on_line`: called with each line;
+    may return flags that an operator set; `flags`: what an operator sets and when, s of record; `t0`: time of sample 0,
+    s of record; `first`: number of the first sample that is tracked.
 
-    Attributes
-    ----------
-    every_s : float
-        Reporting interval, at least one sample long.
-    lines, samples, rejected : int
-        Lines made, samples used, samples rejected.
+    `every_s`: reporting interval, at least one sample long; `lines`: lines made, samples used, samples rejected;
+    `samples`: lines made, samples used, samples rejected; `rejected`: lines made, samples used, samples rejected.
     """
 
     def __init__(
@@ -71,25 +56,13 @@ class Reporter:
         self.lines = self.samples = self.rejected = 0
 
     def note(self, event: Event) -> None:
-        """Keep an event for the next line.
-
-        Parameters
-        ----------
-        event : Event
-        """
+        """Keep an event for the next line."""
         self._events.append(event)
 
     def consume(self, samples: Samples, first: int, *, restart: bool = False) -> None:
         """Take in consecutive samples and make the lines that they complete.
 
-        Parameters
-        ----------
-        samples : Samples
-            Finite.
-        first : int
-            Number of the first one.
-        restart : bool
-            Samples are missing before it.
+        `samples`: finite; `first`: number of the first one; `restart`: samples are missing before it.
         """
         self._pass(first)
         self._obey(first)
@@ -103,12 +76,7 @@ class Reporter:
                 self._report()
 
     def reject(self, rejection: Rejection) -> None:
-        """Count samples that were not used, and say so.
-
-        Parameters
-        ----------
-        rejection : Rejection
-        """
+        """Count samples that were not used, and say so."""
         self.rejected += rejection.samples
         first = round(rejection.t * self._rate)
         passing = rejection.kind in _PASSING
@@ -173,16 +141,7 @@ class Reporter:
     def summary(self, *, computing_s: float, latency: Latency | None = None, complete: bool = True) -> TrackSummary:
         """Return the last line.
 
-        Parameters
-        ----------
-        computing_s : float
-        latency : Latency, optional
-        complete : bool
-            Whether the run came to the end of its record.
-
-        Returns
-        -------
-        TrackSummary
+        `complete`: whether the run came to the end of its record.
         """
         s = self.supervisor
         return TrackSummary(
@@ -210,20 +169,7 @@ def header(
 ) -> TrackHeader:
     """Return the first line of a track.
 
-    Parameters
-    ----------
-    supervisor : Supervisor
-        Before its first sample.
-    limit : float
-    every_s : float
-    method : str
-    record : Mapping[str, object]
-    warnings : sequence of str
-        What to mistrust of the start.
-
-    Returns
-    -------
-    TrackHeader
+    `supervisor`: before its first sample; `warnings`: what to mistrust of the start.
     """
     numbers = supervisor.rpem.numbers
     start: dict[str, TrackedValue] = supervisor.parameters

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from ambid.track.lines import Event, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, TrackHeader, TrackLine, TrackSummary
 
 # What a reader has to know first, when several things happened in one reporting interval.
 _IMPORTANCE = (
@@ -20,25 +20,13 @@ _IMPORTANCE = (
 def most_important(events: Sequence[Event]) -> Event:
     """Return the event that a reader has to know first; of the same kind the first.
 
-    Parameters
-    ----------
-    events : sequence of Event
-        At least one.
-
-    Returns
-    -------
-    Event
+    `events`: at least one.
     """
     return min(events, key=lambda e: _IMPORTANCE.index(e.kind))
 
 
 class Tally:
-    """Counts of a track.
-
-    Parameters
-    ----------
-    header : TrackHeader
-    """
+    """Counts of a track."""
 
     def __init__(self, header: TrackHeader) -> None:
         """Begin before the first line."""
@@ -77,12 +65,7 @@ class Tally:
         return 0.0 if self._begin_s is None else self._end_s - self._begin_s
 
     def add(self, line: TrackLine) -> None:
-        """Count one line.
-
-        Parameters
-        ----------
-        line : TrackLine
-        """
+        """Count one line."""
         if self._begin_s is None:
             self._begin_s = line.t - self._header.every_s
         self._end_s = line.t
@@ -109,17 +92,8 @@ class Tally:
     def summary(self, *, computing_s: float = float("nan"), complete: bool = True) -> TrackSummary:
         """Return what was counted.
 
-        Parameters
-        ----------
-        computing_s : float
-            Time that was spent on it, s; NaN where it is not known.
-        complete : bool
-            Whether the run came to the end of its record.
-
-        Returns
-        -------
-        TrackSummary
-            Without latency; `samples` follows from time and rate, `updates` counts lines.
+        `computing_s`: time that was spent on it, s; NaN where it is not known; `complete`: whether the run came to the
+        end of its record. Returns without latency; `samples` follows from time and rate, `updates` counts lines.
         """
         return TrackSummary(
             samples=round(self.seconds_of_record * self._header.rate_hz),

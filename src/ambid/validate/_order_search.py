@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.orders import UsedOrders, shown
-from ambid.identify.blackbox.structures import Structure
+from ambid.blackbox.data import IOData
+from ambid.blackbox.orders import UsedOrders, shown
+from ambid.blackbox.structures import Structure
 from ambid.validate.arx_orders import ArxCandidate, arx_candidates
 
 Point = tuple[int, ...]
@@ -18,42 +18,23 @@ _SIZES, _DELAYS, _TAPS = 10, 20, 60  # most states, delay in samples, coefficien
 _PATIENCE = 3  # sizes without an improvement after which a line ends
 _BUDGET = 40  # fits
 _SLOW = 6  # most states, and half the fits, for the instrumental structures, whose fits take longer
-_INSTRUMENTAL = "ambid.identify.instrumental"
+_INSTRUMENTAL = "ambid.blackbox.instrumental"
 _FINALISTS = 12  # ARX candidates that are fitted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
-    """Where a search begins.
+    """Where a search begins."""
 
-    Attributes
-    ----------
-    bounds : Mapping[str, (int, int)]
-        Least and largest value of each order.
-    nk : tuple of int
-        Its delays.
-    arx : tuple of ArxCandidate
-        All ARX models that were compared.
-    """
-
-    bounds: Mapping[str, tuple[int, int]]
-    nk: tuple[int, ...]
-    arx: tuple[ArxCandidate, ...]
+    bounds: Mapping[str, tuple[int, int]]  # least and largest value of each order
+    nk: tuple[int, ...]  # its delays
+    arx: tuple[ArxCandidate, ...]  # all ARX models that were compared
 
 
 def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]]) -> Start:
     """Compare ARX models of all sizes and delays, as far as the record is long enough for them.
 
-    Parameters
-    ----------
-    of : Structure
-    data : IOData
-    ranges : Mapping[str, (int, int)]
-        The user's.
-
-    Returns
-    -------
-    Start
+    `ranges`: the user's.
     """
     n_u = max(data.n_inputs, 1)
     room = max(data.n_samples // 10, 4)  # coefficients that a record of this length can tell
@@ -75,16 +56,7 @@ def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]
 
 
 def searched_orders(of: Structure, start: Start, n_inputs: int, score: Callable[[UsedOrders], float]) -> None:
-    """Fit candidates, each once, until none of those around the best is better or the budget is spent.
-
-    Parameters
-    ----------
-    of : Structure
-    start : Start
-    n_inputs : int
-    score : callable
-        Fits and scores orders, less is better; it keeps the record of what was tried.
-    """
+    """Fit candidates, each once, until none of those around the best is better or the budget is spent."""
     if of.name in ("arx", "fir"):
         for orders in _finalists(of, start):
             score(orders)

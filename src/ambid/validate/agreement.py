@@ -12,14 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.greybox import carry
-from ambid.identify.likelihood import Fit, search
-from ambid.identify.predictor import assemble
-from ambid.identify.uncertainty import inverse_information
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
+from ambid.bearing.greybox import carry
+from ambid.estimation.likelihood import Fit, search
+from ambid.estimation.predictor import assemble
+from ambid.estimation.uncertainty import inverse_information
 
 STRIDES = (2, 4)
 MOST = 4.0  # shift in its standard deviations that chance allows
@@ -27,25 +25,14 @@ MOST = 4.0  # shift in its standard deviations that chance allows
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Agreement:
-    """Estimates from a record used in other ways.
+    """Estimates from a record used in other ways."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Estimated physical parameters.
-    shift : ndarray, shape (n_refits, n), SI
-        Refitted value minus estimate.
-    sd : ndarray, shape (n_refits, n), SI
-        Standard deviation of the shift under the right model: the refit uses less of the data, so that its variance
-        less that of the fit is that of their difference (Hausman 1978).
-    strides : tuple of int
-        Of the refits that converged.
-    """
-
-    names: tuple[str, ...]
-    shift: Array
+    names: tuple[str, ...]  # estimated physical parameters
+    shift: Array  # (n_refits, n), SI, refitted value minus estimate
+    # (n_refits, n), SI, standard deviation of the shift under the right model: the refit uses less of the data, so
+    # that its variance less that of the fit is that of their difference (Hausman 1978)
     sd: Array
-    strides: tuple[int, ...]
+    strides: tuple[int, ...]  # of the refits that converged
 
     @property
     def largest(self) -> float:
@@ -60,10 +47,7 @@ class Agreement:
     def disagreement(self) -> Array:
         """Return how far the parameters move in the refit in which they move most.
 
-        Returns
-        -------
-        ndarray, shape (n,), SI
-            Zeros where no refit converged.
+        Returns (n,), SI, zeros where no refit converged.
         """
         if not self.strides:
             return np.zeros(len(self.names))
@@ -73,15 +57,7 @@ class Agreement:
 def agreement(fit: Fit) -> Agreement:
     """Refit a record with every second and every fourth output.
 
-    Parameters
-    ----------
-    fit : Fit
-        Not failed.
-
-    Returns
-    -------
-    Agreement
-        Refits that do not converge are left out.
+    `fit`: not failed. Returns refits that do not converge are left out.
     """
     problem = fit.problem
     size, n = problem.magnitude, problem.n_physical

@@ -6,29 +6,15 @@ e(t) + C K e(t-1) + ... + C A^(k-2) K e(t-k+1) (Ljung 1999, sec. 3.2).
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 
 def errors_ahead(e: Array, A: Array, K: Array, C: Array, steps: int) -> Array:
     """Return the prediction errors `steps` samples ahead.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_samples, n_outputs)
-        Innovations.
-    A : ndarray, shape (n, n)
-    K : ndarray, shape (n, n_outputs)
-    C : ndarray, shape (n_outputs, n)
-    steps : int
-        At least 1.
-
-    Returns
-    -------
-    ndarray, shape (n_samples - steps + 1, n_outputs)
-        Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
+    `e`: (n_samples, n_outputs), innovations; `A`: (n, n); `K`: (n, n_outputs); `C`: (n_outputs, n); `steps`: at least
+    1. Returns (n_samples - steps + 1, n_outputs), row k is the error at sample k + steps - 1, predicted from outputs
+    before sample k.
     """
     n, out, power = e.shape[0], e[steps - 1 :].copy(), K
     for j in range(1, steps):
@@ -40,19 +26,8 @@ def errors_ahead(e: Array, A: Array, K: Array, C: Array, steps: int) -> Array:
 def covariance_ahead(innovation: Array, A: Array, K: Array, C: Array, steps: int) -> Array:
     """Return the covariance that the model gives its own errors `steps` samples ahead.
 
-    Parameters
-    ----------
-    innovation : ndarray, shape (n_outputs, n_outputs)
-        Covariance of the innovations.
-    A : ndarray, shape (n, n)
-    K : ndarray, shape (n, n_outputs)
-    C : ndarray, shape (n_outputs, n)
-    steps : int
-        At least 1.
-
-    Returns
-    -------
-    ndarray, shape (n_outputs, n_outputs)
+    `innovation`: (n_outputs, n_outputs), covariance of the innovations; `A`: (n, n); `K`: (n, n_outputs); `C`:
+    (n_outputs, n); `steps`: at least 1. Returns (n_outputs, n_outputs).
     """
     total, power = innovation.copy(), K
     for _ in range(1, steps):

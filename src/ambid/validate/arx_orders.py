@@ -11,40 +11,25 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
 from ambid.signals.lagged import lagged_triangle
 
-Array = NDArray[np.float64]
 Bounds = Mapping[str, tuple[int, int]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArxCandidate:
-    """One choice of orders.
+    """One choice of orders."""
 
-    Attributes
-    ----------
-    na, nb : int
-        nb for every input.
-    nk : tuple of int
-        One for each input.
-    n_estimated : int
-        Over all outputs.
-    log_det : float
-        Sum over outputs of the log of the mean squared one-step error, SI squared.
-    n_rows : int
-        Samples used.
-    """
-
-    na: int
+    na: int  # nb for every input
     nb: int
-    nk: tuple[int, ...]
-    n_estimated: int
-    log_det: float
-    n_rows: int
+    nk: tuple[int, ...]  # one for each input
+    n_estimated: int  # over all outputs
+    log_det: float  # sum over outputs of the log of the mean squared one-step error, SI squared
+    n_rows: int  # samples used
 
     @property
     def bic(self) -> float:
@@ -55,21 +40,8 @@ class ArxCandidate:
 def arx_candidates(data: IOData, bounds: Bounds) -> tuple[ArxCandidate, ...]:
     """Compare ARX models of all orders within bounds.
 
-    Parameters
-    ----------
-    data : IOData
-    bounds : Mapping[str, (int, int)]
-        Least and largest na, nb and nk.
-
-    Returns
-    -------
-    tuple of ArxCandidate
-        For one input all combinations; for several, delays one input after the other, twice.
-
-    Raises
-    ------
-    EstimationError
-        If the record is too short for the largest orders.
+    `bounds`: least and largest na, nb and nk. Returns for one input all combinations; for several, delays one input
+    after the other, twice.
     """
     (na0, na1), (nb0, nb1), (nk0, nk1) = (bounds[k] for k in ("na", "nb", "nk"))
     first = max(na1, nk1 + nb1 - 1 if data.n_inputs else 0)

@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.identify.estimate import Check
-from ambid.identify.likelihood import Fit, freed
-from ambid.identify.multistart import MAX_DELAY
-from ambid.identify.uncertainty import Uncertainty, inverse_information
+from ambid.bearing.multistart import MAX_DELAY
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit, freed
+from ambid.estimation.uncertainty import Uncertainty, inverse_information
 
 _P_LEAST = 1e-3
 _FAR = 3.3  # standard deviations between a prior and the record
@@ -18,16 +18,7 @@ _FAR = 3.3  # standard deviations between a prior and the record
 def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
     """Check what was taken for known.
 
-    Parameters
-    ----------
-    fit : Fit
-    known : Uncertainty
-    delay_how : {"estimated", "given"}
-
-    Returns
-    -------
-    dict of str to Check
-        ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``long_enough``.
+    Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``long_enough``.
     """
     return {
         "fixed_agree": _fixed_agree(fit),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.estimate import Check
-from ambid.identify.hints import experiment_hint
-from ambid.identify.likelihood import Fit
-from ambid.identify.uncertainty import Uncertainty
+from ambid.arrays import Array
+from ambid.bearing.hints import experiment_hint
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit
+from ambid.estimation.uncertainty import Uncertainty
 from ambid.record import Record
 from ambid.signals.dropouts import find_dropouts
 from ambid.signals.outliers import find_outliers
@@ -18,8 +18,6 @@ from ambid.signals.saturation import find_saturation
 from ambid.validate.agreement import Agreement
 from ambid.validate.plausibility import implausible
 from ambid.validate.residuals import P_LEAST, ResidualTest, residuals_uncorrelated, residuals_white
-
-Array = NDArray[np.float64]
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
@@ -29,20 +27,9 @@ _SATURATED = 0.005  # part of the samples at a limit that a check lets pass
 def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
     """Check what the innovations say of the model, and with that of its standard deviations.
 
-    Parameters
-    ----------
-    fit : Fit
-    e : ndarray, shape (n_used, n_outputs)
-        Innovations, scaled.
-    known : Uncertainty
-    moved : Agreement
-        Estimates from the record used in other ways.
-
-    Returns
-    -------
-    dict of str to Check
-        ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one
-        fails, the robust standard deviations are to be used.
+    `e`: (n_used, n_outputs), innovations, scaled; `moved`: estimates from the record used in other ways. Returns
+    ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
+    the robust standard deviations are to be used.
     """
     return {
         "residuals_white": residual_check(residuals_white(fit, e), "innovations against their own past"),
@@ -77,32 +64,14 @@ def _agreement_check(moved: Agreement) -> Check:
 
 
 def explained_by_inputs(*against_inputs: ResidualTest | None) -> bool:
-    """Return whether residuals hold a function of past inputs: then inputs depend on them without any feedback.
-
-    Parameters
-    ----------
-    *against_inputs : ResidualTest or None
-        Tests of residuals against past inputs, or functions of them; None for one that was not made.
-
-    Returns
-    -------
-    bool
-    """
+    """Return whether residuals hold a function of past inputs: then inputs depend on them without any feedback."""
     return any(x is not None and x.p < P_LEAST for x in against_inputs)
 
 
 def residual_check(test: ResidualTest, what: str) -> Check:
     """Put a residual test into words.
 
-    Parameters
-    ----------
-    test : ResidualTest
-    what : str
-        What was tested against what.
-
-    Returns
-    -------
-    Check
+    `what`: what was tested against what.
     """
     verdict = "nothing is left" if test.passed else "something is left that the model does not explain"
     return Check(
@@ -122,19 +91,8 @@ def residual_check(test: ResidualTest, what: str) -> Check:
 def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
     """Check whether the parameters are shown by the data, can exist, and come from signals within their limits.
 
-    Parameters
-    ----------
-    fit : Fit
-    known : Uncertainty
-    record : Record
-        Channels named by role.
-    robust : bool
-        Which standard deviations count.
-
-    Returns
-    -------
-    dict of str to Check
-        ``identifiable``, ``plausible``, ``within_limits``, ``signals_sound``.
+    `record`: channels named by role; `robust`: which standard deviations count. Returns ``identifiable``,
+    ``plausible``, ``within_limits``, ``signals_sound``.
     """
     theta = fit.problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
@@ -169,15 +127,7 @@ def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, r
 def lowest_power_hz(u: Array, rate_hz: float) -> float:
     """Return the frequency below which the inputs have 0.1 % of their power.
 
-    Parameters
-    ----------
-    u : ndarray, shape (n_samples, n_inputs)
-    rate_hz : float
-
-    Returns
-    -------
-    float
-        Hz.
+    `u`: (n_samples, n_inputs). Returns hz.
     """
     power = np.sum(np.abs(np.fft.rfft(u - u.mean(axis=0), axis=0)) ** 2, axis=1)
     total = np.cumsum(power)

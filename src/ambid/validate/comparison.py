@@ -9,11 +9,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.orders import Orders
+from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.orders import Orders
-from ambid.identify.blackbox.structures import structure
 from ambid.validate.blackbox import judged
 from ambid.validate.holdout import HELD_OUT, hold_out
 from ambid.validate.selection import select
@@ -21,30 +21,16 @@ from ambid.validate.selection import select
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Entry:
-    """One structure in a comparison.
-
-    Attributes
-    ----------
-    structure : str
-    orders : Mapping[str, int or tuple of int]
-        As used; as asked for, or empty, where it could not be fitted.
-    fit : BlackBoxFit or None
-        Judged, with its validation; None where the estimator refused.
-    one_step, simulation : float or None
-        NRMSE fit on data not used in the estimation, mean over the outputs; None where there is none.
-    seconds : float
-        Time of the fit, choice of orders included.
-    refusal : str
-        Why there is no fit.
-    """
+    """One structure in a comparison."""
 
     structure: str
-    orders: Orders
-    fit: BlackBoxFit | None
+    orders: Orders  # as used; as asked for, or empty, where it could not be fitted
+    fit: BlackBoxFit | None  # judged, with its validation; None where the estimator refused
+    # NRMSE fit on data not used in the estimation, mean over the outputs; None where there is none
     one_step: float | None
     simulation: float | None
-    seconds: float
-    refusal: str = ""
+    seconds: float  # time of the fit, choice of orders included
+    refusal: str = ""  # why there is no fit
 
     @property
     def failed(self) -> tuple[str, ...]:
@@ -54,38 +40,22 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """Structures compared, best first.
+    """Structures compared, best first."""
 
-    Attributes
-    ----------
-    entries : tuple of Entry
-        Sorted by the one-step fit on unseen data; those without one last.
-    inputs, outputs : tuple of str
-    fitted_samples, judged_samples : int
-    judged_on : str
-        ``"second record"`` or ``"last 30 % of the record"``.
-    summary : str
-        One line: what the differences mean.
-    record : Mapping[str, object]
-    """
-
-    entries: tuple[Entry, ...]
+    entries: tuple[Entry, ...]  # sorted by the one-step fit on unseen data; those without one last
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     fitted_samples: int
     judged_samples: int
-    judged_on: str
-    summary: str
+    judged_on: str  # ``"second record"`` or ``"last 30 % of the record"``
+    summary: str  # one line: what the differences mean
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
 
     def as_dict(self) -> dict[str, object]:
         """Return the table, ready for JSON.
 
-        Returns
-        -------
-        dict
-            ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds and
-            refusal; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
+        Returns ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds
+        and refusal; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
         """
         return {
             "judged_on": self.judged_on,
@@ -122,30 +92,10 @@ def compare(
 ) -> Comparison:
     """Fit structures to the same samples and judge them on others.
 
-    Parameters
-    ----------
-    data : IOData
-    candidates : sequence of (str, Mapping or None)
-        Structures with their orders; None chooses them by `criterion`.
-    holdout : float, optional
-        Last part of the record that is not fitted, 0 to 1; not used with a second record.
-    second : IOData, optional
-        Other data to judge on; then all of `data` is fitted.
-    criterion : str, optional
-        For orders that are not given, see `ambid.validate.selection.select`.
-    tick : callable, optional
-        Called with the structure before each fit; may raise to interrupt.
-
-    Returns
-    -------
-    Comparison
-        A structure that cannot be fitted is in it, with the reason.
-
-    Raises
-    ------
-    EstimationError
-        If there is no candidate, a structure or criterion is unknown, the hold-out does not fit the record, or no
-        candidate could be fitted.
+    `candidates`: structures with their orders; None chooses them by `criterion`; `second`: other data to judge on; then
+    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validate.selection.select`; `tick`:
+    called with the structure before each fit; may raise to interrupt. Returns a structure that cannot be fitted is in
+    it, with the reason.
     """
     if not candidates:
         raise EstimationError("nothing to compare; name at least one structure")

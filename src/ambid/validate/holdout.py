@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.validate.blackbox.predictor import errors_elsewhere
-
-Array = NDArray[np.float64]
 
 FOLDS = 5
 HELD_OUT = 0.3
@@ -24,12 +21,7 @@ _GAP = 50  # samples at the start of a part that are not judged, at most a tenth
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fold:
-    """One part to fit on, one to judge on.
-
-    Attributes
-    ----------
-    fitted, judged : IOData
-    """
+    """One part to fit on, one to judge on."""
 
     fitted: IOData
     judged: IOData
@@ -38,20 +30,7 @@ class Fold:
 def hold_out(data: IOData, part: float = HELD_OUT) -> Fold:
     """Hold the last part of a record out.
 
-    Parameters
-    ----------
-    data : IOData
-    part : float, optional
-        0 to 1.
-
-    Returns
-    -------
-    Fold
-
-    Raises
-    ------
-    EstimationError
-        If a part would be too short.
+    `part`: 0 to 1.
     """
     if not 0 < part < 1:
         raise EstimationError(f"a hold-out of {part:g} of the record; it must be between 0 and 1. Give 0.3, say")
@@ -69,20 +48,7 @@ def folds(data: IOData, count: int = FOLDS) -> tuple[Fold, ...]:
 
     A fit needs samples without a break, so that it cannot use both sides of a block.
 
-    Parameters
-    ----------
-    data : IOData
-    count : int, optional
-        Number of blocks, at least 2.
-
-    Returns
-    -------
-    tuple of Fold
-
-    Raises
-    ------
-    EstimationError
-        If a block would be too short.
+    `count`: number of blocks, at least 2.
     """
     if count < 2 or data.n_samples // count < _LEAST:
         raise EstimationError(
@@ -103,19 +69,9 @@ def held_out_error(
 ) -> float:
     """Return the root mean squared error on parts that a fit has not seen, relative to the outputs.
 
-    Parameters
-    ----------
-    parts : sequence of Fold
-    fitted : callable
-        Makes a fit from data.
-    tick : callable, optional
-        Called before each fit.
-
-    Returns
-    -------
-    float
-        1 is as bad as the mean; over all outputs, each relative to its own variance. One-step errors; for an
-        output-error model simulation errors. Infinite where a model cannot be run.
+    `fitted`: makes a fit from data; `tick`: called before each fit. Returns 1 is as bad as the mean; over all outputs,
+    each relative to its own variance. One-step errors; for an output-error model simulation errors. Infinite where a
+    model cannot be run.
     """
     total, weight = 0.0, 0
     for fold in parts:

@@ -6,18 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.bearing.magnet.likelihood import BearingFit, run
+from ambid.bearing.magnet.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
+from ambid.bearing.magnet.residual_test import whiteness
+from ambid.bearing.magnet.result import NonlinearBearingEstimate
+from ambid.bearing.magnet.weight import weight_carried
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Check
-from ambid.identify.nonlinear_bearing.likelihood import BearingFit, run
-from ambid.identify.nonlinear_bearing.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
-from ambid.identify.nonlinear_bearing.residual_test import whiteness
-from ambid.identify.nonlinear_bearing.result import NonlinearBearingEstimate
-from ambid.identify.nonlinear_bearing.weight import weight_carried
+from ambid.estimation.estimate import Check
 from ambid.validate.prediction import fit_of
-
-Array = NDArray[np.float64]
 
 _ROLES = ("position", "current")
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
@@ -29,25 +27,14 @@ _WEIGHT = 0.1  # relative error of the force at rest that a check lets pass
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingReplay:
-    """A record run through an estimate, SI units.
+    """A record run through an estimate, SI units."""
 
-    Attributes
-    ----------
-    fit : BearingFit
-        The estimate's problem on this record alone, with every number at its estimate.
-    noise_of : str
-        The record of the estimate whose noise levels were taken.
-    first : int
-        Sample at which row 0 of the arrays stands.
-    measured, predicted, innovations, sd : ndarray, shape (n_used, 2)
-        Position and current: measured, predicted from all samples before, their difference, and the standard deviation
-        that the predictor expects of it; NaN for what is not predicted: the position of a held rotor, and samples that
-        were left out.
-    """
-
-    fit: BearingFit
-    noise_of: str
-    first: int
+    fit: BearingFit  # the estimate's problem on this record alone, with every number at its estimate
+    noise_of: str  # the record of the estimate whose noise levels were taken
+    first: int  # sample at which row 0 of the arrays stands
+    # (n_used, 2), position and current: measured, predicted from all samples before, their difference, and the
+    # standard deviation that the predictor expects of it; NaN for what is not predicted: the position of a held rotor,
+    # and samples that were left out
     measured: Array
     predicted: Array
     innovations: Array
@@ -57,23 +44,7 @@ class BearingReplay:
 def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_of: str | None = None) -> BearingReplay:
     """Run a record through the predictor of an estimate.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    record : BearingRecord
-        Of the same bench, at a rate of the records that it came from.
-    noise_of : str, optional
-        Name of the record of the estimate whose noise levels are taken; default: of those of this rate and kind, that
-        under which this record is likeliest.
-
-    Returns
-    -------
-    BearingReplay
-
-    Raises
-    ------
-    EstimationError
-        If no record of the estimate had this rate, this one is too short, or there is no predictor for it.
+    `record`: of the same bench, at a rate of the records that it came from.
     """
     delay = estimate.delay_samples(record.rate_hz)
     kind = [
@@ -105,7 +76,7 @@ def _fit(
     estimate: NonlinearBearingEstimate, record: BearingRecord, levels: Mapping[str, float], delay: float
 ) -> BearingFit:
     """The estimate's problem on one record, and its criterion there (infinite without a predictor)."""
-    from ambid.identify.nonlinear_bearing.likelihood import criterion
+    from ambid.bearing.magnet.likelihood import criterion
 
     values, law = estimate.values, estimate.law
     numbers = tuple(
@@ -158,25 +129,11 @@ def _replayed(fit: BearingFit, name: str) -> BearingReplay:
 def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[str, object]:
     """Judge an estimate on a further record: nothing is fitted but the state at its beginning.
 
-    Parameters
-    ----------
-    estimate : NonlinearBearingEstimate
-    record : BearingRecord
-        Of a rotor that moves.
-
-    Returns
-    -------
-    dict
-        ``fit``: by output one_step, simulation (None: one magnet falls or clings), innovation_rms in SI and ratio to
-        that at identification; ``checks``: residuals_white, residuals_uncorrelated, innovations_consistent,
-        inside_range (how much of the record lies beyond the positions and currents that the estimate has seen) and, for
-        one magnet, carries_its_weight, each with ``passed`` and ``detail``; ``passed``; ``samples``; ``outside``, share
-        of the record.
-
-    Raises
-    ------
-    EstimationError
-        As `replay`.
+    `record`: of a rotor that moves. Returns ``fit``: by output one_step, simulation (None: one magnet falls or clings),
+    innovation_rms in SI and ratio to that at identification; ``checks``: residuals_white, residuals_uncorrelated,
+    innovations_consistent, inside_range (how much of the record lies beyond the positions and currents that the
+    estimate has seen) and, for one magnet, carries_its_weight, each with ``passed`` and ``detail``; ``passed``;
+    ``samples``; ``outside``, share of the record.
     """
     found = replay(estimate, record)
     sound = np.all(np.isfinite(found.innovations), axis=1)

@@ -16,16 +16,7 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
     energy than was put in; damping may not be negative beyond its uncertainty. Sizes outside what is built, from
     micro-bearings to turbines, are a slip of units.
 
-    Parameters
-    ----------
-    model : LinearModel
-    values, sd : Mapping[str, float]
-        Parameters and their standard deviations, SI.
-
-    Returns
-    -------
-    list of str
-        One line each; empty where all is well.
+    `values`, `sd`: parameters and their standard deviations, SI. Returns one line each; empty where all is well.
     """
     found = []
     for spec in model.parameters:

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.likelihood import Fit
-from ambid.identify.predictor import Predictor, assemble
-from ambid.identify.sensitivity import Workspace, innovations, run
+from ambid.arrays import Array
+from ambid.estimation.likelihood import Fit
+from ambid.estimation.predictor import Predictor, assemble
+from ambid.estimation.sensitivity import Workspace, innovations, run
 from ambid.validate.ahead import covariance_ahead, errors_ahead
-
-Array = NDArray[np.float64]
 
 
 def fit_of(error: Array, y: Array) -> Array:
     """Return ``1 - |e| / |y - mean|`` of each column: 1 is perfect, 0 as good as the mean.
 
-    Parameters
-    ----------
-    error, y : ndarray, shape (n_samples, n_outputs)
-
-    Returns
-    -------
-    ndarray, shape (n_outputs,)
+    `error`, `y`: (n_samples, n_outputs). Returns (n_outputs,).
     """
     spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
     return np.asarray(1 - np.linalg.norm(error, axis=0) / np.where(spread > 0, spread, np.nan))
@@ -31,14 +23,8 @@ def fit_of(error: Array, y: Array) -> Array:
 def simulation_error(fit: Fit) -> Array | None:
     """Return y minus its simulation from the input, offsets and initial state alone, SI.
 
-    Parameters
-    ----------
-    fit : Fit
-
-    Returns
-    -------
-    ndarray, shape (n_used, n_outputs), or None
-        None where the plant is unstable in open loop: its simulation runs away and says nothing.
+    Returns (n_used, n_outputs), or None, none where the plant is unstable in open loop: its simulation runs away and
+    says nothing.
     """
     predictor = _predictor(fit)
     A = predictor.A
@@ -55,21 +41,8 @@ def simulation_error(fit: Fit) -> Array | None:
 def prediction_error(fit: Fit, steps: int) -> Array:
     """Return y minus its prediction `steps` samples ahead, SI, with the inputs known up to then.
 
-    Parameters
-    ----------
-    fit : Fit
-    steps : int
-        At least 1.
-
-    Returns
-    -------
-    ndarray, shape (n_used - steps + 1, n_outputs)
-        Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
-
-    Raises
-    ------
-    ValueError
-        If the fit has failed.
+    `steps`: at least 1. Returns (n_used - steps + 1, n_outputs), row k is the error at sample k + steps - 1, predicted
+    from outputs before sample k.
     """
     predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
     if e is None:
@@ -81,14 +54,7 @@ def prediction_error(fit: Fit, steps: int) -> Array:
 def expected_prediction_sd(fit: Fit, steps: int) -> Array:
     """Return the standard deviation that the model gives its own predictions `steps` samples ahead, SI.
 
-    Parameters
-    ----------
-    fit : Fit
-    steps : int
-
-    Returns
-    -------
-    ndarray, shape (n_outputs,)
+    Returns (n_outputs,).
     """
     predictor = _predictor(fit)
     total = covariance_ahead(fit.covariance, predictor.A, predictor.gain, predictor.C, steps)

@@ -12,12 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.likelihood import Fit, weight_of
-from ambid.identify.sensitivity import Workspace, reduce_rows, residual_blocks
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
+from ambid.estimation.likelihood import Fit, weight_of
+from ambid.estimation.sensitivity import Workspace, reduce_rows, residual_blocks
 
 P_LEAST = 1e-3  # 99.9 % bounds
 _WHITE_LAGS = (1, 2, 3, 5, 8, 13)
@@ -25,27 +23,13 @@ _WHITE_LAGS = (1, 2, 3, 5, 8, 13)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualTest:
-    """Outcome of a residual test.
+    """Outcome of a residual test."""
 
-    Attributes
-    ----------
-    p : float
-        Probability of at least this much if the model is right.
-    statistic : float
-        Fall of the weighted sum of squares.
-    degrees : int
-        Degrees of freedom.
-    largest : float
-        Largest correlation coefficient among the tested pairs, in magnitude.
-    largest_lag : int
-        Its lag in samples.
-    """
-
-    p: float
-    statistic: float
-    degrees: int
-    largest: float
-    largest_lag: int
+    p: float  # probability of at least this much if the model is right
+    statistic: float  # fall of the weighted sum of squares
+    degrees: int  # degrees of freedom
+    largest: float  # largest correlation coefficient among the tested pairs, in magnitude
+    largest_lag: int  # its lag in samples
 
     @property
     def passed(self) -> bool:
@@ -56,15 +40,7 @@ class ResidualTest:
 def residuals_white(fit: Fit, e: Array) -> ResidualTest:
     """Test the innovations against their own past.
 
-    Parameters
-    ----------
-    fit : Fit
-    e : ndarray, shape (n_used, n_outputs)
-        Innovations at the fit, scaled.
-
-    Returns
-    -------
-    ResidualTest
+    `e`: (n_used, n_outputs), innovations at the fit, scaled.
     """
     white = e @ weight_of(fit.covariance).T
     lags = tuple(k for k in _WHITE_LAGS if k < len(e) // 10)
@@ -74,15 +50,7 @@ def residuals_white(fit: Fit, e: Array) -> ResidualTest:
 def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
     """Test the innovations against past inputs.
 
-    Parameters
-    ----------
-    fit : Fit
-    e : ndarray, shape (n_used, n_outputs)
-        Innovations at the fit, scaled.
-
-    Returns
-    -------
-    ResidualTest
+    `e`: (n_used, n_outputs), innovations at the fit, scaled.
     """
     problem = fit.problem
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.nonlinear.fit import NonlinearFit
 
 GROWN = 1.5
 """Times the errors of identification, as for physical estimates."""
@@ -18,17 +18,9 @@ OUTSIDE = 0.1
 def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tuple[str, ...]:
     """Return why a fit does not hold on a second record.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit or NonlinearFit
-    found : Mapping[str, Mapping]
-        By output, as `validate.blackbox.judge.validation` or `validate.nonlinear.validation` give it.
-
-    Returns
-    -------
-    tuple of str
-        One line each; empty where its one-step errors are at most 1.5 times those at identification, and at most a
-        tenth of the record lies outside the training data (which a linear fit does not know).
+    `found`: by output, as `validate.blackbox.judge.validation` or `validate.nonlinear.validation` give it. Returns one
+    line each; empty where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the
+    record lies outside the training data (which a linear fit does not know).
     """
     said = []
     for name, sizes in found.items():

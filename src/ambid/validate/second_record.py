@@ -5,22 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.bearing.multistart import Signals
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Check, Estimate
-from ambid.identify.likelihood import Fit, search, weight_of
-from ambid.identify.multistart import Signals
-from ambid.identify.problem import PredictorProblem
-from ambid.identify.scaling import noise_floor, scales_for
-from ambid.identify.sensitivity import innovations, linearise
-from ambid.identify.threads import one_thread
+from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.likelihood import Fit, search, weight_of
+from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.scaling import noise_floor, scales_for
+from ambid.estimation.sensitivity import innovations, linearise
+from ambid.estimation.threads import one_thread
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
 from ambid.validate.prediction import expected_prediction_sd, fit_of, prediction_error, simulation_error
 from ambid.validate.residuals import residuals_uncorrelated, residuals_white
-
-Array = NDArray[np.float64]
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _HORIZONS = (1, 10, 100)  # samples ahead
@@ -28,48 +26,23 @@ _HORIZONS = (1, 10, 100)  # samples ahead
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Replay:
-    """A record run through an estimate, SI units.
+    """A record run through an estimate, SI units."""
 
-    Attributes
-    ----------
-    fit : Fit
-        Offsets and initial state on this record; the parameters stay as they were, with their covariance as a prior, so
-        that tests on it allow for what was not known of them.
-    first : int
-        Sample of the record at which row 0 of the arrays stands.
-    measured, predicted : ndarray, shape (n_used, n_outputs)
-        Outputs, and their predictions from all samples before.
-    innovations : ndarray, shape (n_used, n_outputs)
-        Their difference.
-    simulated : ndarray, shape (n_used, n_outputs), or None
-        Outputs from the input alone; None where the plant is unstable in open loop.
-    """
-
+    # offsets and initial state on this record; the parameters stay as they were, with their covariance as a prior, so
+    # that tests on it allow for what was not known of them
     fit: Fit
-    first: int
-    measured: Array
+    first: int  # sample of the record at which row 0 of the arrays stands
+    measured: Array  # (n_used, n_outputs), outputs, and their predictions from all samples before
     predicted: Array
-    innovations: Array
+    innovations: Array  # (n_used, n_outputs), their difference
+    # (n_used, n_outputs), or None, outputs from the input alone; None where the plant is unstable in open loop
     simulated: Array | None
 
 
 def replay(estimate: Estimate, signals: Signals) -> Replay:
     """Run a record through the predictor of an estimate.
 
-    Parameters
-    ----------
-    estimate : Estimate
-    signals : Signals
-        Of the same bench, at the same rate.
-
-    Returns
-    -------
-    Replay
-
-    Raises
-    ------
-    EstimationError
-        If the rates differ, the record is too short, or the estimate makes no predictor.
+    `signals`: of the same bench, at the same rate.
     """
     with one_thread():
         fit = _fit(estimate, signals)
@@ -160,23 +133,10 @@ def _with_covariance(fit: Fit, estimate: Estimate) -> Fit:
 def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
     """Judge an estimate on a second record.
 
-    Parameters
-    ----------
-    estimate : Estimate
-    signals : Signals
-
-    Returns
-    -------
-    dict
-        ``fit``: by output one_step, simulation, rms of the innovation in SI, k_step fits, and by k_step_ratio how many
-        times as large as expected the errors are that many steps ahead; ``checks``:
-        residuals_white, residuals_uncorrelated and innovations_consistent (sizes as at identification), each with
-        ``passed`` and ``detail``; ``passed``.
-
-    Raises
-    ------
-    EstimationError
-        As `replay`.
+    Returns ``fit``: by output one_step, simulation, rms of the innovation in SI, k_step fits, and by k_step_ratio how
+    many times as large as expected the errors are that many steps ahead; ``checks``: residuals_white,
+    residuals_uncorrelated and innovations_consistent (sizes as at identification), each with ``passed`` and ``detail``;
+    ``passed``.
     """
     with one_thread():
         return _judged(estimate, signals)

@@ -14,20 +14,19 @@ from types import MappingProxyType
 from typing import Literal, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.orders import UsedOrders
+from ambid.blackbox.structures import Structure, structure
 from ambid.errors import EstimationError, nearest
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.orders import UsedOrders
-from ambid.identify.blackbox.structures import Structure, structure
 from ambid.validate._order_search import first_size, searched_orders
 from ambid.validate.blackbox.criteria import criteria, skipped
 from ambid.validate.blackbox.predictor import errors
 from ambid.validate.blackbox.score import autoregression
 from ambid.validate.holdout import Fold, folds, held_out_error, hold_out
 
-Array = NDArray[np.float64]
 Criterion = Literal["aic", "aicc", "bic", "mdl", "fpe", "holdout", "kfold"]
 
 _LONGEST = 20_000  # samples that a choice of orders looks at
@@ -36,53 +35,30 @@ _FINALISTS = 6  # candidates, of each of AIC and BIC, that are judged on held-ou
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """One choice of orders that was tried.
-
-    Attributes
-    ----------
-    orders : Mapping[str, int or tuple of int]
-    n_estimated : int
-    scores : Mapping[str, float]
-        Criteria by name; what could not be computed is not there. For a structure without a noise model, of residuals
-        made white by an autoregression.
-    """
+    """One choice of orders that was tried."""
 
     orders: UsedOrders
     n_estimated: int
+    # criteria by name; what could not be computed is not there. For a structure without a noise model, of residuals
+    # made white by an autoregression.
     scores: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Selection:
-    """Orders that were chosen, and from what.
-
-    Attributes
-    ----------
-    structure : str
-    criterion : {"aic", "aicc", "bic", "mdl", "fpe", "holdout", "kfold"}
-    orders : Mapping[str, int or tuple of int]
-    candidates : tuple of Candidate
-        Best first.
-    why : str
-        One line for people.
-    samples : int
-        How many samples were looked at.
-    """
+    """Orders that were chosen, and from what."""
 
     structure: str
     criterion: Criterion
     orders: UsedOrders
-    candidates: tuple[Candidate, ...]
-    why: str
-    samples: int
+    candidates: tuple[Candidate, ...]  # best first
+    why: str  # one line for people
+    samples: int  # how many samples were looked at
 
     def summary(self) -> dict[str, object]:
         """Return what was chosen and the best candidates, ready for JSON.
 
-        Returns
-        -------
-        dict
-            ``criterion``, ``why``, ``tried``, ``samples`` and ``best``: up to ten candidates.
+        Returns ``criterion``, ``why``, ``tried``, ``samples`` and ``best``: up to ten candidates.
         """
         return {
             "criterion": self.criterion,
@@ -105,28 +81,8 @@ def select(
 ) -> Selection:
     """Choose the orders of a structure.
 
-    Parameters
-    ----------
-    structure_name : str
-        As in `ambid.identify.blackbox.structures`.
-    data : IOData
-    criterion : {"aic", "aicc", "bic", "mdl", "fpe", "holdout", "kfold"}, optional
-        ``holdout`` fits the first 70 % and judges on the rest, ``kfold`` judges each fifth once: one step ahead, or by
-        simulation for structures without a noise model. An unstable output-error model has no simulation and is
-        not chosen.
-    ranges : Mapping[str, (int, int)], optional
-        Least and largest value of an order.
-    tick : callable, optional
-        Called with the orders before each fit; may raise to interrupt.
-
-    Returns
-    -------
-    Selection
-
-    Raises
-    ------
-    EstimationError
-        If the criterion is unknown, a range is not an order of the structure, or nothing can be fitted.
+    `structure_name`: as in `ambid.blackbox.structures`; `ranges`: least and largest value of an order; `tick`: called
+    with the orders before each fit; may raise to interrupt.
     """
     of = structure(structure_name)
     by = _criterion(criterion)
@@ -228,16 +184,8 @@ def whitened(e: Array) -> tuple[Array, int]:
     The likelihood of coloured residuals as if they were white falls for every extra pole that follows the noise: orders
     chosen by it are too high.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_samples, n_outputs)
-
-    Returns
-    -------
-    e : ndarray, shape (n_samples, n_outputs)
-        White.
-    n_estimated : int
-        Coefficients of the autoregressions.
+    `e`: (n_samples, n_outputs). Returns `e`: (n_samples, n_outputs), white; `n_estimated`: coefficients of the
+    autoregressions.
     """
     from scipy.signal import lfilter
 

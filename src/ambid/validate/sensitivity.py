@@ -13,16 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.spread import pole_covariance
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.spread import pole_covariance
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.validate.blackbox.criteria import skipped
-
-Array = NDArray[np.float64]
 
 _PAIR = 0.9  # correlation from which two numbers are named as a pair
 _DEPENDENT = 1e-10  # eigenvalue of the correlation matrix under which a direction is not independent
@@ -31,81 +29,40 @@ _FREQUENCIES = 60
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Influence:
-    """One estimated number.
-
-    Attributes
-    ----------
-    name : str
-    value, sd : float, SI
-    fit_alone : float
-        Rise of -2 log L when it alone moves by 1 %.
-    fit_free : float
-        The same when the others are fitted again: (0.01 value/sd)^2.
-    inflation : float
-        First over second: how much of its effect the others can undo; 1 is none.
-    poles : float or None
-        Largest relative move of a pole when it moves by 1 %: |dp|/|p| (of log z for a discrete model, which is p times
-        the sampling interval). None where there are no poles, or no structure is at hand.
-    response : float or None
-        The same for the frequency response, root mean square over the band up to half the sampling rate.
-    """
+    """One estimated number."""
 
     name: str
     value: float
     sd: float
-    fit_alone: float
-    fit_free: float
-    inflation: float
+    fit_alone: float  # rise of -2 log L when it alone moves by 1 %
+    fit_free: float  # the same when the others are fitted again: (0.01 value/sd)^2
+    inflation: float  # first over second: how much of its effect the others can undo; 1 is none
+    # largest relative move of a pole when it moves by 1 %: |dp|/|p| (of log z for a discrete model, which is p times
+    # the sampling interval). None where there are no poles, or no structure is at hand.
     poles: float | None
+    # the same for the frequency response, root mean square over the band up to half the sampling rate
     response: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SensitivityAnalysis:
-    """What matters, and what cannot be told apart.
+    """What matters, and what cannot be told apart."""
 
-    Attributes
-    ----------
-    influences : tuple of Influence
-        Largest effect on the fit first.
-    collinearity : float
-        Index of all numbers together; under 10 is good, infinite where they are not independent.
-    dependent : int
-        Directions that are not independent (a full state space always has some: states can be exchanged).
-    pairs : tuple of (str, str, float)
-        Numbers whose estimates are correlated by more than 0.9, strongest first, with the correlation.
-    weakest : tuple of (str, float)
-        Combination that the data see least, relative changes, largest share first; up to four.
-    pole_sd : ndarray, shape (n_poles,)
-        Relative standard deviation of each pole, in the order of the model's poles; empty without structure.
-    """
-
-    influences: tuple[Influence, ...]
-    collinearity: float
-    dependent: int
+    influences: tuple[Influence, ...]  # largest effect on the fit first
+    collinearity: float  # index of all numbers together; under 10 is good, infinite where they are not independent
+    dependent: int  # directions that are not independent (a full state space always has some: states can be exchanged)
+    # numbers whose estimates are correlated by more than 0.9, strongest first, with the correlation
     pairs: tuple[tuple[str, str, float], ...]
+    # combination that the data see least, relative changes, largest share first; up to four
     weakest: tuple[tuple[str, float], ...]
+    # (n_poles,), relative standard deviation of each pole, in the order of the model's poles; empty without structure
     pole_sd: Array
 
 
 def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
     """Analyse a black-box fit.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-        With a covariance.
-    data : IOData
-        What it was estimated from; its length sets the lowest frequency looked at.
-
-    Returns
-    -------
-    SensitivityAnalysis
-
-    Raises
-    ------
-    EstimationError
-        If the fit has no covariance.
+    `fit`: with a covariance; `data`: what it was estimated from; its length sets the lowest frequency looked at.
     """
     if fit.covariance is None or not np.any(np.diag(fit.covariance) > 0):
         raise EstimationError(
@@ -142,19 +99,7 @@ def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
 def estimate_sensitivity(estimate: Estimate) -> SensitivityAnalysis:
     """Analyse an estimate of physical parameters.
 
-    Parameters
-    ----------
-    estimate : Estimate
-
-    Returns
-    -------
-    SensitivityAnalysis
-        Without poles and frequency response.
-
-    Raises
-    ------
-    EstimationError
-        If nothing was estimated.
+    Returns without poles and frequency response.
     """
     names = estimate.covariance_names
     if not names:

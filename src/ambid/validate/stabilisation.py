@@ -15,11 +15,11 @@ from typing import Literal, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.subspace import subspace_models
 from ambid.errors import EstimationError, nearest
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.subspace import subspace_models
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
 
@@ -29,30 +29,14 @@ _SHARE = 0.4  # part of the orders, from a cluster's first one on, that must sho
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModePole:
-    """One pole of one model; of a complex pair the one above the real axis.
+    """One pole of one model; of a complex pair the one above the real axis."""
 
-    Attributes
-    ----------
-    order : int
-        Of the model.
-    pole : complex, rad/s
-        In continuous time, log(z)/dt.
-    frequency_hz : float
-        |pole|/(2 pi).
-    damping : float
-        -Re(pole)/|pole|; negative for an unstable pole.
-    shape : tuple of complex
-        Mode shape: the outputs that go with the pole, largest 1.
-    stable_frequency, stable_damping, stable_shape : bool
-        Whether the next lower order has a pole that agrees in that.
-    """
-
-    order: int
-    pole: complex
-    frequency_hz: float
-    damping: float
-    shape: tuple[complex, ...]
-    stable_frequency: bool = False
+    order: int  # of the model
+    pole: complex  # in continuous time, log(z)/dt
+    frequency_hz: float  # |pole|/(2 pi)
+    damping: float  # -Re(pole)/|pole|; negative for an unstable pole
+    shape: tuple[complex, ...]  # mode shape: the outputs that go with the pole, largest 1
+    stable_frequency: bool = False  # whether the next lower order has a pole that agrees in that
     stable_damping: bool = False
     stable_shape: bool = False
 
@@ -64,52 +48,26 @@ class ModePole:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mode:
-    """A cluster of stable poles: a mode of the plant.
+    """A cluster of stable poles: a mode of the plant."""
 
-    Attributes
-    ----------
-    pole : complex, rad/s
-        Median.
-    frequency_hz, damping : float
-        Of that.
-    frequency_spread, damping_spread : float
-        Standard deviation over the orders; not the uncertainty from noise.
-    orders : tuple of int
-        Models that show it.
-    """
-
-    pole: complex
-    frequency_hz: float
+    pole: complex  # median
+    frequency_hz: float  # of that
     damping: float
-    frequency_spread: float
+    frequency_spread: float  # standard deviation over the orders; not the uncertainty from noise
     damping_spread: float
-    orders: tuple[int, ...]
+    orders: tuple[int, ...]  # models that show it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stabilisation:
-    """Poles of models of all orders.
-
-    Attributes
-    ----------
-    method : {"n4sid", "moesp", "cva", "pbsid"}
-    orders : tuple of int
-    poles : tuple of ModePole
-        Lowest order first.
-    modes : tuple of Mode
-        Lowest frequency first.
-    singular_values : tuple of float
-        By order.
-    criteria : tuple of float
-        Bayes' criterion by order, less is better.
-    """
+    """Poles of models of all orders."""
 
     method: Method
     orders: tuple[int, ...]
-    poles: tuple[ModePole, ...]
-    modes: tuple[Mode, ...]
-    singular_values: tuple[float, ...]
-    criteria: tuple[float, ...]
+    poles: tuple[ModePole, ...]  # lowest order first
+    modes: tuple[Mode, ...]  # lowest frequency first
+    singular_values: tuple[float, ...]  # by order
+    criteria: tuple[float, ...]  # bayes' criterion by order, less is better
 
     @property
     def suggested(self) -> int:
@@ -129,30 +87,9 @@ def stabilisation(
 ) -> Stabilisation:
     """Identify models of all orders and follow their poles.
 
-    Parameters
-    ----------
-    data : IOData
-    method : {"pbsid", "n4sid", "moesp", "cva"}, optional
-        All but pbsid are biased under feedback.
-    n_max : int, optional
-        Largest order.
-    frequency : float, optional
-        Relative change of a stable frequency, at most.
-    damping : float, optional
-        Change of a stable damping at most: relative, or absolute in units of 0.1 where damping is under 0.1.
-    shape : float, optional
-        Modal assurance criterion of a stable shape, at least (0 to 1).
-    tick : callable, optional
-        Called between steps; may raise to interrupt.
-
-    Returns
-    -------
-    Stabilisation
-
-    Raises
-    ------
-    EstimationError
-        If the method is unknown, a tolerance is out of range, or as for the method.
+    `method`: all but pbsid are biased under feedback; `n_max`: largest order; `frequency`: relative change of a stable
+    frequency, at most; `shape`: modal assurance criterion of a stable shape, at least (0 to 1); `tick`: called between
+    steps; may raise to interrupt.
     """
     known = get_args(Method)
     if method not in known:
@@ -229,14 +166,7 @@ def _damped_alike(p: ModePole, q: ModePole, tolerance: float) -> bool:
 def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
     """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
 
-    Parameters
-    ----------
-    one, other : sequence of complex
-
-    Returns
-    -------
-    float
-        1 for equal shapes, whatever their size; 0 for orthogonal ones.
+    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
     """
     a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
     size = float(np.vdot(a, a).real * np.vdot(b, b).real)

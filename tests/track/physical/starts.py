@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.physical import identify
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
@@ -15,7 +15,7 @@ from ambid.record import Channel, Record
 from ambid.rig import default_rig
 from ambid.signals import multisine
 from ambid.simulate import simulate_preset
-from tests.identify.benches import run
+from tests.bearing.benches import run
 
 Array = np.ndarray
 
@@ -43,7 +43,7 @@ def columns(record: Record, first: int = 0, last: int | None = None) -> tuple[Ar
 
 @cache
 def bench_record(name: str, n: int, seed: int) -> Record:
-    """A bench of `tests.identify.benches` as a record."""
+    """A bench of `tests.bearing.benches` as a record."""
     bench = run(name, n, seed)
     of: LinearModel = bench.model
     signals = np.hstack([bench.signals.u, bench.signals.y])

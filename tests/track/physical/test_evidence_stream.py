@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.identify.sensitivity import linearise as off_line
+from ambid.estimation.sensitivity import linearise as off_line
 from ambid.track.physical.evidence_stream import EvidenceStream
 from ambid.track.physical.linearisation import linearise
 from ambid.track.physical.numbers import tracked_numbers

@@ -16,7 +16,7 @@ from ambid.simulate import simulate_scenario
 from ambid.track.physical.numbers import tracked_numbers
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.synchronous import amplitude_and_phase, forcing_of
-from tests.identify.benches import SETTINGS
+from tests.bearing.benches import SETTINGS
 from tests.track.physical.starts import BEARING, bearing, bearing_start, bench_record, bench_start, columns, signals
 
 

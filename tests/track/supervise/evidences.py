@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 
-from ambid.identify.likelihood import weight_of
-from ambid.identify.problem import PredictorProblem, Scales
-from ambid.identify.sensitivity import Workspace, innovations, residual_blocks
+from ambid.estimation.likelihood import weight_of
+from ambid.estimation.problem import PredictorProblem, Scales
+from ambid.estimation.sensitivity import Workspace, innovations, residual_blocks
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Noise
 from ambid.physics.models import model
@@ -19,7 +19,7 @@ from ambid.simulate.schedule import Schedule
 from ambid.simulate.variation import Variation
 from ambid.simulate.varying import simulate_varying
 from ambid.track.evidence import Evidence
-from tests.identify.benches import SETTINGS
+from tests.bearing.benches import SETTINGS
 
 BLOCK, OUTPUTS = 100, 2
 BLOCK_S = 0.005

@@ -8,15 +8,15 @@ from functools import cache
 
 import numpy as np
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.physical import identify
 from ambid.physics.presets import preset
 from ambid.record import Record
+from ambid.recursive.lines import Event, TrackLine
 from ambid.simulate import simulate_scenario
 from ambid.simulate.scenarios import Scenario
 from ambid.simulate.schedule import Schedule
 from ambid.simulate.variation import Variation
-from ambid.track.lines import Event, TrackLine
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.reporter import Reporter

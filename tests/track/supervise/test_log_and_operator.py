@@ -3,7 +3,7 @@ import threading
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.track.lines import Event
+from ambid.recursive.lines import Event
 from ambid.track.supervise.log import DecisionLog
 from ambid.track.supervise.operator import Operator
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.made import made
-from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.identify.blackbox.response import Offsets
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.made import made
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.response import Offsets
 
 DT = 0.01
 
@@ -25,7 +25,7 @@ def io(u, y, **options):
 
 def run(model, u, e):
     """Output of a polynomial model, from rest."""
-    from ambid.identify._kernels import state_scan
+    from ambid.estimation.kernels import state_scan
 
     ss = model.state_space()
     z = np.hstack([u, e])

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.made import made
-from ambid.identify.blackbox.response import Offsets
-from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.blackbox.transfer_model import TransferModel
-from ambid.identify.instrumental import two_stage
-from ambid.identify.polynomial import arma, armax, bj, oe
-from ambid.identify.subspace import n4sid, pbsid
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.instrumental import two_stage
+from ambid.blackbox.made import made
+from ambid.blackbox.polynomial import arma, armax, bj, oe
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.subspace import n4sid, pbsid
+from ambid.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox import judged
 from ambid.validate.blackbox.ahead import ahead
 from ambid.validate.blackbox.gradient import gradient, polynomial_gradient

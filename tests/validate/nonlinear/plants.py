@@ -8,8 +8,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.blackbox.data import IOData
+from ambid.nonlinear.fit import NonlinearFit
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.identify.narmax.estimate import narmax
+from ambid.nonlinear.narmax.estimate import narmax
 from ambid.validate.blackbox.criteria import criteria
 from ambid.validate.nonlinear import judged, validation
 from ambid.validate.nonlinear.runs import beyond

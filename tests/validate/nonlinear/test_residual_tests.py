@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.identify.narmax.estimate import narmax
+from ambid.nonlinear.narmax.estimate import narmax
 from ambid.validate.nonlinear import judged
 from ambid.validate.nonlinear.residual_tests import correlations, material
 from ambid.validate.nonlinear.runs import run

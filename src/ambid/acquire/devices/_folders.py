@@ -18,12 +18,7 @@ _YOUNG_S = 60.0  # a folder as young may be about to be locked
 
 
 class TemporaryFolder:
-    """A folder of this program alone.
-
-    Attributes
-    ----------
-    path : Path
-    """
+    """A folder of this program alone."""
 
     def __init__(self) -> None:
         """Make it, and remove what dead programs have left."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.compiled import compiled
 from ambid.simulate.steps import advance_plant
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # States and causes: as in messages.toml; a test compares them.
@@ -47,20 +47,20 @@ _TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware l
 _MASKS = np.array([0, 0, 0, 0x3, 0x3, 0x5, 0x3, 0x3, 0x1D, 0x11, 0x9, 0x5, 0x53, 0x1B, 0x443, 0x3], dtype=np.int64)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def mapped(value: float, x: Array, y: Array) -> float:
     """Return y at `value` on the polyline through (x, y), its ends continued; x increases."""
     k = min(max(int(np.searchsorted(x, value)) - 1, 0), x.size - 2)
     return float(y[k] + (y[k + 1] - y[k]) / (x[k + 1] - x[k]) * (value - x[k]))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def converted(value: float, x: Array, y: Array, top: int) -> int:
     """Return the counts of a quantity, limited as a converter limits them."""
     return int(min(max(math.floor(mapped(value, x, y) + 0.5), 0.0), float(top)))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def parity(word: int) -> int:
     """Return 1 for an odd number of ones."""
     odd = 0
@@ -70,7 +70,7 @@ def parity(word: int) -> int:
     return odd
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def played(settings: Integers, memory: Integers, table: Integers) -> int:
     """Return the excitation of this tick in counts, and move on."""
     if memory[PLAYING] == 0:
@@ -98,13 +98,13 @@ def played(settings: Integers, memory: Integers, table: Integers) -> int:
     return int(value)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def within(value: int, largest: int) -> int:
     """Return `value` limited to both sides."""
     return min(max(value, -largest), largest)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def ordered(position: int, current: int, excitation: int, settings: Integers, memory: Integers) -> int:
     """Return the pulse width that the law orders, in counts: the firmware's fixed point, number by number."""
     low, high = settings[DUTY_LOW], settings[DUTY_HIGH]
@@ -129,7 +129,7 @@ def ordered(position: int, current: int, excitation: int, settings: Integers, me
     return int(duty)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def tripped(position: int, current: int, settings: Integers, memory: Integers) -> int:
     """Return the cause of a fault that this tick's inputs are, 0 for none."""
     if memory[STATE] != DRIVING and memory[STATE] != LEVITATING:
@@ -145,7 +145,7 @@ def tripped(position: int, current: int, settings: Integers, memory: Integers) -
     return OUT_OF_GAP if outside else 0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def tick_on(
     counts: Integers,
     noise: Array,

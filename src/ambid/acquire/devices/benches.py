@@ -19,47 +19,19 @@ from ambid.simulate.rig_bench import parts_of_rig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bench:
-    """What a simulation of it needs.
-
-    Attributes
-    ----------
-    name : str
-    plant : LinearPlant or NonlinearPlant
-    point : OperatingPoint
-        Where the linear one holds, SI.
-    limits : Limits
-        Its stops count.
-    noise : Noise
-    """
+    """What a simulation of it needs."""
 
     name: str
     plant: LinearPlant | NonlinearPlant
-    point: OperatingPoint
-    limits: Limits
+    point: OperatingPoint  # where the linear one holds, SI
+    limits: Limits  # its stops count
     noise: Noise
 
 
 def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
     """Return the bench that stands behind a rig.
 
-    Parameters
-    ----------
-    rig : Rig
-        Of the device.
-    bench : Preset or Rig or None
-        The truth; None: what daq.bench names, else the rig's own numbers. A preset that has a
-        nonlinear plant is that plant.
-
-    Returns
-    -------
-    Bench
-
-    Raises
-    ------
-    DeviceError
-        If there is no such bench, or it is not driven by a voltage.
-    RigError
-        If a rig has no value for a parameter.
+    `rig`: of the device.
     """
     truth = _named(rig) if bench is None else bench
     if isinstance(truth, Preset):
@@ -86,22 +58,7 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
 def bench_parameters(rig: Rig, bench: Preset | Rig | None) -> Mapping[str, float]:
     """Return what is known of the linear plant of the bench behind a rig.
 
-    Parameters
-    ----------
-    rig : Rig
-        Of the device.
-    bench : Preset or Rig or None
-        As `bench_of`.
-
-    Returns
-    -------
-    Mapping of str to float
-        SI, under the names of the model's parameters.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such bench.
+    `rig`: of the device; `bench`: as `bench_of`. Returns SI, under the names of the model's parameters.
     """
     truth = _named(rig) if bench is None else bench
     if isinstance(truth, Preset):

@@ -25,32 +25,9 @@ def open_device(
 ) -> Device:
     """Return the device that a port's name stands for, not yet opened: it is a context.
 
-    Parameters
-    ----------
-    port : str
-        ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port.
-    rig : Rig
-        Of the bench.
-    bench : Preset or Rig, optional
-        The truth behind what is emulated or simulated; default what daq.bench names, else the rig's own numbers.
-    pace : {"fastest", "real"}
-        Of what is no hardware, which has its own.
-    seed : int
-        Of the noise of what is emulated or simulated.
-    script : Path, optional
-        What happens to an emulated bench meanwhile.
-
-    Returns
-    -------
-    Device
-        Not yet opened.
-
-    Raises
-    ------
-    DeviceError
-        If an option does not fit the device, or as the device's own constructor.
-    RigError
-        If the rig does not say what the device needs.
+    `port`: ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port; `rig`: of the bench; `pace`:
+    of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated; `script`: what
+    happens to an emulated bench meanwhile. Returns not yet opened.
     """
     if script is not None and port != "emulated":
         raise DeviceError(f"a script is for port emulated; {port!r} has none. Leave it out")

@@ -63,30 +63,10 @@ class EmulatedDevice(LineDevice):
     As fast as possible, its time is not the host's: it waits for a host that says nothing, and for a reader who left a
     quarter of a second unread, and no drift is told.
 
-    Parameters
-    ----------
-    rig : Rig
-        What the controller is told; where it has no calibrations or no ``[daq]`` they are made up, and columns are SI.
-    bench : Preset or Rig, optional
-        The truth; default what daq.bench names, else the rig's own numbers.
-    pace : {"fastest", "real"}
-    seed : int
-        Of the noise.
-    script : str or Path, optional
-        What happens to bench and line meanwhile, see `Emulator`.
-    folder : Path, optional
-        Where the emulator's files go and stay; default a temporary one.
-    trajectory : bool
-        Write the bench's true motion into the folder.
-    room : int
-        Samples that wait for a reader at most.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such bench or pace, or the controller has no such rate.
-    RigError
-        If the rig does not say what the controller needs.
+    `bench`: the truth; default what daq.bench names, else the rig's own numbers; `seed`: of the noise; `script`: what
+    happens to bench and line meanwhile, see `Emulator`; `folder`: where the emulator's files go and stay; default a
+    temporary one; `trajectory`: write the bench's true motion into the folder; `room`: samples that wait for a reader
+    at most.
     """
 
     def __init__(

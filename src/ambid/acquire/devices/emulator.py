@@ -32,15 +32,7 @@ _AVR = b"\x53\x00"  # machine of an ELF file, little-endian
 def find_program() -> Path:
     """Return the emulated bench's program, built first where its sources are newer.
 
-    Returns
-    -------
-    Path
-        What ``AMBID_BENCH`` names, else ``firmware/build/amb_bench`` of the checkout.
-
-    Raises
-    ------
-    DeviceError
-        If there is none and it cannot be built here.
+    Returns what ``AMBID_BENCH`` names, else ``firmware/build/amb_bench`` of the checkout.
     """
     return _find("AMBID_BENCH", "amb_bench", "bench", ("bench",))
 
@@ -48,15 +40,7 @@ def find_program() -> Path:
 def find_firmware() -> Path:
     """Return the firmware's ELF file, built first where its sources are newer.
 
-    Returns
-    -------
-    Path
-        What ``AMBID_FIRMWARE`` names, else ``firmware/build/amb_daq.elf`` of the checkout.
-
-    Raises
-    ------
-    DeviceError
-        If there is none and it cannot be built here.
+    Returns what ``AMBID_FIRMWARE`` names, else ``firmware/build/amb_daq.elf`` of the checkout.
     """
     return _find("AMBID_FIRMWARE", "amb_daq.elf", "firmware", ("amb_daq",))
 
@@ -64,33 +48,11 @@ def find_firmware() -> Path:
 class Emulator:
     """The firmware in an emulated controller before a simulated bench. A context: ended when it is left.
 
-    Parameters
-    ----------
-    plant : Path
-        Plant file, see `write_plant_file`.
-    firmware : Path or None
-        ELF file; None: see `find_firmware`.
-    program : Path or None
-        The bench's program; None: see `find_program`.
-    script : str or Path or None
-        What happens while it runs: the lines themselves, or a file.
-    pace : {"fastest", "real"}
-        Emulated time as fast as it goes, or as the wall clock.
-    lockstep_ms : float
-        Emulated time waits for a host that was silent for so long, ms of emulated time; 0: it never waits.
-    seed : int
-        Of all noise.
-    folder : Path or None
-        Where log, trajectory and messages go; None: a temporary folder that is removed at the end.
-    trajectory : bool
-        Write ``trajectory.csv``: t, x, v, i, voltage, duty at every tick of the controller, SI and counts.
+    `plant`: plant file, see `write_plant_file`; `firmware`: ELF file; None: see `find_firmware`; `program`: the bench's
+    program; None: see `find_program`; `script`: what happens while it runs: the lines themselves, or a file; `pace`:
+    emulated time as fast as it goes, or as the wall clock; `seed`: of all noise.
 
-    Attributes
-    ----------
-    port : str
-        The pseudo-terminal; after the start.
-    pid : int
-        Of the process; after the start.
+    `port`: the pseudo-terminal; after the start; `pid`: of the process; after the start.
     """
 
     def __init__(
@@ -142,13 +104,7 @@ class Emulator:
         self.close()
 
     def start(self) -> None:
-        """Start the process and wait until its port is there.
-
-        Raises
-        ------
-        DeviceError
-            If there is no program or firmware, or the program refuses what it was given.
-        """
+        """Start the process and wait until its port is there."""
         if self._process is not None:
             return
         program, firmware = self._program or find_program(), self._firmware or find_firmware()
@@ -179,10 +135,7 @@ class Emulator:
     def close(self, *, keep: bool = False) -> None:
         """End the process, wait for it, and remove the temporary folder.
 
-        Parameters
-        ----------
-        keep : bool
-            Leave the folder.
+        `keep`: leave the folder.
         """
         atexit.unregister(self.close)
         process, self._process = self._process, None
@@ -197,15 +150,7 @@ class Emulator:
     def ended(self, timeout_s: float) -> str | None:
         """Return how the process ended by itself.
 
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for its end, s.
-
-        Returns
-        -------
-        str or None
-            Words; None where it still runs, or was never started.
+        `timeout_s`: how long to wait for its end, s. Returns words; None where it still runs, or was never started.
         """
         if self._process is None:
             return None
@@ -218,15 +163,8 @@ class Emulator:
     def events(self, name: str | None = None) -> list[dict[str, Any]]:
         """Return what the log says so far.
 
-        Parameters
-        ----------
-        name : str or None
-            Only events of that name: ``start``, ``host``, ``enable``, ``script``, ``stop``, ``reset``, ``end``.
-
-        Returns
-        -------
-        list of dict
-            Each with ``t`` in s of emulated time and ``event``.
+        `name`: only events of that name: ``start``, ``host``, ``enable``, ``script``, ``stop``, ``reset``, ``end``.
+        Returns each with ``t`` in s of emulated time and ``event``.
         """
         if self._folder is None or not self.log_path.exists():
             return []
@@ -237,10 +175,7 @@ class Emulator:
     def said(self) -> str:
         """Return what the program wrote on its standard error.
 
-        Returns
-        -------
-        str
-            Empty if nothing.
+        Returns empty if nothing.
         """
         path = self._said_path()
         return path.read_text(encoding="utf-8", errors="replace").strip() if path.exists() else ""

@@ -12,24 +12,8 @@ from ambid.rig.rig import Rig
 def counts_of(program: Program, rig: Rig, settings: ControllerSettings) -> dict[str, int]:
     """Return the fields of the message ``excitation``.
 
-    Parameters
-    ----------
-    program : Program
-        Amplitude in V.
-    rig : Rig
-        With the calibration of its voltage.
-    settings : ControllerSettings
-        Of the device.
-
-    Returns
-    -------
-    dict of str to int
-        Without ``id``.
-
-    Raises
-    ------
-    DeviceError
-        If the amplitude is less than a count, or the pulse width has no room for it.
+    `program`: amplitude in V; `rig`: with the calibration of its voltage; `settings`: of the device. Returns without
+    ``id``.
     """
     amplitude = 0
     if program.kind != "none":

@@ -18,17 +18,9 @@ ROOM = 4_000_000
 class FrameQueue:
     """A queue of frames with an end, and perhaps a reason for it.
 
-    Parameters
-    ----------
-    room : int
-        Samples that wait at most.
+    `room`: samples that wait at most.
 
-    Attributes
-    ----------
-    overruns : int
-        Blocks dropped for want of room.
-    overrun_samples : int
-        Samples in them.
+    `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
     """
 
     def __init__(self, room: int = ROOM) -> None:
@@ -47,14 +39,7 @@ class FrameQueue:
     def put(self, frame: Frame) -> bool:
         """Append a frame, or count it as lost.
 
-        Parameters
-        ----------
-        frame : Frame
-
-        Returns
-        -------
-        bool
-            False if there was no room.
+        Returns false if there was no room.
         """
         n = len(frame.block.values)
         with self._changed:
@@ -70,10 +55,7 @@ class FrameQueue:
     def end(self, failure: DeviceError | None = None) -> None:
         """Say that nothing more will come until the next beginning.
 
-        Parameters
-        ----------
-        failure : DeviceError, optional
-            Why; raised to whoever reads, once all frames are read.
+        `failure`: why; raised to whoever reads, once all frames are read.
         """
         with self._changed:
             self._ended = True
@@ -83,20 +65,7 @@ class FrameQueue:
     def take(self, timeout_s: float) -> Frame | None:
         """Take the next frame.
 
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for it, s.
-
-        Returns
-        -------
-        Frame or None
-            None if none came in time, or at the end.
-
-        Raises
-        ------
-        DeviceError
-            What ended the stream, after its last frame.
+        `timeout_s`: how long to wait for it, s. Returns none if none came in time, or at the end.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._frames or self._ended, timeout_s)

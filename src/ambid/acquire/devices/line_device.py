@@ -17,9 +17,10 @@ from ambid.acquire.link.port import Port
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.table import table
 from ambid.acquire.settings import controller_settings
+from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.rig.rig import Rig
-from ambid.track.stream.block import Array, Frame
+from ambid.track.stream.block import Frame
 
 _MODES: dict[Mode, State] = {"sample": "sampling", "drive": "driving", "levitate": "levitating"}
 _NONE: Mapping[str, int] = MappingProxyType({})
@@ -30,28 +31,9 @@ _TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv") 
 class LineDevice(ABC):
     """A device behind a port. See `ambid.acquire.device.Device` for what its methods promise.
 
-    Parameters
-    ----------
-    rig : Rig
-        With ``[daq]`` and calibrations from counts.
-    kind : {"serial", "emulated"}
-    where : str
-        The port's name, for whoever asks before it is open.
-    si : bool
-        Columns in SI instead of in counts.
-    real : bool
-        Whether the controller's time runs with the host's.
-    answer_s : float
-        How long to wait for an answer before a command is sent again, s.
-    room : int
-        Samples that wait at most.
-
-    Raises
-    ------
-    RigError
-        If the rig does not say what the controller needs.
-    DeviceError
-        If the controller has no such rate.
+    `rig`: with ``[daq]`` and calibrations from counts; `where`: the port's name, for whoever asks before it is open;
+    `si`: columns in SI instead of in counts; `real`: whether the controller's time runs with the host's; `answer_s`:
+    how long to wait for an answer before a command is sent again, s; `room`: samples that wait at most.
     """
 
     def __init__(

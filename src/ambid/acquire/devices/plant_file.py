@@ -41,33 +41,10 @@ def write_plant_file(
 ) -> None:
     """Write the bench that stands behind a rig as a plant file.
 
-    Parameters
-    ----------
-    path : Path
-        File to be written.
-    rig : Rig
-        With calibrations from counts: they say what volts the sensors show, and what voltage a pulse width makes.
-    bench : Preset or Rig or None
-        The truth; None: what daq.bench names, else the rig's own numbers.
-    pwm : {"switched", "averaged"}
-        Whether the coil sees each pulse, or its mean over the period.
-    off : {"diodes", "short"}
-        What the coil sees while ENABLE is low: the supply against its current until there is none, or nothing.
-    start : float or None
-        Position at the beginning, m. None: where the rotor comes to lie without current.
-    noise : float
-        Factor on the bench's noise; 0 for none.
-    pin_noise : float
-        More noise at all three analog inputs, V rms.
-    third : (float, float, float)
-        Third input: V/m, V/A and V.
-
-    Raises
-    ------
-    DeviceError
-        If the emulated bench knows no such plant, or lacks a number.
-    RigError
-        If a channel has no calibration from counts.
+    `path`: file to be written; `bench`: the truth; None: what daq.bench names, else the rig's own numbers; `pwm`:
+    whether the coil sees each pulse, or its mean over the period; `start`: position at the beginning, m. None: where
+    the rotor comes to lie without current; `noise`: factor on the bench's noise; 0 for none; `pin_noise`: more noise at
+    all three analog inputs, V rms; `third`: third input: V/m, V/A and V.
     """
     truth = bench_of(rig, bench)
     body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name

@@ -28,20 +28,8 @@ _MODES: dict[str, State] = {"sample": "sampling", "drive": "driving", "levitate"
 class PlayedDevice(ABC):
     """A device without a line. See `ambid.acquire.device.Device` for what its methods promise.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Samples in one second.
-    pace : {"real", "fastest"}
-    block_samples : int, optional
-        Samples of a block at most; default those of 10 ms.
-    room : int
-        Samples that wait at most.
-
-    Raises
-    ------
-    DeviceError
-        If pace or block are no such.
+    `rate_hz`: samples in one second; `block_samples`: samples of a block at most; default those of 10 ms; `room`:
+    samples that wait at most.
     """
 
     def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None, room: int = ROOM) -> None:

@@ -29,20 +29,8 @@ class ReplayDevice(PlayedDevice):
     Each start out of idle plays it from its first row on; numbers count on. ``Block.time_s`` is what the record says,
     counted from the first row.
 
-    Parameters
-    ----------
-    path : str or Path
-        ``.csv``, ``.csv.gz``, ``.h5``.
-    rig : Rig
-        Its columns are played first, then all others of the record.
-    pace : {"real", "fastest"}
-    block_samples : int, optional
-        Samples of a block at most; default those of 10 ms.
-
-    Raises
-    ------
-    DeviceError
-        If the record has not the rig's columns, they are in other units, or its rows cannot be numbered.
+    `path`: ``.csv``, ``.csv.gz``, ``.h5``; `rig`: its columns are played first, then all others of the record;
+    `block_samples`: samples of a block at most; default those of 10 ms.
     """
 
     def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real", block_samples: int | None = None) -> None:

@@ -14,29 +14,9 @@ class SerialDevice(LineDevice):
     Blocks hold counts. ``Block.time_s`` is sample number over rate, by the controller's clock; its drift against the
     host's is in the counters.
 
-    Parameters
-    ----------
-    port : str
-        Such as ``/dev/ttyACM0`` or ``COM3``.
-    rig : Rig
-        With ``[daq]`` and calibrations from counts.
-    baud : int, optional
-        Bits per second; default daq.baud.
-    boot_s : float, optional
-        How long a board takes that resets when its port is opened, s; default 2, none for a pseudo-terminal.
-    real : bool
-        Whether the controller's time runs with the host's: not on an emulator that goes as fast as it can.
-    answer_s : float
-        How long to wait for an answer before a command is sent again, s.
-    room : int
-        Samples that wait for a reader at most.
-
-    Raises
-    ------
-    RigError
-        If the rig does not say what the controller needs.
-    DeviceError
-        If the controller has no such rate.
+    `port`: such as ``/dev/ttyACM0`` or ``COM3``; `rig`: with ``[daq]`` and calibrations from counts; `baud`: bits per
+    second; default daq.baud; `answer_s`: how long to wait for an answer before a command is sent again, s; `room`:
+    samples that wait for a reader at most.
     """
 
     def __init__(

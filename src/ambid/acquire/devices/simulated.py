@@ -21,13 +21,13 @@ from ambid.acquire.layout import carried, columns, in_si
 from ambid.acquire.protocol.table import table
 from ambid.acquire.scales import Scale, scale_of
 from ambid.acquire.settings import ControllerSettings, controller_settings
+from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 from ambid.simulate.plant import Standing
 from ambid.track.stream.block import Block
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _SETTLE_S = 0.5  # before a start: a rotor without current falls to where it lies
@@ -58,24 +58,9 @@ class _Plant:
 class SimulatedDevice(PlayedDevice):
     """A bench in this process.
 
-    Parameters
-    ----------
-    rig : Rig
-        What the controller is told; where it has no calibrations or no ``[daq]`` they are made up, and columns are SI.
-    bench : Preset or Rig, optional
-        The truth; default what daq.bench names, else the rig's own numbers.
-    pace : {"fastest", "real"}
-    seed : int
-        Of the noise; equal seeds and equal commands between equal samples give equal samples.
-    block_samples : int, optional
-        Samples of a block at most; default those of 10 ms.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such bench.
-    RigError
-        If the rig does not say what a controller needs.
+    `bench`: the truth; default what daq.bench names, else the rig's own numbers; `seed`: of the noise; equal seeds and
+    equal commands between equal samples give equal samples; `block_samples`: samples of a block at most; default those
+    of 10 ms.
     """
 
     def __init__(

@@ -12,8 +12,9 @@ from ambid.acquire.link.drift import ClockDrift, Drift
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.samples import SampleCounters, SampleDecoder, Samples
 from ambid.acquire.protocol.table import table
+from ambid.arrays import Array
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Array, Block, Frame
+from ambid.track.stream.block import Block, Frame
 
 _FLOWING: tuple[State, ...] = ("sampling", "driving", "levitating")
 _STATES: tuple[State, ...] = ("idle", "sampling", "driving", "levitating", "fault")
@@ -22,26 +23,11 @@ _STATES: tuple[State, ...] = ("idle", "sampling", "driving", "levitating", "faul
 class SampleStream:
     """Turns frames of samples into blocks and events. `heard` and `told` are called from the listener's thread.
 
-    Parameters
-    ----------
-    mask : int
-        Stream mask.
-    rate_hz : float
-    real : bool
-        Whether the controller's time runs with the host's; else no drift is estimated.
-    convert : callable
-        From counts, shape (n_samples, n_columns), to what blocks hold.
-    room : int
-        Samples that wait at most.
+    `mask`: stream mask; `real`: whether the controller's time runs with the host's; else no drift is estimated;
+    `convert`: from counts, shape (n_samples, n_columns), to what blocks hold; `room`: samples that wait at most.
 
-    Attributes
-    ----------
-    frames : FrameQueue
-        What is read.
-    live : bool
-        Whether what the controller tells is of this session.
-    ending : bool
-        Whether it was asked to stop.
+    `frames`: what is read; `live`: whether what the controller tells is of this session; `ending`: whether it was asked
+    to stop.
     """
 
     def __init__(self, mask: int, rate_hz: float, *, real: bool, convert: Callable[[Array], Array], room: int) -> None:
@@ -85,12 +71,7 @@ class SampleStream:
             return found
 
     def tell(self, event: DeviceEvent) -> None:
-        """Add an event.
-
-        Parameters
-        ----------
-        event : DeviceEvent
-        """
+        """Add an event."""
         with self._lock:
             self._events.append(event)
 
@@ -108,10 +89,7 @@ class SampleStream:
     def finish(self, ticks: int | None) -> None:
         """Give out what was held back: the controller has stopped.
 
-        Parameters
-        ----------
-        ticks : int or None
-            Since start, as its status says.
+        `ticks`: since start, as its status says.
         """
         with self._lock:
             if self._running:
@@ -122,12 +100,7 @@ class SampleStream:
             self.frames.end()
 
     def fail(self, failure: DeviceError) -> None:
-        """The line is lost: what came can be read, then the error is raised.
-
-        Parameters
-        ----------
-        failure : DeviceError
-        """
+        """The line is lost: what came can be read, then the error is raised."""
         with self._lock:
             if self._running:
                 self._pass_on(self._decoder.finish(), None)
@@ -138,11 +111,7 @@ class SampleStream:
     def enter(self, state: State, *, unless_fault: bool = False) -> None:
         """Note a state that a command brought about.
 
-        Parameters
-        ----------
-        state : State
-        unless_fault : bool
-            Only `clear` leaves a fault.
+        `unless_fault`: only `clear` leaves a fault.
         """
         with self._lock:
             if unless_fault and self._state == "fault":
@@ -156,11 +125,7 @@ class SampleStream:
     def heard(self, payloads: list[bytes], arrived_s: float) -> None:
         """Take frames of samples.
 
-        Parameters
-        ----------
-        payloads : list of bytes
-        arrived_s : float
-            By `time.perf_counter`, s.
+        `arrived_s`: by `time.perf_counter`, s.
         """
         with self._lock:
             if not self._running:
@@ -171,12 +136,7 @@ class SampleStream:
                 self._clock.learn(int(samples.ticks[-1]), arrived_s)
 
     def told(self, what: Message) -> None:
-        """Take a fault, or a status.
-
-        Parameters
-        ----------
-        what : Message
-        """
+        """Take a fault, or a status."""
         with self._lock:
             if not self.live:
                 return

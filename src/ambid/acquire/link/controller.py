@@ -41,29 +41,13 @@ class _Waiting:
 class Controller:
     """Commands, answers and the sign of life. Its methods may be called from any thread, except from `heard`.
 
-    Parameters
-    ----------
-    port : Port
-        Open; nobody else may use it. It is closed with the controller.
-    samples : callable
-        Given frames of samples and their time of arrival, from the listener's thread.
-    told : callable
-        Given messages that nobody asked for, and statuses, from the listener's thread.
-    lost : callable
-        Given the error, once, when the line is lost, from whichever thread sees it.
-    paused : callable
-        Tells whether the controller's time stands still: then it is not pinged.
-    answer_s : float
-        How long to wait for an answer before a command is sent again, s.
-    tries : int
-        How often a command is sent.
+    `port`: open; nobody else may use it. It is closed with the controller; `samples`: given frames of samples and their
+    time of arrival, from the listener's thread; `told`: given messages that nobody asked for, and statuses, from the
+    listener's thread; `lost`: given the error, once, when the line is lost, from whichever thread sees it; `paused`:
+    tells whether the controller's time stands still: then it is not pinged; `answer_s`: how long to wait for an answer
+    before a command is sent again, s; `tries`: how often a command is sent.
 
-    Attributes
-    ----------
-    resent : int
-        Commands sent again.
-    odd : int
-        Sound frames that are no message.
+    `resent`: commands sent again; `odd`: sound frames that are no message.
     """
 
     def __init__(
@@ -124,15 +108,7 @@ class Controller:
     def identify(self) -> Message:
         """Ask who is there.
 
-        Returns
-        -------
-        Message
-            ``identity``.
-
-        Raises
-        ------
-        DeviceError
-            If nobody answers, something else than the firmware is there, or it speaks another version.
+        Returns ``identity``.
         """
         try:
             return self.ask("identify")
@@ -146,24 +122,8 @@ class Controller:
     def ask(self, name: str, fields: Mapping[str, int] = _NONE, *, values: tuple[int, ...] = ()) -> Message:
         """Send a command and wait for its answer.
 
-        Parameters
-        ----------
-        name : str
-            Of the message.
-        fields : Mapping of str to int
-            Its fields but ``id``.
-        values : tuple of int
-            Elements of its last field, where that is an array.
-
-        Returns
-        -------
-        Message
-            The answer: ``ack``, or the command's own.
-
-        Raises
-        ------
-        DeviceError
-            If the controller refuses, does not answer, or the line is lost.
+        `name`: of the message; `fields`: its fields but ``id``; `values`: elements of its last field, where that is an
+        array. Returns the answer: ``ack``, or the command's own.
         """
         with self._asking:
             number = self._next_id()
@@ -188,10 +148,7 @@ class Controller:
     def pace(self, rate_hz: float) -> None:
         """Begin with pings, and count samples as the time between them.
 
-        Parameters
-        ----------
-        rate_hz : float
-            Samples in a second.
+        `rate_hz`: samples in a second.
         """
         with self._due:
             self._per_ping = max(1, int(_PING_SAMPLES_S * rate_hz))

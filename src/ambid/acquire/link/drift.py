@@ -22,30 +22,17 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """What is known of a clock.
+    """What is known of a clock."""
 
-    Attributes
-    ----------
-    drift : float
-        Relative; positive if the controller's clock is fast, NaN while unknown.
-    drift_sd : float
-        Its standard deviation.
-    offset_s : float
-        Host time at which sample 0 was there, by `time.perf_counter`, s.
-    """
-
-    drift: float = math.nan
-    drift_sd: float = math.nan
-    offset_s: float = math.nan
+    drift: float = math.nan  # relative; positive if the controller's clock is fast, NaN while unknown
+    drift_sd: float = math.nan  # its standard deviation
+    offset_s: float = math.nan  # host time at which sample 0 was there, by `time.perf_counter`, s
 
 
 class ClockDrift:
     """Learns from arrivals in constant memory.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Samples in a second by the controller's clock.
+    `rate_hz`: samples in a second by the controller's clock.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -57,12 +44,7 @@ class ClockDrift:
     def learn(self, number: int, arrived_s: float) -> None:
         """Take in one arrival.
 
-        Parameters
-        ----------
-        number : int
-            Sample number.
-        arrived_s : float
-            When it was there by the host's clock, s.
+        `number`: sample number; `arrived_s`: when it was there by the host's clock, s.
         """
         if self._origin is None:
             self._origin = arrived_s - number * self._period

@@ -19,35 +19,19 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hearing:
-    """Who is told of what comes. All are called from the listener's thread and must not wait.
+    """Who is told of what comes. All are called from the listener's thread and must not wait."""
 
-    Attributes
-    ----------
-    samples : callable
-        Given frames of samples that came together, and their time of arrival by `time.perf_counter`, s.
-    message : callable
-        Given every other message.
-    odd : callable
-        Given what is wrong with a sound frame that is no message.
-    lost : callable
-        Given why the line is lost, once.
-    """
-
+    # given frames of samples that came together, and their time of arrival by `time.perf_counter`, s
     samples: Callable[[list[bytes], float], None]
-    message: Callable[[Message], None]
-    odd: Callable[[DeviceError], None]
-    lost: Callable[[OSError], None]
+    message: Callable[[Message], None]  # given every other message
+    odd: Callable[[DeviceError], None]  # given what is wrong with a sound frame that is no message
+    lost: Callable[[OSError], None]  # given why the line is lost, once
 
 
 class Listener:
     """Listens to a port until it is closed or lost.
 
-    Parameters
-    ----------
-    port : Port
-        Nobody else may read from it.
-    hearing : Hearing
-        Who is told.
+    `port`: nobody else may read from it; `hearing`: who is told.
     """
 
     def __init__(self, port: Port, hearing: Hearing) -> None:

@@ -39,12 +39,7 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; one thread at a time. `OSError`: the line is lost.
-
-        Parameters
-        ----------
-        data : bytes
-        """
+        """Send bytes; one thread at a time. `OSError`: the line is lost."""
         ...
 
     def close(self) -> None:
@@ -55,12 +50,7 @@ class Port(Protocol):
 class SerialPort:
     """A serial port or pseudo-terminal through pyserial.
 
-    Parameters
-    ----------
-    line : serial.Serial
-        Open.
-    name : str
-        Where it is.
+    `line`: open; `name`: where it is.
     """
 
     def __init__(self, line: serial.Serial, name: str) -> None:
@@ -74,15 +64,7 @@ class SerialPort:
     def read(self) -> bytes:
         """Return the bytes that have come.
 
-        Returns
-        -------
-        bytes
-            Empty if none came within some milliseconds.
-
-        Raises
-        ------
-        OSError
-            If the line is lost.
+        Returns empty if none came within some milliseconds.
         """
         try:
             return bytes(self._line.read(_LARGEST))
@@ -90,17 +72,7 @@ class SerialPort:
             raise OSError(errno.EBADF, f"closed while reading: {failure}") from None
 
     def write(self, data: bytes) -> None:
-        """Send bytes.
-
-        Parameters
-        ----------
-        data : bytes
-
-        Raises
-        ------
-        OSError
-            If the line is lost, or takes nothing for some seconds.
-        """
+        """Send bytes."""
         try:
             self._line.write(data)
         except (TypeError, ValueError) as failure:
@@ -115,25 +87,8 @@ class SerialPort:
 def open_port(name: str, *, baud: int, boot_s: float | None = None) -> SerialPort:
     """Open a serial port for this program alone.
 
-    Parameters
-    ----------
-    name : str
-        Such as ``/dev/ttyACM0`` or ``COM3``.
-    baud : int
-        Bits per second.
-    boot_s : float, optional
-        How long to wait for a board that resets when its port is opened, as an Uno does on DTR; what it says meanwhile
-        is thrown away. Default 2 s, none for a pseudo-terminal.
-
-    Returns
-    -------
-    SerialPort
-        Ready; bytes from before are discarded.
-
-    Raises
-    ------
-    DeviceError
-        If there is no such port, it is busy, it may not be opened, it cannot go at that speed, or pyserial is missing.
+    `name`: such as ``/dev/ttyACM0`` or ``COM3``; `baud`: bits per second. Returns ready; bytes from before are
+    discarded.
     """
     try:
         import serial
@@ -166,10 +121,7 @@ def open_port(name: str, *, baud: int, boot_s: float | None = None) -> SerialPor
 def candidate_ports() -> Sequence[str]:
     """Return the serial ports of this machine that have a device behind them, those of USB first.
 
-    Returns
-    -------
-    sequence of str
-        Name and description of each; empty without pyserial.
+    Returns name and description of each; empty without pyserial.
     """
     try:
         from serial.tools import list_ports

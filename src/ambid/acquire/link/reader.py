@@ -19,35 +19,19 @@ _PATIENCE_S = 5.0  # for the thread to end; a read lasts milliseconds
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chunk:
-    """Bytes that came together.
-
-    Attributes
-    ----------
-    data : bytes
-    arrived_s : float
-        When they were there, by `time.perf_counter`, s.
-    """
+    """Bytes that came together."""
 
     data: bytes
-    arrived_s: float
+    arrived_s: float  # when they were there, by `time.perf_counter`, s
 
 
 class Reader:
     """Reads a port until it is closed or lost.
 
-    Parameters
-    ----------
-    port : Port
-        Nobody else may read from it.
-    room : int
-        Bytes that wait at most.
+    `port`: nobody else may read from it; `room`: bytes that wait at most.
 
-    Attributes
-    ----------
-    overruns, overrun_bytes : int
-        Reads dropped for want of room, and the bytes in them.
-    failure : OSError or None
-        Why the line is lost, once it is.
+    `overruns`: reads dropped for want of room, and the bytes in them; `overrun_bytes`: reads dropped for want of room,
+    and the bytes in them; `failure`: why the line is lost, once it is.
     """
 
     def __init__(self, port: Port, *, room: int = _ROOM) -> None:
@@ -65,15 +49,7 @@ class Reader:
     def take(self, timeout_s: float) -> list[Chunk]:
         """Take all that has come.
 
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for something, s.
-
-        Returns
-        -------
-        list of Chunk
-            Empty if nothing came.
+        `timeout_s`: how long to wait for something, s. Returns empty if nothing came.
         """
         with self._news:
             self._news.wait_for(lambda: self._chunks or self._over, timeout_s)

@@ -18,17 +18,7 @@ _REMEDY = {
 def refusal(asked: Message, answer: Message) -> str:
     """Return what was refused, why, and what to do.
 
-    Parameters
-    ----------
-    asked : Message
-        The command.
-    answer : Message
-        Its ``ack`` with a code that is not 0.
-
-    Returns
-    -------
-    str
-        One line.
+    `asked`: the command; `answer`: its ``ack`` with a code that is not 0. Returns one line.
     """
     known = table()
     code = known.name("code", answer["code"])

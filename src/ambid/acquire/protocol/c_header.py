@@ -53,15 +53,7 @@ static inline void put_i32(uint8_t *p, int32_t v) { put_u32(p, (uint32_t)v); }
 def c_header(table: Table) -> str:
     """Return the text of the C header.
 
-    Parameters
-    ----------
-    table : Table
-        The protocol.
-
-    Returns
-    -------
-    str
-        C99 and C++, ending in a line feed.
+    `table`: the protocol. Returns C99 and C++, ending in a line feed.
     """
     parts = [_HEAD.format(version=table.version, baud=table.baud, largest=table.largest)]
     messages = list(table.messages.values())

@@ -16,21 +16,11 @@ _NO_FIELDS: Mapping[str, int] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Message:
-    """One message.
+    """One message."""
 
-    Attributes
-    ----------
-    name : str
-        As in the table.
-    fields : Mapping of str to int
-        All fields of one element, by name.
-    values : tuple of int
-        Elements of the last field where it is the rest of the frame; else empty.
-    """
-
-    name: str
-    fields: Mapping[str, int] = field(default_factory=lambda: _NO_FIELDS)
-    values: tuple[int, ...] = ()
+    name: str  # as in the table
+    fields: Mapping[str, int] = field(default_factory=lambda: _NO_FIELDS)  # all fields of one element, by name
+    values: tuple[int, ...] = ()  # elements of the last field where it is the rest of the frame; else empty
 
     def __getitem__(self, name: str) -> int:
         return self.fields[name]
@@ -39,23 +29,8 @@ class Message:
 def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
     """Make a message, checked against the table.
 
-    Parameters
-    ----------
-    name : str
-        As in the table.
-    values : iterable of int
-        Elements of the last field, for a message that ends in an array.
-    **fields : int
-        Every other field.
-
-    Returns
-    -------
-    Message
-
-    Raises
-    ------
-    DeviceError
-        If there is no such message, a field is missing, unknown or out of range, or the frame would be too long.
+    `name`: as in the table; `values`: elements of the last field, for a message that ends in an array; `**fields`:
+    every other field.
     """
     kind = _kind(name)
     wanted = [f.name for f in kind.fixed]
@@ -79,19 +54,7 @@ def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
 def pack(what: Message) -> bytes:
     """Return code and fields of a message as bytes, without CRC.
 
-    Parameters
-    ----------
-    what : Message
-        Made by `message`, or with fields as the table has them.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    DeviceError
-        If a field is missing or does not fit its type.
+    `what`: made by `message`, or with fields as the table has them.
     """
     kind = _kind(what.name)
     tail = kind.tail
@@ -106,22 +69,7 @@ def pack(what: Message) -> bytes:
 def unpack(payload: bytes, to: str = "host") -> Message:
     """Read a message from the code and fields of a sound frame.
 
-    Parameters
-    ----------
-    payload : bytes
-        As `FrameDecoder.feed` returns them.
-    to : {"host", "controller"}
-        Who receives it.
-
-    Returns
-    -------
-    Message
-
-    Raises
-    ------
-    DeviceError
-        If the code is unknown or the length is not that of the message, or if a controller says that it speaks another
-        version of the protocol.
+    `payload`: as `FrameDecoder.feed` returns them; `to`: who receives it.
     """
     kind = _codes(to).get(payload[0]) if payload else None
     if kind is None:
@@ -142,16 +90,7 @@ def unpack(payload: bytes, to: str = "host") -> Message:
 def fits(kind: MessageType, length: int) -> bool:
     """Tell whether code and fields of a message may have this many bytes.
 
-    Parameters
-    ----------
-    kind : MessageType
-        The message.
-    length : int
-        Bytes of code and fields.
-
-    Returns
-    -------
-    bool
+    `kind`: the message; `length`: bytes of code and fields.
     """
     if kind.tail is None:
         return length == kind.length
@@ -161,15 +100,7 @@ def fits(kind: MessageType, length: int) -> bool:
 def refuse_other_version(version: int) -> None:
     """Refuse a controller that speaks another version of the protocol.
 
-    Parameters
-    ----------
-    version : int
-        What the controller says (field ``protocol`` of ``identity``).
-
-    Raises
-    ------
-    DeviceError
-        If it is not the version of this table.
+    `version`: what the controller says (field ``protocol`` of ``identity``).
     """
     ours = table().version
     if version != ours:

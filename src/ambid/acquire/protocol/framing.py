@@ -16,32 +16,19 @@ from ambid.acquire.protocol.table import CRC_BYTES, table
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameCounters:
-    """What a decoder has seen. Every byte fed is in `kept_bytes`, `discarded_bytes`, `empty`, or still pending.
+    """What a decoder has seen. Every byte fed is in `kept_bytes`, `discarded_bytes`, `empty`, or still pending."""
 
-    Attributes
-    ----------
-    frames : int
-        Sound frames given out.
-    kept_bytes : int
-        Bytes of these on the line, their 0x00 included.
-    crc, length, code, cobs, overlong : int
-        Runs between two 0x00 that were discarded: wrong check value; too short or not of the message's length; unknown
-        code; not COBS; longer than any frame.
-    discarded_bytes : int
-        Bytes of those, their 0x00 included.
-    empty : int
-        Bytes 0x00 with nothing before them: no damage.
-    """
-
-    frames: int = 0
-    kept_bytes: int = 0
+    frames: int = 0  # sound frames given out
+    kept_bytes: int = 0  # bytes of these on the line, their 0x00 included
+    # runs between two 0x00 that were discarded: wrong check value; too short or not of the message's length; unknown
+    # code; not COBS; longer than any frame
     crc: int = 0
     length: int = 0
     code: int = 0
     cobs: int = 0
     overlong: int = 0
-    discarded_bytes: int = 0
-    empty: int = 0
+    discarded_bytes: int = 0  # bytes of those, their 0x00 included
+    empty: int = 0  # bytes 0x00 with nothing before them: no damage
 
     @property
     def damaged(self) -> int:
@@ -52,19 +39,7 @@ class FrameCounters:
 def frame(payload: bytes) -> bytes:
     """Return the bytes on the line for code and fields, with CRC, COBS and the 0x00 at the end.
 
-    Parameters
-    ----------
-    payload : bytes
-        Code and fields.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    ValueError
-        If it is empty or longer than the largest frame.
+    `payload`: code and fields.
     """
     if not 0 < len(payload) <= table().largest - CRC_BYTES:
         raise ValueError(f"{len(payload)} bytes of code and fields; a frame holds 1 to {table().largest - CRC_BYTES}")
@@ -73,16 +48,7 @@ def frame(payload: bytes) -> bytes:
 
 
 def encode(what: Message) -> bytes:
-    """Return the bytes on the line for a message.
-
-    Parameters
-    ----------
-    what : Message
-
-    Returns
-    -------
-    bytes
-    """
+    """Return the bytes on the line for a message."""
     return frame(pack(what))
 
 
@@ -91,10 +57,7 @@ class FrameDecoder:
 
     It never raises, whatever it is fed, and keeps at most one frame's bytes between calls.
 
-    Parameters
-    ----------
-    to : {"host", "controller"}
-        Which side's messages are known.
+    `to`: which side's messages are known.
     """
 
     def __init__(self, to: str = "host") -> None:
@@ -126,16 +89,8 @@ class FrameDecoder:
     def feed(self, data: bytes | bytearray | memoryview) -> list[bytes]:
         """Take the next bytes of the line.
 
-        Parameters
-        ----------
-        data : bytes-like
-            Any number of bytes.
-
-        Returns
-        -------
-        list of bytes
-            Code and fields of each sound frame that ended in them, in their order; code known, length that of the
-            message.
+        `data`: any number of bytes. Returns code and fields of each sound frame that ended in them, in their order;
+        code known, length that of the message.
         """
         runs = (self._tail + data).split(b"\0")
         tail = runs.pop()

@@ -76,15 +76,7 @@ names both, and sends it nothing but `identify`. There is no half compatibility:
 def protocol_page(table: Table) -> str:
     """Return the reference page of the protocol.
 
-    Parameters
-    ----------
-    table : Table
-        The protocol that this version of `ambid` speaks: the worked example is encoded with it.
-
-    Returns
-    -------
-    str
-        MyST markdown, ending in a line feed.
+    Returns myST markdown, ending in a line feed.
     """
     state_code = table.value("code", "state")
     parts = [

@@ -24,26 +24,13 @@ _LEAK = 0.02  # how much slower than said the controller's clock may be, with mu
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Samples:
-    """Samples in the order of their ticks.
+    """Samples in the order of their ticks."""
 
-    Attributes
-    ----------
-    ticks : ndarray of int64, shape (n_samples,)
-        Numbers of the ticks since start, strictly increasing.
-    states : ndarray of uint8, shape (n_samples,)
-        Values of enum ``state``.
-    causes : ndarray of uint8, shape (n_samples,)
-        Values of enum ``cause``.
-    values : ndarray of float64, shape (n_samples, n_columns), counts
-        In the order of the stream mask's bits.
-    gaps : tuple of (int, int)
-        For each gap that ends in these samples: the number of the first sample that is missing, and how many are.
-    """
-
-    ticks: NDArray[np.int64]
-    states: NDArray[np.uint8]
-    causes: NDArray[np.uint8]
-    values: NDArray[np.float64]
+    ticks: NDArray[np.int64]  # (n_samples,), numbers of the ticks since start, strictly increasing
+    states: NDArray[np.uint8]  # (n_samples,), values of enum ``state``
+    causes: NDArray[np.uint8]  # (n_samples,), values of enum ``cause``
+    values: NDArray[np.float64]  # (n_samples, n_columns), counts, in the order of the stream mask's bits
+    # for each gap that ends in these samples: the number of the first sample that is missing, and how many are
     gaps: tuple[tuple[int, int], ...]
 
     def __len__(self) -> int:
@@ -59,49 +46,20 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleCounters:
-    """What became of the frames of samples, since the decoder was made.
+    """What became of the frames of samples, since the decoder was made."""
 
-    Attributes
-    ----------
-    samples : int
-        Given out.
-    lost : int
-        Ticks of which no sample was given out, between the first expected and the last given out.
-    gaps : int
-        Runs of such ticks.
-    damaged : int
-        Frames of samples whose length is not that of the stream, or whose state or cause does not exist.
-    misnumbered : int
-        Frames whose number jumped and the next one did not go on from it: dropped.
-    repeated : int
-        Frames with the number of the one before: dropped.
-    """
-
-    samples: int = 0
-    lost: int = 0
-    gaps: int = 0
-    damaged: int = 0
-    misnumbered: int = 0
-    repeated: int = 0
+    samples: int = 0  # given out
+    lost: int = 0  # ticks of which no sample was given out, between the first expected and the last given out
+    gaps: int = 0  # runs of such ticks
+    damaged: int = 0  # frames of samples whose length is not that of the stream, or whose state or cause does not exist
+    misnumbered: int = 0  # frames whose number jumped and the next one did not go on from it: dropped
+    repeated: int = 0  # frames with the number of the one before: dropped
 
 
 def columns_of(mask: int) -> tuple[StreamColumn, ...]:
     """Return what a sample carries for a stream mask.
 
-    Parameters
-    ----------
-    mask : int
-        Field ``stream`` of ``configure``.
-
-    Returns
-    -------
-    tuple of StreamColumn
-        In the order of a sample's values.
-
-    Raises
-    ------
-    DeviceError
-        If the mask has a bit that the table does not have.
+    `mask`: field ``stream`` of ``configure``. Returns in the order of a sample's values.
     """
     known = table().stream
     if mask < 0 or mask >> len(known):
@@ -112,14 +70,7 @@ def columns_of(mask: int) -> tuple[StreamColumn, ...]:
 class SampleDecoder:
     """Turns frames of samples into arrays.
 
-    Parameters
-    ----------
-    mask : int
-        Stream mask that was configured.
-    rate_hz : float or None
-        Samples in one second. With it and with times of arrival, gaps of more than 65535 ticks are counted right, up to
-        ten minutes and as long as what comes after the gap is late by less than 32768 ticks; without, such a gap is
-        counted short by a multiple of 65536.
+    `mask`: stream mask that was configured.
     """
 
     def __init__(self, mask: int, *, rate_hz: float | None = None) -> None:
@@ -159,10 +110,7 @@ class SampleDecoder:
     def restart(self, first: int | None = 0) -> None:
         """Expect a new stream; what was counted stays. A sample that is still held counts as misnumbered.
 
-        Parameters
-        ----------
-        first : int or None
-            Number of its first sample; None: any, of a stream joined on its way.
+        `first`: number of its first sample; None: any, of a stream joined on its way.
         """
         self._last = None if first is None else first - 1
         self._misnumbered += bool(self._held)
@@ -173,33 +121,15 @@ class SampleDecoder:
     def decode(self, payloads: Iterable[bytes], arrived_s: float | None = None) -> Samples:
         """Take the next frames of samples.
 
-        Parameters
-        ----------
-        payloads : iterable of bytes
-            Code and fields of sound frames of message ``sample``, in their order.
-        arrived_s : float or None
-            When they arrived, by any steady clock of the host, s. None where the controller's time does not run with
-            the host's.
-
-        Returns
-        -------
-        Samples
-            May be empty. A last sample whose number jumped comes with the next call, or with `finish`.
+        `payloads`: code and fields of sound frames of message ``sample``, in their order. Returns may be empty. A last
+        sample whose number jumped comes with the next call, or with `finish`.
         """
         return self._take(payloads, arrived_s, final=False)
 
     def finish(self, ticks: int | None = None) -> Samples:
         """Give out what was held back, at the end of a stream.
 
-        Parameters
-        ----------
-        ticks : int or None
-            Number of ticks since start, as the controller's status says; those that never came count as lost.
-
-        Returns
-        -------
-        Samples
-            One or none.
+        Returns one or none.
         """
         rest = self._take((), self._held_s, final=True)
         if ticks is None or self._last is None:

@@ -22,41 +22,21 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
-    """A named number: an entry of an enum, or a bit of a mask.
-
-    Attributes
-    ----------
-    name : str
-    value : int
-        Of the enum; of a mask the number of the bit.
-    about : str
-        What it means, one line.
-    """
+    """A named number: an entry of an enum, or a bit of a mask."""
 
     name: str
-    value: int
-    about: str
+    value: int  # of the enum; of a mask the number of the bit
+    about: str  # what it means, one line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldType:
-    """One field of a message.
-
-    Attributes
-    ----------
-    name : str
-    kind : {"u8", "u16", "u32", "i8", "i16", "i32"}
-        An integer, little endian.
-    many : bool
-        True for a last field that is the rest of the frame: any number of elements, none included.
-    about : str
-        Meaning and unit, one line.
-    """
+    """One field of a message."""
 
     name: str
-    kind: str
-    many: bool
-    about: str
+    kind: str  # an integer, little endian
+    many: bool  # true for a last field that is the rest of the frame: any number of elements, none included
+    about: str  # meaning and unit, one line
 
     @property
     def width(self) -> int:
@@ -77,26 +57,13 @@ class FieldType:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageType:
-    """One message.
-
-    Attributes
-    ----------
-    name : str
-    code : int
-        First byte of its frames.
-    to : {"host", "controller"}
-        Who receives it.
-    about : str
-        One line.
-    fields : tuple of FieldType
-        In their order on the wire.
-    """
+    """One message."""
 
     name: str
-    code: int
-    to: str
-    about: str
-    fields: tuple[FieldType, ...]
+    code: int  # first byte of its frames
+    to: str  # who receives it
+    about: str  # one line
+    fields: tuple[FieldType, ...]  # in their order on the wire
 
     @property
     def fixed(self) -> tuple[FieldType, ...]:
@@ -116,52 +83,26 @@ class MessageType:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamColumn:
-    """What a sample may carry.
-
-    Attributes
-    ----------
-    name : str
-    bit : int
-        Of the stream mask.
-    kind : {"u16", "i16"}
-        How its two bytes are read.
-    about : str
-        Meaning and unit, one line.
-    """
+    """What a sample may carry."""
 
     name: str
-    bit: int
-    kind: str
-    about: str
+    bit: int  # of the stream mask
+    kind: str  # how its two bytes are read
+    about: str  # meaning and unit, one line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """The whole protocol.
+    """The whole protocol."""
 
-    Attributes
-    ----------
-    version : int
-        Controllers of another version are refused.
-    baud : int
-        Of the serial line, bits in one second.
-    largest : int
-        Bytes of a frame before COBS: code, fields and CRC.
-    enums, bits : Mapping of str to tuple of Entry
-        Named numbers by group; in a group of `bits` the values are numbers of bits.
-    stream : tuple of StreamColumn
-        In the order of their bits, which is their order in a sample.
-    messages : Mapping of str to MessageType
-        By name.
-    """
-
-    version: int
-    baud: int
-    largest: int
+    version: int  # controllers of another version are refused
+    baud: int  # of the serial line, bits in one second
+    largest: int  # bytes of a frame before COBS: code, fields and CRC
+    # named numbers by group; in a group of `bits` the values are numbers of bits
     enums: Mapping[str, tuple[Entry, ...]]
     bits: Mapping[str, tuple[Entry, ...]]
-    stream: tuple[StreamColumn, ...]
-    messages: Mapping[str, MessageType]
+    stream: tuple[StreamColumn, ...]  # in the order of their bits, which is their order in a sample
+    messages: Mapping[str, MessageType]  # by name
 
     def by_code(self, to: str) -> dict[int, MessageType]:
         """Return the messages that side `to` receives, by their code."""
@@ -182,12 +123,7 @@ class Table:
 
 @functools.cache
 def table() -> Table:
-    """Return the protocol that this version of `ambid` speaks.
-
-    Returns
-    -------
-    Table
-    """
+    """Return the protocol that this version of `ambid` speaks."""
     text = resources.files(__package__).joinpath("messages.toml").read_text(encoding="utf-8")
     return read_table(text)
 
@@ -195,19 +131,7 @@ def table() -> Table:
 def read_table(text: str) -> Table:
     """Read a protocol from its text and check it.
 
-    Parameters
-    ----------
-    text : str
-        As in ``messages.toml``.
-
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    ValueError
-        If the table breaks a rule of its own: all of them are named.
+    `text`: as in ``messages.toml``.
     """
     raw = tomllib.loads(text)
     made = Table(

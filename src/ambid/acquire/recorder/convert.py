@@ -20,10 +20,11 @@ from ambid.acquire.recorder.disk import sync_folder
 from ambid.acquire.recorder.header import Event, JournalHeader
 from ambid.acquire.recorder.reader import JournalReader
 from ambid.acquire.recorder.survey import Survey, survey
+from ambid.arrays import Array
 from ambid.errors import DeviceError, RecordError
 from ambid.record.chunks import check_chunks, write_chunks
 from ambid.record.csv_format import head_lines
-from ambid.record.record import Array, Channel, Record, Step
+from ambid.record.record import Channel, Record, Step
 from ambid.track.stream.block import Block
 from ambid.units import UNKNOWN, parse_unit
 
@@ -35,20 +36,11 @@ _GAP_SHARE = 10  # and so many times the samples
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recorded:
-    """A record that was made from a journal.
+    """A record that was made from a journal."""
 
-    Attributes
-    ----------
-    path : Path
-        Of the record.
-    rate_hz : float
-    survey : Survey
-        What the journal held, and what it lacked.
-    """
-
-    path: Path
+    path: Path  # of the record
     rate_hz: float
-    survey: Survey
+    survey: Survey  # what the journal held, and what it lacked
 
     @property
     def keep_journal(self) -> bool:
@@ -59,18 +51,7 @@ class Recorded:
 def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
     """Refuse a record that could not be written, before anything is recorded.
 
-    Parameters
-    ----------
-    path : Path
-        The record to be.
-    header : JournalHeader
-    force : bool
-        Whether it may exist.
-
-    Raises
-    ------
-    DeviceError
-        If its format is not known or cannot hold the columns, or it is there already.
+    `path`: the record to be; `force`: whether it may exist.
     """
     if not path.name.lower().endswith(FORMATS):
         raise DeviceError(f"{path}: a recording is written as {', '.join(FORMATS)}. Name it so")
@@ -97,27 +78,9 @@ def recorded_from(
 ) -> Recorded | None:
     """Make the record of a journal, read it back, and put it in its place.
 
-    Parameters
-    ----------
-    reader : JournalReader
-    path : Path
-        ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``.
-    force : bool
-        Whether a file that is there may be replaced.
-    extra : Mapping of str to object
-        What else its history is to say.
-    progress : callable, optional
-        Takes the part that is done, 0 to 1.
-
-    Returns
-    -------
-    Recorded or None
-        None if there is no sample in the journal.
-
-    Raises
-    ------
-    DeviceError
-        If the record cannot be written, or does not read back as written. Nothing is then left but the journal.
+    `path`: ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``; `force`: whether a file that is there may be replaced; `extra`:
+    what else its history is to say; `progress`: takes the part that is done, 0 to 1. Returns none if there is no sample
+    in the journal.
     """
     found = survey(reader)
     if not found.samples:
@@ -143,18 +106,11 @@ def recorded_from(
 
 
 def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
-    """Hold a record that is there against a journal: the power may have gone after the one and before the other's end.
+    """Hold a record that is there against a journal: the power may have gone after the one and before the other's
+    end.
 
-    Parameters
-    ----------
-    reader : JournalReader
-    path : Path
-        Of the record.
-
-    Returns
-    -------
-    Recorded or None
-        None unless the record reads back as every value, column and event that the journal gives.
+    `path`: of the record. Returns none unless the record reads back as every value, column and event that the journal
+    gives.
     """
     found = survey(reader)
     if not found.samples or not path.is_file() or not path.name.lower().endswith(FORMATS):

@@ -31,17 +31,7 @@ _WHY = {
 def disk_error(what: str, failure: OSError, remedy: str = "") -> DeviceError:
     """Put what the system says of a file into words.
 
-    Parameters
-    ----------
-    what : str
-        Which file, and what was done with it.
-    failure : OSError
-    remedy : str
-        What else to do, a sentence.
-
-    Returns
-    -------
-    DeviceError
+    `what`: which file, and what was done with it; `remedy`: what else to do, a sentence.
     """
     why, first = _WHY.get(failure.errno or 0, (failure.strerror or str(failure), "Check folder and disk"))
     return DeviceError(f"{what}: {why}. {first}{'. ' + remedy if remedy else ''}")
@@ -50,21 +40,9 @@ def disk_error(what: str, failure: OSError, remedy: str = "") -> DeviceError:
 class JournalFile:
     """A file that is only appended to, and that no second recorder writes.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
+    `path`: must not exist.
 
-    Attributes
-    ----------
-    path : Path
-    size : int
-        Bytes written so far.
-
-    Raises
-    ------
-    DeviceError
-        If it exists, or cannot be made.
+    `size`: bytes written so far.
     """
 
     def __init__(self, path: Path) -> None:
@@ -81,12 +59,7 @@ class JournalFile:
         sync_folder(path)
 
     def write(self, data: bytes) -> None:
-        """Append all of the bytes.
-
-        Parameters
-        ----------
-        data : bytes
-        """
+        """Append all of the bytes."""
         rest = memoryview(data)
         while rest:
             written = os.write(self._fd, rest)
@@ -100,10 +73,7 @@ class JournalFile:
     def fault(self) -> str:
         """Say what makes the file useless although it can still be written.
 
-        Returns
-        -------
-        str
-            Empty if it lies where it was made, in a folder that will take the record too.
+        Returns empty if it lies where it was made, in a folder that will take the record too.
         """
         if os.fstat(self._fd).st_nlink == 0:
             return REMOVED
@@ -124,14 +94,7 @@ class JournalFile:
     def read(self, at: int, n: int) -> bytes:
         """Return the bytes from a place on, also where the file was removed.
 
-        Parameters
-        ----------
-        at, n : int
-            First byte, and how many; fewer at the end.
-
-        Returns
-        -------
-        bytes
+        `at`, `n`: first byte, and how many; fewer at the end.
         """
         return os.pread(self._fd, n, at)
 
@@ -162,17 +125,7 @@ if hasattr(os, "register_at_fork"):
 def lock(fd: int, path: Path) -> None:
     """Lock a journal against every other recorder and recovery, until the file is closed.
 
-    Parameters
-    ----------
-    fd : int
-        Closed if it cannot be locked.
-    path : Path
-        For the message.
-
-    Raises
-    ------
-    DeviceError
-        If another process holds it.
+    `fd`: closed if it cannot be locked; `path`: for the message.
     """
     try:
         import fcntl
@@ -192,10 +145,7 @@ def lock(fd: int, path: Path) -> None:
 def sync_folder(path: Path) -> None:
     """Bring the name of a file to the disk, as far as the system can.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file.
+    `path`: of the file.
     """
     if os.name != "posix":
         return
@@ -210,14 +160,7 @@ def sync_folder(path: Path) -> None:
 def free_bytes(folder: Path) -> int:
     """Return how much more a folder takes.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Returns
-    -------
-    int
-        Bytes.
+    Returns bytes.
     """
     import shutil
 

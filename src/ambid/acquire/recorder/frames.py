@@ -58,40 +58,18 @@ PREAMBLE_SIZE: Final = _PREAMBLE.size + _CRC.size
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Head:
-    """Head of a frame.
+    """Head of a frame."""
 
-    Attributes
-    ----------
-    kind : int
-        `HEADER`, `BLOCK`, `EVENT` or `CLOSE`.
-    journal : int
-        Number of the journal that it belongs to.
-    frame : int
-        Running number of the frame.
-    block : int
-        Blocks before it: the running number of a block.
-    length : int
-        Bytes of the payload.
-    first : int
-        Number of the first sample; `NO_SAMPLE` where there is none.
-    time_s : float
-        Of the first sample by the acquisition's clock, s.
-    n_samples, n_columns : int
-        Rows and columns of a block.
-    dtype : int
-        Code of the type of its values.
-    """
-
-    kind: int
-    journal: int
-    frame: int
-    block: int
-    length: int
-    first: int = NO_SAMPLE
-    time_s: float = float("nan")
-    n_samples: int = 0
+    kind: int  # `HEADER`, `BLOCK`, `EVENT` or `CLOSE`
+    journal: int  # number of the journal that it belongs to
+    frame: int  # running number of the frame
+    block: int  # blocks before it: the running number of a block
+    length: int  # bytes of the payload
+    first: int = NO_SAMPLE  # number of the first sample; `NO_SAMPLE` where there is none
+    time_s: float = float("nan")  # of the first sample by the acquisition's clock, s
+    n_samples: int = 0  # rows and columns of a block
     n_columns: int = 0
-    dtype: int = 0
+    dtype: int = 0  # code of the type of its values
 
     @property
     def size(self) -> int:
@@ -102,10 +80,7 @@ class Head:
 def preamble() -> bytes:
     """Return the first bytes of a journal.
 
-    Returns
-    -------
-    bytes
-        `PREAMBLE_SIZE` of them.
+    Returns `PREAMBLE_SIZE` of them.
     """
     text = _PREAMBLE.pack(_MAGIC, VERSION)
     return text + _CRC.pack(crc32(text))
@@ -114,15 +89,7 @@ def preamble() -> bytes:
 def version_of(data: bytes) -> int | None:
     """Return the version that the first bytes of a file tell.
 
-    Parameters
-    ----------
-    data : bytes
-        At least `PREAMBLE_SIZE`, or all there are.
-
-    Returns
-    -------
-    int or None
-        None if they are not those of a journal, or damaged.
+    `data`: at least `PREAMBLE_SIZE`, or all there are. Returns none if they are not those of a journal, or damaged.
     """
     if len(data) < PREAMBLE_SIZE or crc32(data[: _PREAMBLE.size]) != _CRC.unpack_from(data, _PREAMBLE.size)[0]:
         return None
@@ -133,17 +100,7 @@ def version_of(data: bytes) -> int | None:
 def frame_bytes(head: Head, payload: bytes) -> bytes:
     """Put a frame together.
 
-    Parameters
-    ----------
-    head : Head
-        Its ``length`` is that of the payload.
-    payload : bytes
-        At most `LARGEST`.
-
-    Returns
-    -------
-    bytes
-        ``head.size`` of them.
+    `head`: its ``length`` is that of the payload; `payload`: at most `LARGEST`. Returns ``head.size`` of them.
     """
     packed = _HEAD.pack(
         SYNC, head.journal, head.frame, head.block, head.first, head.time_s, head.length,
@@ -156,15 +113,7 @@ def frame_bytes(head: Head, payload: bytes) -> bytes:
 def head_of(data: bytes) -> Head | None:
     """Read the head of a frame.
 
-    Parameters
-    ----------
-    data : bytes
-        From the sync word on.
-
-    Returns
-    -------
-    Head or None
-        None if it is damaged, or does not agree with itself.
+    `data`: from the sync word on. Returns none if it is damaged, or does not agree with itself.
     """
     if len(data) < HEAD_SIZE or data[:8] != SYNC or crc32(data[:60]) != _CRC.unpack_from(data, _HEAD.size)[0]:
         return None
@@ -185,17 +134,8 @@ def _agrees(head: Head) -> bool:
 def is_whole(data: bytes, head: Head) -> bool:
     """Tell whether a frame's payload is what was written.
 
-    Parameters
-    ----------
-    data : bytes
-        The frame, ``head.size`` bytes or fewer.
-    head : Head
-        That it begins with.
-
-    Returns
-    -------
-    bool
-        False if a byte of it is wrong or missing.
+    `data`: the frame, ``head.size`` bytes or fewer; `head`: that it begins with. Returns false if a byte of it is wrong
+    or missing.
     """
     if len(data) < head.size:
         return False
@@ -206,19 +146,8 @@ def is_whole(data: bytes, head: Head) -> bool:
 def packed_values(values: NDArray[np.float64], declared: str | None = None) -> tuple[int, bytes]:
     """Write values in the narrowest type that gives every bit of them back.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n_samples, n_columns), float64
-        Anything, NaN and signed zeros included.
-    declared : str, optional
-        Type to be tried first, e.g. ``"float64"`` to have them as they are.
-
-    Returns
-    -------
-    code : int
-        Of the type.
-    payload : bytes
-        Row by row.
+    `values`: (n_samples, n_columns), float64, anything, NaN and signed zeros included; `declared`: type to be tried
+    first, e.g. ``"float64"`` to have them as they are. Returns `code`: of the type; `payload`: row by row.
     """
     plain = np.ascontiguousarray(values, dtype="<f8")
     bits = plain.tobytes()
@@ -242,17 +171,8 @@ def _candidates(first: float) -> list[str]:
 def unpacked_values(data: bytes, head: Head) -> NDArray[np.float64]:
     """Return the values of a block's payload.
 
-    Parameters
-    ----------
-    data : bytes
-        The payload, or a frame cut to it.
-    head : Head
-        Of the frame.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_columns), float64
-        Bit for bit what was packed.
+    `data`: the payload, or a frame cut to it; `head`: of the frame. Returns (n_samples, n_columns), float64, bit for
+    bit what was packed.
     """
     flat = np.frombuffer(data, dtype=_DTYPES[head.dtype])
     return flat.reshape(head.n_samples, head.n_columns).astype(np.float64)

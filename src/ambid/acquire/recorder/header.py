@@ -21,30 +21,15 @@ SUFFIX = ".journal"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JournalHeader:
-    """What is recorded, from what, since when.
+    """What is recorded, from what, since when."""
 
-    Attributes
-    ----------
-    columns : tuple of Column
-        In the order of a block's values.
-    rate_hz : float
-        Samples in one second.
-    device : Mapping of str to object
-        Who gave them: ``kind``, ``port``, ``identity``.
-    rig : str
-        Text of the rig file; empty where there is none.
-    started : str
-        Date and time, UTC, as ISO 8601 has it.
-    version : str
-        Of the program that recorded.
-    """
-
-    columns: tuple[Column, ...]
-    rate_hz: float
+    columns: tuple[Column, ...]  # in the order of a block's values
+    rate_hz: float  # samples in one second
+    # who gave them: ``kind``, ``port``, ``identity``
     device: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-    rig: str = ""
-    started: str = ""
-    version: str = ""
+    rig: str = ""  # text of the rig file; empty where there is none
+    started: str = ""  # date and time, UTC, as ISO 8601 has it
+    version: str = ""  # of the program that recorded
 
     def __post_init__(self) -> None:
         names = [c.name for c in self.columns]
@@ -59,16 +44,7 @@ class JournalHeader:
     def of(cls, info: DeviceInfo, rig: str = "") -> Self:
         """Describe a recording that begins now.
 
-        Parameters
-        ----------
-        info : DeviceInfo
-            Of the device that gives the samples.
-        rig : str
-            Text of the rig file.
-
-        Returns
-        -------
-        JournalHeader
+        `info`: of the device that gives the samples; `rig`: text of the rig file.
         """
         from importlib.metadata import version
 
@@ -89,10 +65,7 @@ class JournalHeader:
     def as_json(self) -> dict[str, object]:
         """Return it as a JSON object.
 
-        Returns
-        -------
-        dict
-            What `from_json` takes.
+        Returns what `from_json` takes.
         """
         columns = [asdict(c) for c in self.columns]
         rest = {k: getattr(self, k) for k in ("rate_hz", "rig", "started", "version")}
@@ -104,19 +77,7 @@ class JournalHeader:
     def from_json(cls, found: Mapping[str, Any]) -> Self:
         """Read it back.
 
-        Parameters
-        ----------
-        found : Mapping
-            That `as_json` made.
-
-        Returns
-        -------
-        JournalHeader
-
-        Raises
-        ------
-        DeviceError
-            If it is of another schema, or something is missing.
+        `found`: that `as_json` made.
         """
         if found.get("schema") != SCHEMA:
             raise DeviceError(f"the journal's schema is {found.get('schema')!r}; this program reads {SCHEMA!r}."
@@ -147,52 +108,24 @@ def _check_unit(column: Column) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that happened while samples were recorded.
+    """Something that happened while samples were recorded."""
 
-    Attributes
-    ----------
-    kind : str
-        As `DeviceEvent` has it (``fault``, ``state``, ``lost``, ``damaged``, ``link``), or ``excitation``, ``note``.
-    what : str
-        Cause, state, or one line for a person.
-    sample : int or None
-        Number of the sample at which it happened, where that is known.
-    count : int
-        Samples or frames concerned.
-    """
-
+    # as `DeviceEvent` has it (``fault``, ``state``, ``lost``, ``damaged``, ``link``), or ``excitation``, ``note``
     kind: str
-    what: str
-    sample: int | None = None
-    count: int = 0
+    what: str  # cause, state, or one line for a person
+    sample: int | None = None  # number of the sample at which it happened, where that is known
+    count: int = 0  # samples or frames concerned
 
     @classmethod
     def of(cls, told: DeviceEvent) -> Self:
-        """Take over what a device told.
-
-        Parameters
-        ----------
-        told : DeviceEvent
-
-        Returns
-        -------
-        Event
-        """
+        """Take over what a device told."""
         return cls(kind=told.kind, what=told.what, sample=told.sample, count=told.count)
 
 
 def json_bytes(value: object) -> bytes:
     """Write a header or an event.
 
-    Parameters
-    ----------
-    value : object
-        JSON-able.
-
-    Returns
-    -------
-    bytes
-        UTF-8.
+    `value`: JSON-able. Returns UTF-8.
     """
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
@@ -200,14 +133,7 @@ def json_bytes(value: object) -> bytes:
 def event_json(event: Event) -> bytes:
     """Write an event.
 
-    Parameters
-    ----------
-    event : Event
-
-    Returns
-    -------
-    bytes
-        UTF-8.
+    Returns UTF-8.
     """
     return json_bytes(asdict(event))
 
@@ -215,14 +141,7 @@ def event_json(event: Event) -> bytes:
 def event_of(text: bytes) -> Event:
     """Read an event.
 
-    Parameters
-    ----------
-    text : bytes
-        That `event_json` wrote.
-
-    Returns
-    -------
-    Event
+    `text`: that `event_json` wrote.
     """
     found = json.loads(text)
     return Event(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
@@ -231,15 +150,7 @@ def event_of(text: bytes) -> Event:
 def journal_path(path: Path) -> Path:
     """Return where the journal of a record lies.
 
-    Parameters
-    ----------
-    path : Path
-        The record to be.
-
-    Returns
-    -------
-    Path
-        Beside it.
+    `path`: the record to be. Returns beside it.
     """
     return path.with_name(path.name + SUFFIX)
 
@@ -247,14 +158,7 @@ def journal_path(path: Path) -> Path:
 def record_path(journal: Path) -> Path:
     """Return the record that a journal was to become.
 
-    Parameters
-    ----------
-    journal : Path
-
-    Returns
-    -------
-    Path
-        Beside it.
+    Returns beside it.
     """
     name = journal.name.removesuffix(SUFFIX)
     return journal.with_name(name if name != journal.name else name + ".h5")

@@ -27,58 +27,23 @@ _SECTOR = 4096
 
 @dataclass(slots=True, kw_only=True)
 class Damage:
-    """What a journal lacks. Counted while it is read.
+    """What a journal lacks. Counted while it is read."""
 
-    Attributes
-    ----------
-    blocks : int
-        Blocks that are missing or damaged between sound ones.
-    frames : int
-        Frames of any kind, those blocks included.
-    places : int
-        Stretches of bytes that are no sound frame, the end not counted.
-    discarded_bytes : int
-        Bytes of these stretches.
-    repeated : int
-        Frames that came a second time and were passed over.
-    tail_bytes : int
-        Bytes behind the last sound frame: what was being written when the recording was cut off.
-    closed : bool
-        Whether the recorder itself ended the journal.
-    """
-
-    blocks: int = 0
-    frames: int = 0
-    places: int = 0
-    discarded_bytes: int = 0
-    repeated: int = 0
-    tail_bytes: int = 0
-    closed: bool = False
+    blocks: int = 0  # blocks that are missing or damaged between sound ones
+    frames: int = 0  # frames of any kind, those blocks included
+    places: int = 0  # stretches of bytes that are no sound frame, the end not counted
+    discarded_bytes: int = 0  # bytes of these stretches
+    repeated: int = 0  # frames that came a second time and were passed over
+    tail_bytes: int = 0  # bytes behind the last sound frame: what was being written when the recording was cut off
+    closed: bool = False  # whether the recorder itself ended the journal
 
 
 class JournalReader:
     """A journal to be read, from its beginning, as often as wanted.
 
-    Parameters
-    ----------
-    read : callable
-        Takes a place and a number of bytes, and gives them.
-    size : int
-        Bytes of the file.
-    path : Path
-        For messages.
+    `read`: takes a place and a number of bytes, and gives them; `size`: bytes of the file; `path`: for messages.
 
-    Attributes
-    ----------
-    path : Path
-    header : JournalHeader
-    damage : Damage
-        Of the last reading that came to its end.
-
-    Raises
-    ------
-    DeviceError
-        If it is no journal, or one of another version.
+    `damage`: of the last reading that came to its end.
     """
 
     def __init__(self, read: Callable[[int, int], bytes], size: int, path: Path) -> None:
@@ -90,21 +55,7 @@ class JournalReader:
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Open a journal, and keep recorders and other readers away until it is closed.
-
-        Parameters
-        ----------
-        path : str or Path
-
-        Returns
-        -------
-        JournalReader
-
-        Raises
-        ------
-        DeviceError
-            If there is none, it is still being written, or it is no journal.
-        """
+        """Open a journal, and keep recorders and other readers away until it is closed."""
         path = Path(path)
         try:
             fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0))
@@ -138,10 +89,7 @@ class JournalReader:
     def items(self) -> Iterator[Block | Event]:
         """Read from the beginning; `damage` is complete once the last item was taken.
 
-        Yields
-        ------
-        Block or Event
-            In the order in which they were written.
+        Returns in the order in which they were written.
         """
         damage, number, block = Damage(), 0, 0
         end = frames.PREAMBLE_SIZE  # of what is accounted for

@@ -32,40 +32,13 @@ _AHEAD_S = 10.0  # a disk that would be full in this time is told
 class Recorder:
     """A recording: a context that makes the journal, and at its end the record. One thread may append.
 
-    Parameters
-    ----------
-    path : str or Path
-        The record to be: ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``; the journal is ``PATH.journal`` beside it.
-    header : JournalHeader
-        What is recorded.
-    sync_s : float
-        How often what was written is brought to the disk, s: a power cut costs no more.
-    write_s : float
-        How often it is written, s: a kill costs no more.
-    queue_s : float
-        How long the disk may stall before blocks find no room, s.
-    seconds : float, optional
-        How long the recording will be, where that is known: whether the disk has room for it is looked at before.
-    dtype : str, optional
-        Type of the values to try first (``int16``, ``uint16``, ``int32``, ``float32``, ``float64``); in any case each
-        block is stored in one that gives every bit back, the narrowest one if none is named.
-    force : bool
-        Whether a record that exists may be written over.
-    on_acknowledged : callable, optional
-        Takes the number of blocks that are on the disk, in the thread of the recorder.
-    on_trouble : callable, optional
-        Takes a `DeviceError` as soon as something is wrong, in whichever thread sees it.
-    on_event : callable, optional
-        Takes an `Event` of the recorder's own: blocks that found no room, numbers that went back.
-    open_file : callable
-        Makes the file from its path.
+    `header`: what is recorded; `write_s`: how often it is written, s: a kill costs no more; `queue_s`: how long the
+    disk may stall before blocks find no room, s; `force`: whether a record that exists may be written over;
+    `on_trouble`: takes a `DeviceError` as soon as something is wrong, in whichever thread sees it; `open_file`: makes
+    the file from its path.
 
-    Attributes
-    ----------
-    path, journal : Path
-        The record to be, and its journal.
-    result : Recorded or None
-        What became of it, once closed; None before, and where nothing was recorded.
+    `path`: the record to be, and its journal; `journal`: the record to be, and its journal; `result`: what became of
+    it, once closed; None before, and where nothing was recorded.
     """
 
     def __init__(
@@ -98,17 +71,7 @@ class Recorder:
         self._closed = False
 
     def __enter__(self) -> Self:
-        """Make the journal.
-
-        Returns
-        -------
-        Recorder
-
-        Raises
-        ------
-        DeviceError
-            If the record or the journal exists, cannot be made, or has no room on the disk.
-        """
+        """Make the journal."""
         check_target(self.path, self._header, force=self._force)
         self._check_room()
         self._writer.start(self._open_file(self.journal))
@@ -147,20 +110,7 @@ class Recorder:
     def append(self, block: Block) -> bool:
         """Take a block, without waiting for the disk.
 
-        Parameters
-        ----------
-        block : Block
-            Copied; of as many columns as the header says. Numbers that go back are stored, and told.
-
-        Returns
-        -------
-        bool
-            False if it will not be stored: there was no room, or the disk has failed. It is then counted.
-
-        Raises
-        ------
-        DeviceError
-            If it is no block of this recording.
+        Returns false if it will not be stored: there was no room, or the disk has failed. It is then counted.
         """
         values = self._checked(block)
         n = len(values)
@@ -186,12 +136,7 @@ class Recorder:
         return True
 
     def event(self, event: Event | DeviceEvent) -> None:
-        """Put something that happened into the journal, in its place between the blocks.
-
-        Parameters
-        ----------
-        event : Event or DeviceEvent
-        """
+        """Put something that happened into the journal, in its place between the blocks."""
         own = event if isinstance(event, Event) else Event.of(event)
         sample = NO_SAMPLE if own.sample is None else own.sample
         self._queue.put(Item(EVENT, sample, float("nan"), 0, 0, 0, event_json(own)))
@@ -199,15 +144,7 @@ class Recorder:
     def flush(self, timeout_s: float = 60.0) -> bool:
         """Wait until everything that was taken is on the disk.
 
-        Parameters
-        ----------
-        timeout_s : float
-            Longest wait.
-
-        Returns
-        -------
-        bool
-            Whether it is.
+        `timeout_s`: longest wait. Returns whether it is.
         """
         return self._writer.flush(self._queue.blocks, timeout_s)
 
@@ -217,20 +154,8 @@ class Recorder:
         Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record. So does
         a disk that had failed, from which reading back proves little, and a journal that holds more than the record.
 
-        Parameters
-        ----------
-        progress : callable, optional
-            Takes the part that is done, 0 to 1.
-
-        Returns
-        -------
-        Recorded or None
-            None if nothing was recorded; there is then neither record nor journal.
-
-        Raises
-        ------
-        DeviceError
-            If the record cannot be written, or is not what the journal holds.
+        `progress`: takes the part that is done, 0 to 1. Returns none if nothing was recorded; there is then neither
+        record nor journal.
         """
         if self._closed or not self._writer.started:
             return self.result

@@ -12,34 +12,17 @@ from ambid.acquire.recorder.reader import Damage, JournalReader
 
 @dataclass(slots=True, kw_only=True)
 class Survey:
-    """What a journal holds.
+    """What a journal holds."""
 
-    Attributes
-    ----------
-    blocks, samples : int
-        Blocks, and rows of them that have a place in the record.
-    first, end : int
-        Number of the first sample, and of the one behind the last.
-    start_s : float
-        Time of the first sample, s.
-    gaps, gap_samples : int
-        Places where samples are missing, and how many.
-    misplaced : int
-        Rows whose numbers were there before.
-    stamp_error_s : float
-        Largest difference between a block's time and that of its number at the rate of the header, s.
-    events : list of Event
-    damage : Damage
-    """
-
-    blocks: int = 0
+    blocks: int = 0  # blocks, and rows of them that have a place in the record
     samples: int = 0
-    first: int = 0
+    first: int = 0  # number of the first sample, and of the one behind the last
     end: int = 0
-    start_s: float = 0.0
-    gaps: int = 0
+    start_s: float = 0.0  # time of the first sample, s
+    gaps: int = 0  # places where samples are missing, and how many
     gap_samples: int = 0
-    misplaced: int = 0
+    misplaced: int = 0  # rows whose numbers were there before
+    # largest difference between a block's time and that of its number at the rate of the header, s
     stamp_error_s: float = 0.0
     events: list[Event] = field(default_factory=list)
     damage: Damage = field(default_factory=Damage)
@@ -51,16 +34,7 @@ class Survey:
 
 
 def survey(reader: JournalReader) -> Survey:
-    """Look through a journal.
-
-    Parameters
-    ----------
-    reader : JournalReader
-
-    Returns
-    -------
-    Survey
-    """
+    """Look through a journal."""
     found = Survey()
     rate = reader.header.rate_hz
     for item in reader.items():

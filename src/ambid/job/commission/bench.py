@@ -10,9 +10,10 @@ import numpy as np
 
 from ambid.acquire.device import Device
 from ambid.acquire.session import Course
+from ambid.arrays import Array
 from ambid.job.amplitude import Trial, find_amplitude
 from ambid.job.commission.step import EXCITATION, Step, Wishes
-from ambid.job.look import Array, Look, Room, ended
+from ambid.job.look import Look, Room, ended
 from ambid.report.numbers import sized
 
 _SD_AT_REST = 0.02  # of the trips' width: noise of a sensor with the output off
@@ -25,15 +26,7 @@ _UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
 def self_test(device: Device) -> Step:
     """Let the device look at itself.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle.
-
-    Returns
-    -------
-    Step
-        Passed if nothing failed.
+    `device`: opened, idle. Returns passed if nothing failed.
     """
     found = device.self_test()
     who = ", ".join(f"{k} {v}" for k, v in device.info.identity.items() if k in ("protocol", "major", "minor", "board"))
@@ -51,19 +44,8 @@ def self_test(device: Device) -> Step:
 def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     """Look at the sensors with the output off.
 
-    Parameters
-    ----------
-    look : callable
-        See `ambid.job.look.looking`.
-    room : Room
-        Limits.
-    wishes : Wishes
-        Lengths.
-
-    Returns
-    -------
-    Step
-        Not passed where a sensor is noisy, or a current is shown that cannot be.
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
+    or a current is shown that cannot be.
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
     reasons = list(ended(report, "the look at rest"))
@@ -97,19 +79,8 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
 def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     """Lift the rotor and let it hover without excitation.
 
-    Parameters
-    ----------
-    look : callable
-        See `ambid.job.look.looking`.
-    room : Room
-        Limits.
-    wishes : Wishes
-        Lengths.
-
-    Returns
-    -------
-    Step
-        Not passed where the controller tripped, the rotor strays, or no room is left.
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
+    tripped, the rotor strays, or no room is left.
     """
     report, seen = look(Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s))
     reasons = list(ended(report, "levitation"))
@@ -145,23 +116,9 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
 def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
     """Find the largest excitation that keeps to its part of the room.
 
-    Parameters
-    ----------
-    look : callable
-        See `ambid.job.look.looking`.
-    room : Room
-        Limits.
-    wishes : Wishes
-        Band, part of the room, perhaps the amplitude itself.
-    rate_hz : float
-        Of the device, Hz.
-    hover : Step
-        Levitation without excitation: where the bench rests.
-
-    Returns
-    -------
-    Step
-        `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
+    itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
+    `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """
     resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
     trial = Trial(

@@ -14,17 +14,7 @@ FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "
 
 
 def check_folder(folder: str | Path) -> None:
-    """Refuse a folder that holds an earlier commissioning.
-
-    Parameters
-    ----------
-    folder : str or Path
-
-    Raises
-    ------
-    AmbidError
-        If it is no folder, may not be written, or one of `FILES`, or what a killed recording left, is in it.
-    """
+    """Refuse a folder that holds an earlier commissioning."""
     place = Path(folder)
     if not place.is_dir():
         raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
@@ -39,12 +29,7 @@ def check_folder(folder: str | Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a file that is there whole or not at all.
 
-    Parameters
-    ----------
-    path : Path
-        Written over if it exists.
-    text : str
-        In UTF-8.
+    `path`: written over if it exists; `text`: in UTF-8.
     """
     with whole_file(path) as beside:
         beside.write_text(text, encoding="utf-8")
@@ -54,20 +39,7 @@ def write_text(path: Path, text: str) -> None:
 def whole_file(path: Path) -> Iterator[Path]:
     """Let a file be written under another name, and put it in place whole.
 
-    Parameters
-    ----------
-    path : Path
-        Where it goes.
-
-    Yields
-    ------
-    Path
-        Where it is to be written.
-
-    Raises
-    ------
-    AmbidError
-        If it cannot be.
+    `path`: where it goes. Returns where it is to be written.
     """
     beside = path.with_name(f".{os.getpid()}-{path.name}")
     try:

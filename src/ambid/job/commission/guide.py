@@ -15,7 +15,7 @@ from ambid.acquire.device import Device, DeviceEvent
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job._progress import Tick, silent
 from ambid.job.acquire import Acquired, Progress, acquire
 from ambid.job.commission import bench, result
@@ -34,21 +34,11 @@ _LIMIT = 1.5  # acceptable model error of tracking
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Commissioned:
-    """What came of a commissioning.
+    """What came of a commissioning."""
 
-    Attributes
-    ----------
-    steps : tuple of Step
-        Those that were done, the last one perhaps not passed.
-    estimate : Estimate or None
-        Where it came as far.
-    folder : Path
-        Where the files are.
-    """
-
-    steps: tuple[Step, ...]
-    estimate: Estimate | None
-    folder: Path
+    steps: tuple[Step, ...]  # those that were done, the last one perhaps not passed
+    estimate: Estimate | None  # where it came as far
+    folder: Path  # where the files are
 
     @property
     def passed(self) -> bool:
@@ -80,36 +70,10 @@ def commission(
 ) -> Commissioned:
     """Bring a bench from a controller that answers to physical parameters that are tracked.
 
-    Parameters
-    ----------
-    device : Device
-        Opened, idle. Its output is off when this returns: it is idle again, or in its safe state after a fault.
-    rig : Rig
-        The bench, with ``[loop]`` and ``[daq]``.
-    folder : str or Path
-        Where the files go; it has to exist, and none of `folder.FILES` may be in it: see `folder.check_folder`.
-    wishes : Wishes, optional
-        What is to be reached.
-    on_begin, on_step : callable, optional
-        Told of a step before it begins, and of what it found.
-    on_progress, on_event : callable, optional
-        As `ambid.job.acquire.acquire`.
-    confirm : callable, optional
-        Asked before the rotor is lifted; False ends it.
-    stopped : callable, optional
-        Asked while samples come and numbers are worked out; True ends the commissioning, with that as a reason.
-    tick : callable, optional
-        Sign of life while computing.
-
-    Returns
-    -------
-    Commissioned
-        Also where a step was not good enough, or could not be done: the error is then the step's reason.
-
-    Raises
-    ------
-    AmbidError
-        If rig, wishes or folder break a rule, which is seen before anything moves; or the operator does not agree.
+    `rig`: the bench, with ``[loop]`` and ``[daq]``; `wishes`: what is to be reached; `on_begin`, `on_step`: told of a
+    step before it begins, and of what it found; `on_progress`, `on_event`: as `ambid.job.acquire.acquire`; `confirm`:
+    asked before the rotor is lifted; False ends it; `tick`: sign of life while computing. Returns also where a step was
+    not good enough, or could not be done: the error is then the step's reason.
     """
     place = Path(folder)
     check_folder(place)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.job.acquire import Acquired
 from ambid.job.commission.step import Step, Wishes
 from ambid.job.look import ended
@@ -21,18 +21,9 @@ _RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consisten
 def record(name: str, done: Acquired) -> Step:
     """Judge a record as it was taken.
 
-    Parameters
-    ----------
-    name : str
-        What it is for.
-    done : Acquired
-        From `acquire`.
-
-    Returns
-    -------
-    Step
-        Not passed where samples were lost or not stored, or a sensor saturates or stands still. Little signal over
-        noise is a caution: whether it is enough is decided by the intervals of what is identified.
+    `name`: what it is for; `done`: from `acquire`. Returns not passed where samples were lost or not stored, or a
+    sensor saturates or stands still. Little signal over noise is a caution: whether it is enough is decided by the
+    intervals of what is identified.
     """
     reasons = list(ended(done.run, f"the {name}"))
     if done.not_stored:
@@ -58,17 +49,8 @@ def record(name: str, done: Acquired) -> Step:
 def identification(estimate: Estimate, wishes: Wishes) -> Step:
     """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Of the record.
-    wishes : Wishes
-        How wide an interval may be.
-
-    Returns
-    -------
-    Step
-        Tests of residuals that fail are cautions, because the standard deviations allow for them; all else stops.
+    `estimate`: of the record; `wishes`: how wide an interval may be. Returns tests of residuals that fail are cautions,
+    because the standard deviations allow for them; all else stops.
     """
     findings: list[str] = []
     reasons: list[str] = []
@@ -101,15 +83,7 @@ def identification(estimate: Estimate, wishes: Wishes) -> Step:
 def validation(estimate: Estimate) -> Step:
     """Judge how an estimate does on the second record.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        With `validation`.
-
-    Returns
-    -------
-    Step
-        Not passed where the second record is predicted worse than the first allows.
+    `estimate`: with `validation`. Returns not passed where the second record is predicted worse than the first allows.
     """
     checks: Mapping[str, Any] = (estimate.validation or {}).get("checks", {})  # type: ignore[assignment]
     findings = tuple(f"{name}: {c['detail']}" for name, c in checks.items() if c["passed"])
@@ -124,17 +98,8 @@ def validation(estimate: Estimate) -> Step:
 def tracking(done: LiveTrack, limit: float) -> Step:
     """Judge live tracking: the bench that was identified is the bench that runs.
 
-    Parameters
-    ----------
-    done : LiveTrack
-        From `track_live`, with its lines.
-    limit : float
-        Acceptable model error.
-
-    Returns
-    -------
-    Step
-        Not passed where it ended early, the error is beyond the limit, or a change was found.
+    `done`: from `track_live`, with its lines; `limit`: acceptable model error. Returns not passed where it ended early,
+    the error is beyond the limit, or a change was found.
     """
     reasons = list(ended(done.run, "tracking"))
     summary, lines = done.track.summary, done.track.lines

@@ -35,27 +35,13 @@ _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """One step, done.
+    """One step, done."""
 
-    Attributes
-    ----------
-    name : str
-        One of `STEPS`.
-    findings : tuple of str
-        What was measured, one line each.
-    reasons : tuple of str
-        Why it is not good enough, and what to do, one line each; empty: it is.
-    cautions : tuple of str
-        What a reader should know although the step is good enough.
-    numbers : Mapping of str to float
-        The same as numbers, SI.
-    """
-
-    name: StepName
-    findings: tuple[str, ...] = ()
-    reasons: tuple[str, ...] = ()
-    cautions: tuple[str, ...] = ()
-    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)
+    name: StepName  # one of `STEPS`
+    findings: tuple[str, ...] = ()  # what was measured, one line each
+    reasons: tuple[str, ...] = ()  # why it is not good enough, and what to do, one line each; empty: it is
+    cautions: tuple[str, ...] = ()  # what a reader should know although the step is good enough
+    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
 
     @property
     def passed(self) -> bool:
@@ -65,10 +51,7 @@ class Step:
     def as_json(self) -> dict[str, object]:
         """Return it as a JSON object.
 
-        Returns
-        -------
-        dict
-            ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``; what is not known is None.
+        Returns ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``; what is not known is None.
         """
         return {
             "name": self.name,
@@ -82,67 +65,35 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wishes:
-    """What a commissioning is to reach, and how long it may take for it.
+    """What a commissioning is to reach, and how long it may take for it."""
 
-    Attributes
-    ----------
-    record_s, second_s, hover_s, rest_s, trial_s, track_s : float
-        Length of the record, of the one for validation, of levitation without excitation, of the look at rest, of each
-        trial of the amplitude, and of tracking, s.
-    settle_s : float
-        Time that lift-off is given, s.
-    amplitude_v : float or None
-        Peak of the excitation, V; None: found by trials.
-    band_hz : (float, float) or None
-        Of the excitation; None: a thousandth to a thirtieth of the rate.
-    use : float
-        Part of the way to the trips that the excitation may use.
-    widest : float
-        Largest half width of a 95 % interval, relative to the value, of a parameter that counts as found.
-    seed : int
-        Of the excitation.
-    """
-
+    # length of the record, of the one for validation, of levitation without excitation, of the look at rest, of each
+    # trial of the amplitude, and of tracking, s
     record_s: float = 20.0
     second_s: float = 8.0
     hover_s: float = 2.0
     rest_s: float = 0.5
     trial_s: float = 2.0
     track_s: float = 5.0
-    settle_s: float = 1.0
-    amplitude_v: float | None = None
-    band_hz: tuple[float, float] | None = None
-    use: float = 0.3
+    settle_s: float = 1.0  # time that lift-off is given, s
+    amplitude_v: float | None = None  # peak of the excitation, V; None: found by trials
+    band_hz: tuple[float, float] | None = None  # of the excitation; None: a thousandth to a thirtieth of the rate
+    use: float = 0.3  # part of the way to the trips that the excitation may use
+    # largest half width of a 95 % interval, relative to the value, of a parameter that counts as found
     widest: float = 0.10
-    seed: int = 0
+    seed: int = 0  # of the excitation
 
     def band(self, rate_hz: float) -> tuple[float, float]:
         """Return the band of the excitation in Hz.
 
-        Parameters
-        ----------
-        rate_hz : float
-            Of the device, Hz.
-
-        Returns
-        -------
-        (float, float)
-            As wished, or from the rate.
+        `rate_hz`: of the device, Hz. Returns as wished, or from the rate.
         """
         return self.band_hz or moving_band(rate_hz)
 
     def longest_trial_s(self, rate_hz: float) -> float:
         """Return the length of a trial in s: as wished, or longer where the band is slow.
 
-        Parameters
-        ----------
-        rate_hz : float
-            Of the device, Hz.
-
-        Returns
-        -------
-        float
-            Four periods of the lowest line at least.
+        `rate_hz`: of the device, Hz. Returns four periods of the lowest line at least.
         """
         low = self.band(rate_hz)[0]
         return max(self.trial_s, _PERIODS / low * (1 + 1e-9)) if low > 0.0 else self.trial_s

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.track.evidence import Evidence
 from ambid.track.physical.parameter_filter import ParameterFilter
-
-Array = NDArray[np.float64]
 
 CHUNK_S = 0.05  # evidence is merged to this length: the fastest drift that is told from a jump
 _WINDOW = 400  # chunks
@@ -34,23 +33,11 @@ _NOTICED = 3.0  # factor of a variance from which the recent past is filtered an
 class DriftRates:
     """Variances per second of the walks.
 
-    Parameters
-    ----------
-    start : ndarray, shape (p,)
-        First variances per second.
-    floor, ceiling : ndarray, shape (p,)
-        Bounds; where floor equals ceiling nothing is adapted.
-    block_s : float
-        Length of the evidence that will come, s.
+    `start`: (p,), first variances per second; `floor`, `ceiling`: (p,), bounds; where floor equals ceiling nothing is
+    adapted; `block_s`: length of the evidence that will come, s.
 
-    Attributes
-    ----------
-    variance : ndarray, shape (p,)
-        Per second.
-    adapts : bool
-        Whether the variances are found from the data.
-    walks : bool
-        Whether any variance is, or may become, positive.
+    `variance`: (p,), per second; `adapts`: whether the variances are found from the data; `walks`: whether any variance
+    is, or may become, positive.
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
@@ -74,11 +61,7 @@ class DriftRates:
     def add(self, evidence: Evidence, before: ParameterFilter) -> None:
         """Take in a block.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        before : ParameterFilter
-            The numbers as they were known before this block.
+        `before`: the numbers as they were known before this block.
         """
         if not self.adapts:
             return
@@ -99,12 +82,7 @@ class DriftRates:
     def adapt(self, known: ParameterFilter, noise: float) -> None:
         """Look at the window where a look is due; where something walks faster than thought, filter its end anew.
 
-        Parameters
-        ----------
-        known : ParameterFilter
-            The numbers as they are known after the last block of `add`; may be set anew.
-        noise : float
-            Variance of the evidence's residual.
+        `noise`: variance of the evidence's residual.
         """
         if self._parts == 0 and self._count >= _FEWEST and self._since >= _EVERY:
             self._since = 0
@@ -115,12 +93,7 @@ class DriftRates:
         self._count = self._next = self._since = self._parts = 0
 
     def copy(self) -> DriftRates:
-        """Return an independent copy in the same state.
-
-        Returns
-        -------
-        DriftRates
-        """
+        """Return an independent copy in the same state."""
         other = copy.copy(self)
         for name in ("variance", "_J", "_r", "_at", "_q", "_P", "_triangle"):
             setattr(other, name, getattr(self, name).copy())

@@ -7,14 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.track.evidence import Evidence
 from ambid.track.physical.linearisation import Linearisation
 from ambid.track.physical.numbers import TrackedNumbers
 from ambid.track.physical.signals import Samples
-
-Array = NDArray[np.float64]
 
 SETTLING = 10.0  # memories of the predictor until what it did not know at a restart is below the noise
 _ROOM = 128  # samples whose rows are folded at once: they stay in the first-level cache
@@ -23,21 +21,9 @@ _ROOM = 128  # samples whose rows are folded at once: they stay in the first-lev
 class EvidenceStream:
     """The predictor of a bench, running.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    at : Linearisation
-        Where the predictor starts.
-    block : int
-        Samples of one evidence.
+    `at`: where the predictor starts; `block`: samples of one evidence.
 
-    Attributes
-    ----------
-    at : Linearisation
-    sample : int
-        Number of the next sample of the stream.
-    latest : Evidence or None
-        Of the last block.
+    `sample`: number of the next sample of the stream; `latest`: of the last block.
     """
 
     def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
@@ -62,22 +48,15 @@ class EvidenceStream:
         self.latest: Evidence | None = None
 
     def relinearise(self, at: Linearisation) -> None:
-        """Go on with the predictor of another point; the state moves along to first order.
-
-        Parameters
-        ----------
-        at : Linearisation
-        """
+        """Go on with the predictor of another point; the state moves along to first order."""
         self._x += self._s @ (at.at - self.at.at)
         self.at = at
 
     def restart(self, sample: int) -> None:
-        """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is dropped.
+        """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is
+        dropped.
 
-        Parameters
-        ----------
-        sample : int
-            Number of the next sample.
+        `sample`: number of the next sample.
         """
         self.sample, self._fresh = sample, True
         self._triangle[:] = 0.0
@@ -96,18 +75,8 @@ class EvidenceStream:
     def feed(self, samples: Samples) -> tuple[int, Array, Evidence | None]:
         """Take samples until a block is complete, they are used up, or one is not finite.
 
-        Parameters
-        ----------
-        samples : Samples
-
-        Returns
-        -------
-        used : int
-            Samples taken; fewer than given, without evidence, where the next one is not finite.
-        errors : ndarray, shape (used, n_outputs)
-            Innovations in scaled output units.
-        evidence : Evidence or None
-            Of the block that these samples complete.
+        Returns `used`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
+        (used, n_outputs), innovations in scaled output units; `evidence`: of the block that these samples complete.
         """
         u, y = samples.u, samples.y
         if self._fresh and y.shape[0]:
@@ -124,15 +93,7 @@ class EvidenceStream:
     def close(self, block: int) -> Evidence | None:
         """Return the evidence of the samples since the last block, and go on with blocks of another length.
 
-        Parameters
-        ----------
-        block : int
-            Samples of the blocks to come.
-
-        Returns
-        -------
-        Evidence or None
-            None where nothing but settling has happened.
+        `block`: samples of the blocks to come. Returns none where nothing but settling has happened.
         """
         from ambid.track.physical._kernels import fold
 
@@ -184,12 +145,7 @@ class EvidenceStream:
         return found
 
     def copy(self) -> EvidenceStream:
-        """Return an independent stream in the same state.
-
-        Returns
-        -------
-        EvidenceStream
-        """
+        """Return an independent stream in the same state."""
         other = copy.copy(self)
         for name in ("_history", "_x", "_s", "_rows", "_triangle", "_counts", "_scale"):
             setattr(other, name, getattr(self, name).copy())

@@ -5,55 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.predictor import assemble
-from ambid.identify.threads import one_thread
+from ambid.arrays import Array
+from ambid.estimation.predictor import assemble
+from ambid.estimation.threads import one_thread
 from ambid.track.physical.numbers import TrackedNumbers
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearisation:
-    """x+ = M [x; inputs at their lags; y; 1; unbalance forcing], and dM/dq.
+    """x+ = M [x; inputs at their lags; y; 1; unbalance forcing], and dM/dq."""
 
-    Attributes
-    ----------
-    at : ndarray, shape (p,)
-        The point.
-    M : ndarray, shape (n, n_l)
-    D : ndarray, shape (n_l, n, p)
-        Derivative of M by the tracked numbers, first by column.
-    C : ndarray, shape (n_outputs, n)
-    gain : ndarray, shape (n, n_outputs)
-        Starts the next solution of the Riccati equation.
-    memory : float
-        Samples after which the predictor has forgotten all but a part 1/e of its state.
-    """
-
-    at: Array
-    M: Array
-    D: Array
-    C: Array
-    gain: Array
-    memory: float
+    at: Array  # (p,), the point
+    M: Array  # (n, n_l)
+    D: Array  # (n_l, n, p), derivative of M by the tracked numbers, first by column
+    C: Array  # (n_outputs, n)
+    gain: Array  # (n, n_outputs), starts the next solution of the Riccati equation
+    memory: float  # samples after which the predictor has forgotten all but a part 1/e of its state
 
 
 def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> Linearisation | None:
     """Assemble the predictor and its derivatives at a point.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    q : ndarray, shape (p,)
-    near : ndarray, shape (n, n_outputs), optional
-        Predictor gain of a point near this one.
-
-    Returns
-    -------
-    Linearisation or None
-        None where there is no stable predictor or no physical plant.
+    `q`: (p,); `near`: (n, n_outputs), predictor gain of a point near this one. Returns none where there is no stable
+    predictor or no physical plant.
     """
     problem = numbers.problem
     with one_thread():  # matrices of a few rows, and the next block waits

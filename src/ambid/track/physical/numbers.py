@@ -14,18 +14,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
-from ambid.identify.predictor import assemble
-from ambid.identify.problem import PredictorProblem, Scales
-from ambid.identify.scaling import scales_for
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.predictor import assemble
+from ambid.estimation.problem import PredictorProblem, Scales
+from ambid.estimation.scaling import scales_for
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.physics.sensor_gain import SensorGains
 from ambid.track.physical.start_noise import NoiseNumbers, noise_numbers, overdispersion_of, rate_of
 
-Array = NDArray[np.float64]
 Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
 
 UNBALANCE = ("unbalance_cos", "unbalance_sin")
@@ -37,51 +37,23 @@ _UNBALANCE_SD = 10.0  # forces that would throw the rotor through the noise in o
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedNumbers:
-    """The tracked numbers of a bench and their state at the start.
-
-    Attributes
-    ----------
-    names : tuple of str
-    kinds : tuple of {"parameter", "gain", "noise", "offset", "unbalance"}
-        The delay counts as noise: it belongs to the predictor, not to the bench.
-    units : tuple of str
-        SI units of parameters and gains; "1" for the others, except ``kg m`` for the unbalance.
-    magnitude : ndarray, shape (p,)
-        SI size of one unit of q.
-    start : ndarray, shape (p,)
-        q at the start.
-    covariance : ndarray, shape (p, p)
-        Of q at the start.
-    problem : PredictorProblem
-        Without data: model, scales, delay and noise form from which predictors are assembled.
-    point : ndarray, shape (n_inputs + n_outputs,), SI
-        Operating point that is taken off the samples: inputs, then outputs.
-    innovation_covariance : ndarray, shape (n_outputs, n_outputs)
-        At the start, in scaled output units.
-    information_s : float
-        Length of the record behind the start, s.
-    overdispersion : float
-        Variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
-        explains its record only in part.
-    speed : float
-        rad/s at which the unbalance force has the size of its magnitude.
-    warnings : tuple of str
-        What to mistrust, one line each.
-    """
+    """The tracked numbers of a bench and their state at the start."""
 
     names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    units: tuple[str, ...]
-    magnitude: Array
-    start: Array
-    covariance: Array
-    problem: PredictorProblem
-    point: Array
-    innovation_covariance: Array
-    information_s: float
+    kinds: tuple[Kind, ...]  # the delay counts as noise: it belongs to the predictor, not to the bench
+    units: tuple[str, ...]  # SI units of parameters and gains; "1" for the others, except ``kg m`` for the unbalance
+    magnitude: Array  # (p,), SI size of one unit of q
+    start: Array  # (p,), q at the start
+    covariance: Array  # (p, p), of q at the start
+    problem: PredictorProblem  # without data: model, scales, delay and noise form from which predictors are assembled
+    point: Array  # (n_inputs + n_outputs,), SI, operating point that is taken off the samples: inputs, then outputs
+    innovation_covariance: Array  # (n_outputs, n_outputs), at the start, in scaled output units
+    information_s: float  # length of the record behind the start, s
+    # variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
+    # explains its record only in part
     overdispersion: float = 1.0
-    speed: float = 1.0
-    warnings: tuple[str, ...] = ()
+    speed: float = 1.0  # rad/s at which the unbalance force has the size of its magnitude
+    warnings: tuple[str, ...] = ()  # what to mistrust, one line each
 
     @property
     def rate_hz(self) -> float:
@@ -102,39 +74,21 @@ class TrackedNumbers:
     def places(self, *kinds: Kind) -> NDArray[np.int64]:
         """Return where the numbers of some kinds stand in q.
 
-        Parameters
-        ----------
-        *kinds : str
-
-        Returns
-        -------
-        ndarray of int, shape (n_places,)
+        Returns (n_places,).
         """
         return np.array([j for j, k in enumerate(self.kinds) if k in kinds], dtype=np.int64)
 
     def values(self, q: Array) -> dict[str, float]:
         """Return numbers in SI units.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        dict of str to float
+        `q`: (p,).
         """
         return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
 
     def physical(self, q: Array) -> Array:
         """Return the physical parameters in SI units.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        ndarray, shape (n_parameters,)
+        `q`: (p,). Returns (n_parameters,).
         """
         own = self.places("parameter")
         return np.asarray(q[own] * self.magnitude[own])
@@ -142,14 +96,7 @@ class TrackedNumbers:
     def physical_covariance(self, covariance: Array) -> Array:
         """Return the covariance of the physical parameters in SI units.
 
-        Parameters
-        ----------
-        covariance : ndarray, shape (p, p)
-            Of q.
-
-        Returns
-        -------
-        ndarray, shape (n_parameters, n_parameters)
+        `covariance`: (p, p), of q. Returns (n_parameters, n_parameters).
         """
         own = self.places("parameter")
         return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
@@ -157,13 +104,7 @@ class TrackedNumbers:
     def vector(self, q: Array) -> Array:
         """Return q in the layout of `PredictorProblem`, initial state zero.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        ndarray, shape (problem.size,)
+        `q`: (p,). Returns (problem.size,).
         """
         out = np.zeros(self.problem.size)
         n = self.problem.slices["initial"].start
@@ -174,23 +115,8 @@ class TrackedNumbers:
 def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed: float = 1.0) -> TrackedNumbers:
     """Set up tracking from an off-line estimate.
 
-    Parameters
-    ----------
-    estimate : Estimate
-        Parameters, covariance, noise, delay and operating point are taken from it.
-    synchronous : bool
-        Track an unbalance too: the angle of the rotor is known.
-    top_speed : float
-        Speed at which the unbalance is felt most, rad/s.
-
-    Returns
-    -------
-    TrackedNumbers
-
-    Raises
-    ------
-    EstimationError
-        If the estimate has failed, has nothing free, or makes no predictor.
+    `estimate`: parameters, covariance, noise, delay and operating point are taken from it; `synchronous`: track an
+    unbalance too: the angle of the rotor is known; `top_speed`: speed at which the unbalance is felt most, rad/s.
     """
     from scipy.linalg import block_diag
 

@@ -11,30 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.track.evidence import Evidence
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 class ParameterFilter:
     """Estimate and covariance of the tracked numbers.
 
-    Parameters
-    ----------
-    start : ndarray, shape (p,)
-    covariance : ndarray, shape (p, p)
-        Positive definite.
-    positive : ndarray of bool, shape (p,), optional
-        Numbers that are positive and stay so; default none.
+    `start`: (p,); `covariance`: (p, p), positive definite; `positive`: (p,), numbers that are positive and stay so;
+    default none.
 
-    Attributes
-    ----------
-    q : ndarray, shape (p,)
-    active : ndarray of bool, shape (p,)
-        Which numbers evidence may move, and which may walk.
-    n_shortened : int
-        Steps that were shortened because a positive number would have lost more than half of itself.
+    `q`: (p,); `active`: (p,), which numbers evidence may move, and which may walk; `n_shortened`: steps that were
+    shortened because a positive number would have lost more than half of itself.
     """
 
     def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
@@ -61,29 +51,15 @@ class ParameterFilter:
     def walk(self, variance: Array, time: float = 1.0) -> None:
         """Let the active numbers walk.
 
-        Parameters
-        ----------
-        variance : ndarray, shape (p,)
-            Of the walks, per second.
-        time : float
-            s.
+        `variance`: (p,), of the walks, per second; `time`: s.
         """
         self._spread(self._S, variance, self.active, time)
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
         """Take in a block's evidence.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        noise : float
-            Variance of its residual: above 1 where the model explains the record only in part.
-
-        Returns
-        -------
-        float
-            Squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model and
-            the covariance are right.
+        Returns squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model
+        and the covariance are right.
         """
         misfit, part = self._absorb(
             self.q, self._S, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise
@@ -94,30 +70,13 @@ class ParameterFilter:
     def far(self, at: Array, J: Array, curved: Array, most: float) -> bool:
         """Return whether the estimate has left the neighbourhood of a point.
 
-        Parameters
-        ----------
-        at : ndarray, shape (p,)
-        J : ndarray, shape (p, p)
-            Upper triangle of a block's evidence.
-        curved : ndarray, shape (p,)
-            Squared moves over standard deviations that are too much.
-        most : float
-            |J (q - at)|^2 that is too much.
-
-        Returns
-        -------
-        bool
+        `at`: (p,); `J`: (p, p), upper triangle of a block's evidence; `curved`: (p,), squared moves over standard
+        deviations that are too much; `most`: |J (q - at)|^2 that is too much.
         """
         return bool(self._far(self.q, at, J, self._S, curved, most))
 
     def widen(self, place: int, sd: float) -> None:
-        """Forget what is known of one number, but not the others: it may have moved by about `sd`.
-
-        Parameters
-        ----------
-        place : int
-        sd : float
-        """
+        """Forget what is known of one number, but not the others: it may have moved by about `sd`."""
         variance = np.zeros(self.q.size)
         variance[place] = sd * sd
         self._spread(self._S, variance, np.ones_like(self.active), 1.0)
@@ -125,21 +84,13 @@ class ParameterFilter:
     def set(self, q: Array, covariance: Array) -> None:
         """Go on from other numbers.
 
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-        covariance : ndarray, shape (p, p)
+        `q`: (p,); `covariance`: (p, p).
         """
         fresh = ParameterFilter(q, covariance)
         self.q, self._S = fresh.q, fresh._S
 
     def copy(self) -> ParameterFilter:
-        """Return an independent filter in the same state.
-
-        Returns
-        -------
-        ParameterFilter
-        """
+        """Return an independent filter in the same state."""
         other = ParameterFilter.__new__(ParameterFilter)
         other.__dict__.update(self.__dict__)
         other.q, other._S, other.active = self.q.copy(), self._S.copy(), self.active.copy()

@@ -12,10 +12,11 @@ import copy
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.track.evidence import Evidence
 from ambid.track.physical.drift import DriftRates
 from ambid.track.physical.evidence_stream import EvidenceStream
@@ -24,7 +25,6 @@ from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.signals import Samples, checked
 
-Array = NDArray[np.float64]
 Memory = float | Literal["auto", "all"]
 
 BLOCK_S = 0.005  # of one evidence

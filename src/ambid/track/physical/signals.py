@@ -7,40 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.track.physical.numbers import TrackedNumbers
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Samples:
-    """Consecutive samples.
+    """Consecutive samples."""
 
-    Attributes
-    ----------
-    u : ndarray, shape (n_samples, n_inputs), SI
-    y : ndarray, shape (n_samples, n_outputs), SI
-    forcing : ndarray, shape (n_samples, 2), or None
-        (speed/top speed)^2 times cosine and sine of the rotor's angle, in the middle of each sample.
-    """
-
-    u: Array
-    y: Array
+    u: Array  # (n_samples, n_inputs), SI
+    y: Array  # (n_samples, n_outputs), SI
+    # (n_samples, 2), or None, (speed/top speed)^2 times cosine and sine of the rotor's angle, in the middle of each
+    # sample
     forcing: Array | None = None
 
     def part(self, first: int, last: int | None = None) -> Samples:
-        """Return samples `first` <= k < `last`, as views.
-
-        Parameters
-        ----------
-        first : int
-        last : int, optional
-
-        Returns
-        -------
-        Samples
-        """
+        """Return samples `first` <= k < `last`, as views."""
         cut = slice(first, last)
         return Samples(u=self.u[cut], y=self.y[cut], forcing=None if self.forcing is None else self.forcing[cut])
 
@@ -48,10 +31,7 @@ class Samples:
 class RecentSamples:
     """The last samples of a stream, in memory that does not grow.
 
-    Parameters
-    ----------
-    capacity : int
-        Samples kept at least.
+    `capacity`: samples kept at least.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -69,12 +49,7 @@ class RecentSamples:
     def add(self, samples: Samples, last: int) -> None:
         """Keep more samples.
 
-        Parameters
-        ----------
-        samples : Samples
-            Those that follow the ones before.
-        last : int
-            Number of the sample after them.
+        `samples`: those that follow the ones before; `last`: number of the sample after them.
         """
         columns = [samples.u, samples.y] + ([] if samples.forcing is None else [samples.forcing])
         if not self._parts:
@@ -99,14 +74,7 @@ class RecentSamples:
     def since(self, first: int) -> Samples | None:
         """Return the samples from number `first` on, as views that the next `add` may overwrite.
 
-        Parameters
-        ----------
-        first : int
-
-        Returns
-        -------
-        Samples or None
-            None where they are no longer, or not yet, there.
+        Returns none where they are no longer, or not yet, there.
         """
         if not self.first <= first < self.last:
             return None
@@ -118,22 +86,7 @@ class RecentSamples:
 def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None) -> Samples:
     """Put one sample or a block into the shape of a block.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs)
-    outputs : array_like, shape (n_outputs,) or (n_samples, n_outputs)
-        A number, or (n_samples,), where there is one column.
-    forcing : array_like, shape (2,) or (n_samples, 2), or None
-
-    Returns
-    -------
-    Samples
-
-    Raises
-    ------
-    EstimationError
-        If the shapes do not fit each other or the model.
+    `outputs`: a number, or (n_samples,), where there is one column.
     """
     if forcing is None and not numbers.synchronous:
         # one sample as it mostly comes: the checks below would take as long as its use

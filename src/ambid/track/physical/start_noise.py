@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
-from ambid.identify.innovations import predictor_gain
-from ambid.identify.problem import NoiseForm, Scales
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.innovations import predictor_gain
+from ambid.estimation.problem import NoiseForm, Scales
 from ambid.physics.discretise import discretise
 from ambid.physics.sensor_gain import SensorGains
-
-Array = NDArray[np.float64]
 
 MEMORY_S = 0.02  # longest memory of the predictor: it is deaf for ten of them after a gap, and slow to show a change
 _LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
@@ -24,34 +22,18 @@ _GAIN_SD = 0.1  # relative, of an entry of the predictor gain
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoiseNumbers:
-    """The noise of a predictor.
-
-    Attributes
-    ----------
-    form : {"levels", "gain", "given"}
-    numbers, sd : ndarray, shape (n_noise,)
-        That describe it, and their standard deviations.
-    gain : ndarray, shape (n_states, n_outputs)
-        Predictor gain in scaled units.
-    """
+    """The noise of a predictor."""
 
     form: NoiseForm
-    numbers: Array
+    numbers: Array  # (n_noise,), that describe it, and their standard deviations
     sd: Array
-    gain: Array
+    gain: Array  # (n_states, n_outputs), predictor gain in scaled units
 
 
 def rate_of(estimate: Estimate) -> float:
     """Return the sampling rate of the record behind an estimate.
 
-    Parameters
-    ----------
-    estimate : Estimate
-
-    Returns
-    -------
-    float
-        Hz.
+    Returns hz.
     """
     return float(str(estimate.record["rate_hz"]))
 
@@ -59,14 +41,7 @@ def rate_of(estimate: Estimate) -> float:
 def overdispersion_of(estimate: Estimate) -> float:
     """Return how much larger than the model says the variance of weighted innovations' sums is.
 
-    Parameters
-    ----------
-    estimate : Estimate
-
-    Returns
-    -------
-    float
-        1 where the model explains its record.
+    Returns 1 where the model explains its record.
     """
     if estimate.covariance_method == "information":
         return 1.0
@@ -76,21 +51,7 @@ def overdispersion_of(estimate: Estimate) -> float:
 def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> NoiseNumbers:
     """Return the noise with which tracking begins.
 
-    Parameters
-    ----------
-    plant : SensorGains
-    estimate : Estimate
-    scales : Scales
-
-    Returns
-    -------
-    NoiseNumbers
-        Form "given" with a gain that forgets where the estimate's own predictor does not forget soon enough.
-
-    Raises
-    ------
-    EstimationError
-        If no predictor of the estimate forgets.
+    Returns form "given" with a gain that forgets where the estimate's own predictor does not forget soon enough.
     """
     found = estimate.noise
     gain = found.gain * scales.output / scales.state[:, None]

@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.record import Record
-
-Array = NDArray[np.float64]
 
 _PARTS, _PART_RAD = 25, 10.0  # parts of a record in which speed and angle are compared, each at least so long
 _AGREE = 0.05  # relative difference of speed and turning that sensors make
@@ -23,38 +21,17 @@ _AGREE = 0.05  # relative difference of speed and turning that sensors make
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Forcing:
-    """Regressors of the unbalance.
+    """Regressors of the unbalance."""
 
-    Attributes
-    ----------
-    columns : ndarray, shape (n_samples, 2)
-        (speed/top speed)^2 times cosine and sine of the angle, in the middle of each sample.
-    top_speed : float
-        rad/s.
-    """
-
+    # (n_samples, 2), (speed/top speed)^2 times cosine and sine of the angle, in the middle of each sample
     columns: Array
-    top_speed: float
+    top_speed: float  # rad/s
 
 
 def forcing_of(record: Record) -> Forcing | None:
     """Return the regressors of a record that holds the speed or the angle of its rotor.
 
-    Parameters
-    ----------
-    record : Record
-        With a channel ``angle`` in rad, ``speed`` in rad/s, or both. An angle alone is differentiated, a speed alone
-        integrated: the phase then counts from the first sample.
-
-    Returns
-    -------
-    Forcing or None
-        None where the record holds neither, or the rotor stands still.
-
-    Raises
-    ------
-    EstimationError
-        If the speed passes half the sampling rate, where an angle says nothing of it, or contradicts the angle.
+    Returns none where the record holds neither, or the rotor stands still.
     """
     if "angle" not in record.names and "speed" not in record.names:
         return None
@@ -110,19 +87,9 @@ def _check_agreement(speed: Array, angle: Array, period: float) -> None:
 def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, float, float, float]:
     """Return the unbalance as amplitude and phase.
 
-    Parameters
-    ----------
-    a, b : float
-        m e cos(phase) and -m e sin(phase), kg m.
-    covariance : ndarray, shape (2, 2)
-        Of a and b.
-
-    Returns
-    -------
-    amplitude, amplitude_sd : float
-        kg m.
-    phase, phase_sd : float
-        rad; the standard deviation is pi where the amplitude is within its own of zero.
+    `a`, `b`: m e cos(phase) and -m e sin(phase), kg m; `covariance`: (2, 2), of a and b. Returns `amplitude,
+    amplitude_sd`: kg m; `phase, phase_sd`: rad; the standard deviation is pi where the amplitude is within its own of
+    zero.
     """
     size = float(np.hypot(a, b))
     if size == 0.0:

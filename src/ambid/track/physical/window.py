@@ -12,18 +12,17 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.identify.estimate import Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.track.evidence import Evidence
 from ambid.track.physical.evidence_stream import EvidenceStream
 from ambid.track.physical.linearisation import Linearisation, linearise
 from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.signals import RecentSamples, Samples, checked
-
-Array = NDArray[np.float64]
 
 _WHOLE = 1 << 40  # samples: a stretch is one block
 _ITERATIONS = 6
@@ -35,26 +34,13 @@ _ENDLESS = 1 << 40  # samples of one evidence: the stretch is one block
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Refined:
-    """Numbers found from a stretch.
+    """Numbers found from a stretch."""
 
-    Attributes
-    ----------
-    filter : ParameterFilter
-        Estimate and covariance, what was known before included.
-    stream : EvidenceStream
-        The predictor at the estimate, at the end of the stretch.
-    evidence : Evidence
-        Of the stretch, linearised where the last step began.
-    misfit : float
-        Squared distance of the estimate from what was known before and from the stretch: chi-squared with p degrees of
-        freedom if both are right.
-    converged : bool
-    iterations : int
-    """
-
-    filter: ParameterFilter
-    stream: EvidenceStream
-    evidence: Evidence
+    filter: ParameterFilter  # estimate and covariance, what was known before included
+    stream: EvidenceStream  # the predictor at the estimate, at the end of the stretch
+    evidence: Evidence  # of the stretch, linearised where the last step began
+    # squared distance of the estimate from what was known before and from the stretch: chi-squared with p degrees of
+    # freedom if both are right
     misfit: float
     converged: bool
     iterations: int
@@ -72,26 +58,10 @@ def refine(
 ) -> Refined | None:
     """Find the numbers that explain a stretch, given what is known from before it.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    before : ParameterFilter
-        What is known without the stretch; the search starts there.
-    samples : Samples
-        The stretch; its first part settles the predictor.
-    first : int
-        Number of its first sample in the stream.
-    block : int
-        Samples of one evidence of the stream that is given back.
-    noise : float
-        Variance of the evidence's residual.
-    gain : ndarray, shape (n_states, n_outputs), optional
-        A predictor gain near the one looked for.
-
-    Returns
-    -------
-    Refined or None
-        None where the stretch is too short to settle, or no step leads to a predictor.
+    `before`: what is known without the stretch; the search starts there; `samples`: the stretch; its first part settles
+    the predictor; `first`: number of its first sample in the stream; `block`: samples of one evidence of the stream
+    that is given back; `noise`: variance of the evidence's residual; `gain`: (n_states, n_outputs), a predictor gain
+    near the one looked for. Returns none where the stretch is too short to settle, or no step leads to a predictor.
     """
     q, near, last = before.q.copy(), gain, 0.0
     for iteration in range(1, _ITERATIONS + 1):
@@ -131,19 +101,8 @@ def refine(
 def evidence_of(numbers: TrackedNumbers, at: Linearisation, samples: Samples, *, first: int = 0) -> Evidence | None:
     """Return the evidence of a stretch as a whole.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    at : Linearisation
-    samples : Samples
-        Its first part settles the predictor.
-    first : int
-        Number of its first sample in the stream.
-
-    Returns
-    -------
-    Evidence or None
-        None where the stretch is too short to settle.
+    `samples`: its first part settles the predictor; `first`: number of its first sample in the stream. Returns none
+    where the stretch is too short to settle.
     """
     stream = EvidenceStream(numbers, at, _WHOLE)
     stream.restart(first)

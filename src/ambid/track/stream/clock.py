@@ -18,22 +18,9 @@ _SIGMAS = 4.0
 class SampleClock:
     """Predicts the time stamp of a sample number, and learns from stamps that agree.
 
-    Parameters
-    ----------
-    rate_hz : float
-        As stated.
-    tolerance_s : float
-        How far a stamp may lie from its prediction, s; a third of it is taken as the standard deviation of the jitter.
+    `rate_hz`: as stated.
 
-    Attributes
-    ----------
-    drift : float
-        Estimated relative deviation of the stamps' period from the stated one.
-
-    Raises
-    ------
-    EstimationError
-        If the rate or the tolerance is not positive.
+    `drift`: estimated relative deviation of the stamps' period from the stated one.
     """
 
     def __init__(self, rate_hz: float, tolerance_s: float) -> None:
@@ -52,12 +39,7 @@ class SampleClock:
     def start(self, number: int, time_s: float) -> None:
         """Begin anew at one stamp, keeping what is known of the drift.
 
-        Parameters
-        ----------
-        number : int
-            Sample number.
-        time_s : float
-            Its stamp, s.
+        `number`: sample number; `time_s`: its stamp, s.
         """
         self._number, self._time = number, time_s
         self._p00, self._p01, self._p11 = self._jitter, 0.0, DRIFT_SD**2
@@ -65,34 +47,14 @@ class SampleClock:
     def deviation(self, number: int, time_s: float) -> float:
         """Return how far a stamp lies from its prediction.
 
-        Parameters
-        ----------
-        number : int
-            Sample number.
-        time_s : float
-            Its stamp, s.
-
-        Returns
-        -------
-        float
-            s; positive if the stamp is late.
+        `number`: sample number; `time_s`: its stamp, s. Returns s; positive if the stamp is late.
         """
         return time_s - self._time - (number - self._number) * self._period * (1.0 + self.drift)
 
     def agrees(self, number: int, time_s: float) -> bool:
         """Tell whether a stamp lies within the tolerance of its prediction, and what the drift may have added.
 
-        Parameters
-        ----------
-        number : int
-            Sample number.
-        time_s : float
-            Its stamp, s.
-
-        Returns
-        -------
-        bool
-            False for a stamp that is not a number.
+        `number`: sample number; `time_s`: its stamp, s. Returns false for a stamp that is not a number.
         """
         dt = (number - self._number) * self._period
         # The spread of the offset is left out: it is jitter, which the tolerance covers, and one sample must stand out.
@@ -101,17 +63,8 @@ class SampleClock:
     def agree(self, number: int, time_s: float, other: int, other_s: float) -> bool:
         """Tell whether two stamps agree with each other, whatever was known before.
 
-        Parameters
-        ----------
-        number, other : int
-            Sample numbers.
-        time_s, other_s : float
-            Their stamps, s.
-
-        Returns
-        -------
-        bool
-            False if one of the stamps is not a number.
+        `number`, `other`: sample numbers; `time_s`, `other_s`: their stamps, s. Returns false if one of the stamps is
+        not a number.
         """
         dt = (other - number) * self._period
         between = other_s - time_s - dt * (1.0 + self.drift)
@@ -120,12 +73,7 @@ class SampleClock:
     def learn(self, number: int, time_s: float) -> None:
         """Take in a stamp that agrees.
 
-        Parameters
-        ----------
-        number : int
-            Sample number; below that of the last stamp, nothing is learned.
-        time_s : float
-            Its stamp, s.
+        `number`: sample number; below that of the last stamp, nothing is learned; `time_s`: its stamp, s.
         """
         if number <= self._number:
             return

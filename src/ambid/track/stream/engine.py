@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import FrameType, MappingProxyType
 from typing import Any, Literal
 
-from ambid.track.lines import Latency
+from ambid.recursive.lines import Latency
 from ambid.track.stream.block import Block, Frame
 from ambid.track.stream.guard import StreamGuard
 from ambid.track.stream.latency import LatencyStatistics
@@ -29,46 +29,23 @@ _LOOK_S = 0.1  # how often a wait looks whether it should end
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamReport:
-    """What went through an engine.
+    """What went through an engine."""
 
-    Attributes
-    ----------
-    blocks, samples : int
-        That came.
-    given, rejected, missing : int
-        Samples that the consumer got; that came and were not given; that never came.
-    reordered : int
-        Blocks that came too late but in time to be put right.
-    drift : float
-        Of the acquisition's clock, relative to the stated rate.
-    events, rejected_samples : Mapping of str to int
-        Rejections of each kind, and the samples in them.
-    seconds : float
-        From the first wait to the end, s of clock.
-    working_s : float
-        Of these, in the guard and the consumer.
-    latency : Latency or None
-        None if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
-    torn : int
-        Blocks lost because their check value was wrong.
-    interrupted : bool
-        Whether it ended by an interrupt, everything up to then being delivered.
-    """
-
-    blocks: int
+    blocks: int  # that came
     samples: int
-    given: int
+    given: int  # samples that the consumer got; that came and were not given; that never came
     rejected: int
     missing: int
-    reordered: int
-    drift: float
-    events: Mapping[RejectionKind, int]
+    reordered: int  # blocks that came too late but in time to be put right
+    drift: float  # of the acquisition's clock, relative to the stated rate
+    events: Mapping[RejectionKind, int]  # rejections of each kind, and the samples in them
     rejected_samples: Mapping[RejectionKind, int]
-    seconds: float
-    working_s: float
+    seconds: float  # from the first wait to the end, s of clock
+    working_s: float  # of these, in the guard and the consumer
+    # none if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
     latency: Latency | None
-    torn: int
-    interrupted: bool
+    torn: int  # blocks lost because their check value was wrong
+    interrupted: bool  # whether it ended by an interrupt, everything up to then being delivered
 
 
 def run(
@@ -89,33 +66,9 @@ def run(
     says so. A second one interrupts the consumer itself. An exception of source or consumer ends everything and is
     raised again; the ring is removed in any case.
 
-    Parameters
-    ----------
-    source : iterable of Block, or BlockRing
-        Blocks, or a ring that another process fills; that one is read at its own pace and is not closed.
-    consume : callable
-        Given each clean stretch.
-    reject : callable, optional
-        Given each rejection.
-    guard : StreamGuard
-        A fresh one, of this stream.
-    pace : {"fastest", "real-time"}
-        Of a source that is no ring.
-    producer : {"none", "thread", "process"}
-        Where the source is iterated. For another process it must be one that can be pickled, such as a `Replay`.
-    ring_blocks, block_samples : int
-        Capacity of the ring, with a producer.
-    stopped : callable, optional
-        Asked between blocks; True ends the stream as an interrupt does.
-
-    Returns
-    -------
-    StreamReport
-
-    Raises
-    ------
-    EstimationError
-        If the source cannot be sent to another process, or that process dies.
+    `consume`: given each clean stretch; `reject`: given each rejection; `guard`: a fresh one, of this stream; `pace`:
+    of a source that is no ring; `ring_blocks`, `block_samples`: capacity of the ring, with a producer; `stopped`: asked
+    between blocks; True ends the stream as an interrupt does.
     """
     pump = _Pump(guard, consume, reject)
     with _Interrupt() as interrupt:

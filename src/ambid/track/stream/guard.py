@@ -13,11 +13,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.track.stream.block import Block
 from ambid.track.stream.clock import SampleClock
 from ambid.track.stream.order import BlockOrder
-from ambid.track.stream.outcome import Array, Ledger, Part, Passed, RejectionKind, RowKind, Stretch
+from ambid.track.stream.outcome import Ledger, Part, Passed, RejectionKind, RowKind, Stretch
 from ambid.track.stream.rows import Mask, RowCheck, Stuck
 
 _LARGEST = 2**62  # of a sample number
@@ -40,37 +41,11 @@ class StreamGuard:
     an acquisition that sets both its counter and its clock back is taken for a repetition until `patience_s` is over.
     Without stamps a single wrong number is noticed only if it leads by more than one second.
 
-    Parameters
-    ----------
-    rate_hz : float
-    n_channels : int
-    limits : array_like, shape (n_channels,), or float, optional
-        Largest credible magnitude of each channel, SI.
-    saturation : array_like, shape (n_channels, 2), optional
-        Rails of each channel; NaN for none.
-    stuck : "auto", None, int or sequence of int or None
-        Run of equal values from which a channel counts as frozen: learned, not watched, or given (for each).
-    reorder : int
-        Blocks that may wait for a missing one; a gap delays as many.
-    clock_tolerance_s : float, optional
-        How far stamps may lie from a steady clock, s; default 0.75 of a sample. Stamps given by a computer's scheduler
-        need some milliseconds; `math.inf` for a stream without stamps.
-    counter_bits : int, optional
-        Width of a sample counter that wraps around, e.g. 32.
-    patience_s : float
-        Old numbers that come in sequence for so long mean that the acquisition began anew, s.
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2),
+    rails of each channel; NaN for none; `reorder`: blocks that may wait for a missing one; a gap delays as many;
+    `counter_bits`: width of a sample counter that wraps around, e.g. 32.
 
-    Attributes
-    ----------
-    rate_hz : float
-    n_channels : int
-    n_received : int
-        Samples that came.
-
-    Raises
-    ------
-    EstimationError
-        If a setting breaks a rule.
+    `n_received`: samples that came.
     """
 
     def __init__(
@@ -154,15 +129,8 @@ class StreamGuard:
     def take(self, block: Block) -> list[Passed]:
         """Take in a block.
 
-        Parameters
-        ----------
-        block : Block
-            Possibly damaged; not modified and not kept.
-
-        Returns
-        -------
-        list of Stretch and Rejection
-            In the order of the stream; may be empty while a block waits.
+        `block`: possibly damaged; not modified and not kept. Returns in the order of the stream; may be empty while a
+        block waits.
         """
         part = self._part(block)
         if part is not None:
@@ -170,12 +138,7 @@ class StreamGuard:
         return self._ledger.taken()
 
     def flush(self) -> list[Passed]:
-        """Give out what waits: at the end of the stream.
-
-        Returns
-        -------
-        list of Stretch and Rejection
-        """
+        """Give out what waits: at the end of the stream."""
         self._order.finish()
         part, self._undecided = self._undecided, None
         if part is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import ceil, log10
 
 from ambid.errors import EstimationError
-from ambid.track.lines import Latency
+from ambid.recursive.lines import Latency
 
 _LOWEST = 1e-7  # s: upper edge of the first bin
 _PER_DECADE = 100
@@ -18,16 +18,8 @@ _DECADES = 11  # up to 10 000 s; what is beyond is in the last bin
 class LatencyStatistics:
     """Counts latencies, overruns and late blocks.
 
-    Attributes
-    ----------
-    count : int
-        Blocks.
-    largest : float
-        s.
-    overruns : int
-        Blocks that were lost because the ring was full.
-    late : int
-        Blocks whose work ended after the next one had come.
+    `count`: blocks; `largest`: s; `overruns`: blocks that were lost because the ring was full; `late`: blocks whose
+    work ended after the next one had come.
     """
 
     def __init__(self) -> None:
@@ -36,19 +28,7 @@ class LatencyStatistics:
         self.largest = 0.0
 
     def add(self, latency_s: float) -> None:
-        """Count a block.
-
-        Parameters
-        ----------
-        latency_s : float
-            From its arrival to the end of its work, s; below zero, where two clocks differ by their resolution, counts
-            as zero.
-
-        Raises
-        ------
-        EstimationError
-            If it is not a number.
-        """
+        """Count a block."""
         if latency_s <= _LOWEST:
             at = 0
         elif latency_s < float("inf"):
@@ -64,20 +44,8 @@ class LatencyStatistics:
     def quantile(self, fraction: float) -> float:
         """Return the latency that this fraction of the blocks does not exceed.
 
-        Parameters
-        ----------
-        fraction : float
-            0 to 1.
-
-        Returns
-        -------
-        float
-            s; upper edge of its bin, or the largest latency if that is less; NaN without any block.
-
-        Raises
-        ------
-        EstimationError
-            If the fraction is not within 0 and 1.
+        `fraction`: 0 to 1. Returns s; upper edge of its bin, or the largest latency if that is less; NaN without any
+        block.
         """
         if not 0 <= fraction <= 1:
             raise EstimationError(f"the fraction of a quantile is {fraction}; it must lie within 0 and 1. Correct it")

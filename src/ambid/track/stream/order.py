@@ -22,30 +22,11 @@ _LEAP_S = 1.0  # a number that leads by more is doubted where no clock says that
 class BlockOrder:
     """Places blocks: each sample once, later than all before.
 
-    Parameters
-    ----------
-    rate_hz : float
-    clock : SampleClock or None
-        None for a stream without stamps.
-    depth : int
-        Blocks that may wait for a missing one.
-    patience_s : float
-        Old numbers that come in sequence for so long mean that the acquisition began anew, s.
-    ledger : Ledger
-        Takes the rejections.
-    place : callable
-        Given each part in order, less what had been passed before.
-    broke : callable
-        Called, without arguments, before the first part that does not follow on the last although its number does.
+    `clock`: none for a stream without stamps; `depth`: blocks that may wait for a missing one; `ledger`: takes the
+    rejections; `place`: given each part in order, less what had been passed before.
 
-    Attributes
-    ----------
-    next : int
-        Number of the sample that is wanted next.
-    offset : int
-        Of the stream's numbers against the acquisition's.
-    n_reordered : int
-        Blocks that had been missed and came in time.
+    `next`: number of the sample that is wanted next; `offset`: of the stream's numbers against the acquisition's;
+    `n_reordered`: blocks that had been missed and came in time.
     """
 
     def __init__(
@@ -84,12 +65,7 @@ class BlockOrder:
         return len(self._waiting) + (self._doubtful is not None)
 
     def take(self, part: Part) -> None:
-        """Take in a block: place it, hold it, or refuse it.
-
-        Parameters
-        ----------
-        part : Part
-        """
+        """Take in a block: place it, hold it, or refuse it."""
         if not self._started:
             self._begin(part)
         elif part.end <= self.next:
@@ -112,14 +88,7 @@ class BlockOrder:
     def fits(self, part: Part) -> bool:
         """Tell whether number and stamp of a block agree with the stream.
 
-        Parameters
-        ----------
-        part : Part
-
-        Returns
-        -------
-        bool
-            False before the stream has begun.
+        Returns false before the stream has begun.
         """
         if not self._started:
             return False
@@ -128,12 +97,7 @@ class BlockOrder:
         return self._clock.agrees(part.first, part.time_s)
 
     def pass_over(self, part: Part) -> None:
-        """Remember numbers that came but were refused: they are not waited for.
-
-        Parameters
-        ----------
-        part : Part
-        """
+        """Remember numbers that came but were refused: they are not waited for."""
         if self._started and part.end > self.next:
             self._refused.append((part.first, part.end))
 

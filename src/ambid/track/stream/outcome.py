@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
+from ambid.arrays import Array
 
-Array = NDArray[np.float64]
 RowKind = Literal["nan", "range", "saturated", "stuck"]
 RejectionKind = (
     Literal["gap", "repeated", "overlap", "contradiction", "clock", "number", "shape", "type", "empty"] | RowKind
@@ -17,46 +15,25 @@ RejectionKind = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stretch:
-    """Clean consecutive samples.
+    """Clean consecutive samples."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_samples, n_channels), SI
-        Finite, within the limits.
-    first : int
-        Number of the first sample.
-    restart : bool
-        Whether it does not follow on the last stretch: a memory of the signals must start anew.
-    """
-
-    values: Array
-    first: int
-    restart: bool
+    values: Array  # (n_samples, n_channels), SI, finite, within the limits
+    first: int  # number of the first sample
+    restart: bool  # whether it does not follow on the last stretch: a memory of the signals must start anew
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rejection:
-    """What was not given out, or what happened to the stream.
+    """What was not given out, or what happened to the stream."""
 
-    Attributes
-    ----------
-    kind : str
-        ``gap`` (numbers that never came), ``repeated`` and ``overlap`` (numbers that had been given or passed over),
-        ``contradiction`` (an overlap that differs from what was given), ``clock`` and ``number`` (the block does not
-        fit the stream; without samples: the clock or the counter jumped and the stream goes on), ``shape``, ``type``
-        and ``empty`` (of the block), ``nan``, ``range``, ``saturated`` and ``stuck`` (of rows).
-    samples : int
-        How many.
-    t : float
-        Number of the first of them divided by the rate, s.
-    why : str
-        One line for people.
-    """
-
+    # ``gap`` (numbers that never came), ``repeated`` and ``overlap`` (numbers that had been given or passed over),
+    # ``contradiction`` (an overlap that differs from what was given), ``clock`` and ``number`` (the block does not fit
+    # the stream; without samples: the clock or the counter jumped and the stream goes on), ``shape``, ``type`` and
+    # ``empty`` (of the block), ``nan``, ``range``, ``saturated`` and ``stuck`` (of rows)
     kind: RejectionKind
-    samples: int
-    t: float
-    why: str
+    samples: int  # how many
+    t: float  # number of the first of them divided by the rate, s
+    why: str  # one line for people
 
 
 Passed = Stretch | Rejection
@@ -64,20 +41,11 @@ Passed = Stretch | Rejection
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Part:
-    """A block under its number in the stream.
+    """A block under its number in the stream."""
 
-    Attributes
-    ----------
-    first : int
-        Number of the first sample, with wrap-arounds and new counts taken out.
-    time_s : float
-        Its stamp, s; NaN if it has none.
-    values : ndarray, shape (n_samples, n_channels)
-    """
-
-    first: int
-    time_s: float
-    values: Array
+    first: int  # number of the first sample, with wrap-arounds and new counts taken out
+    time_s: float  # its stamp, s; NaN if it has none
+    values: Array  # (n_samples, n_channels)
 
     @property
     def size(self) -> int:
@@ -93,17 +61,10 @@ class Part:
 class Ledger:
     """Collects what is given in the order of the stream, and counts.
 
-    Parameters
-    ----------
-    rate_hz : float
-        Turns sample numbers into times.
+    `rate_hz`: turns sample numbers into times.
 
-    Attributes
-    ----------
-    events, samples : dict of str to int
-        Rejections of each kind, and samples in them.
-    n_given : int
-        Samples in stretches.
+    `events`: rejections of each kind, and samples in them; `samples`: rejections of each kind, and samples in them;
+    `n_given`: samples in stretches.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -116,26 +77,14 @@ class Ledger:
     def reject(self, kind: RejectionKind, samples: int, first: int, why: str) -> None:
         """Enter a rejection.
 
-        Parameters
-        ----------
-        kind : str
-        samples : int
-        first : int
-            Number of the first of them.
-        why : str
-            One line for people.
+        `first`: number of the first of them; `why`: one line for people.
         """
         self.events[kind] = self.events.get(kind, 0) + 1
         self.samples[kind] = self.samples.get(kind, 0) + samples
         self._entries.append(Rejection(kind=kind, samples=samples, t=first / self._rate, why=why))
 
     def give(self, stretch: Stretch) -> None:
-        """Enter a stretch.
-
-        Parameters
-        ----------
-        stretch : Stretch
-        """
+        """Enter a stretch."""
         self.n_given += stretch.values.shape[0]
         self._entries.append(stretch)
 

@@ -36,25 +36,8 @@ def produced_in(
 ) -> Iterator[Producer]:
     """Run a source beside the caller while the context lasts.
 
-    Parameters
-    ----------
-    where : {"thread", "process"}
-    source : iterable of Block
-        For a process, one that can be pickled.
-    ring : BlockRing
-    rate_hz : float
-    pace : {"fastest", "real-time"}
-        A source that goes as fast as possible waits for room in the ring; one in real time does not.
-
-    Yields
-    ------
-    Producer
-        On leaving, it is told to stop; an exception of the source is raised then, unless another is on its way.
-
-    Raises
-    ------
-    EstimationError
-        If the source cannot be pickled, or its process died.
+    `source`: for a process, one that can be pickled. Returns on leaving, it is told to stop; an exception of the source
+    is raised then, unless another is on its way.
     """
     maker = _Thread(source, ring, rate_hz, pace) if where == "thread" else _Process(source, ring, rate_hz, pace)
     try:
@@ -74,14 +57,7 @@ def fill(
 ) -> None:
     """Put the blocks of a source into a ring until they end or the consumer wants no more.
 
-    Parameters
-    ----------
-    source : iterable of Block
-    ring : BlockRing
-    rate_hz : float
-    pace : {"fastest", "real-time"}
-    alone : callable, optional
-        Tells whether the consumer is dead.
+    `alone`: tells whether the consumer is dead.
     """
 
     def stopped() -> bool:

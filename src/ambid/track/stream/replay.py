@@ -16,10 +16,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record import Record
 from ambid.record.sampling import JITTER
-from ambid.track.stream.block import Array, Block, Frame
+from ambid.track.stream.block import Block, Frame
 
 _LONGEST_GAP_S = 60.0  # or ten times the record: a stamp that leads by more is a clock that was set
 _EQUAL = 0.05  # of a period: stamps that are as close are the same
@@ -30,41 +31,19 @@ _LONGEST_PAUSE_S = 1.0  # a gap in the numbers takes its time, up to this
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Replay:
-    """Rows of a record that come as blocks of consecutive numbers. Can be iterated again, and sent to another process.
-
-    Attributes
-    ----------
-    values : ndarray, shape (n_rows, n_channels), SI
-        May hold NaN.
-    numbers : ndarray, shape (n_rows,), int64
-        Sample number of each row.
-    time_s : ndarray, shape (n_rows,), s
-        Stamp of each row.
-    rate_hz : float
-    block_samples : int
-        A block is shorter where the numbers do not follow on each other, and at the end.
-    irregular : int
-        Stamps that are more than 1 % of a period off the grid of the samples beside them.
+    """Rows of a record that come as blocks of consecutive numbers. Can be iterated again, and sent to another
+    process.
     """
 
-    values: Array
-    numbers: NDArray[np.int64]
-    time_s: Array
+    values: Array  # (n_rows, n_channels), SI, may hold NaN
+    numbers: NDArray[np.int64]  # (n_rows,), int64, sample number of each row
+    time_s: Array  # (n_rows,), s, stamp of each row
     rate_hz: float
-    block_samples: int
-    irregular: int = 0
+    block_samples: int  # a block is shorter where the numbers do not follow on each other, and at the end
+    irregular: int = 0  # stamps that are more than 1 % of a period off the grid of the samples beside them
 
     def since(self, first: int) -> Replay:
-        """Return the rows whose numbers are `first` or more, in the order in which they come.
-
-        Parameters
-        ----------
-        first : int
-
-        Returns
-        -------
-        Replay
-        """
+        """Return the rows whose numbers are `first` or more, in the order in which they come."""
         kept = self.numbers >= first
         if kept.all():
             return self
@@ -89,26 +68,9 @@ def blocks_of(
 ) -> Replay:
     """Return a record as a stream.
 
-    Parameters
-    ----------
-    record : Record
-        Rows in the order in which they were written; may hold NaN.
-    block_samples : int
-        Samples of a block.
-    channels : sequence of str, optional
-        Which, in which order; default all.
-    time_s : array_like, shape (n_samples,), optional
-        Stamp of each row where they are not uniform (`ambid.record.read_rows`); default those of the record's rate.
-
-    Returns
-    -------
-    Replay
-        Samples are numbered from 0 at the first row.
-
-    Raises
-    ------
-    RecordError
-        If a channel is missing, the block has no samples, or the stamps number no samples.
+    `record`: rows in the order in which they were written; may hold NaN; `block_samples`: samples of a block;
+    `channels`: which, in which order; default all; `time_s`: (n_samples,). Returns samples are numbered from 0 at the
+    first row.
     """
     if block_samples < 1:
         raise RecordError(f"a block of {block_samples} samples holds nothing; it must have at least one. Correct it")
@@ -139,28 +101,10 @@ def blocks_of(
 def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
     """Number the rows of a damaged record by their stamps.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n_rows,)
-        Stamps, s; may have gaps, jumps, repetitions, and NaN for a stamp that is missing.
-    values : ndarray, shape (n_rows, n_channels)
-        Tell repeated rows from a clock that was set back.
-    rate_hz : float
-
-    Returns
-    -------
-    numbers : ndarray, shape (n_rows,), int64
-        Sample numbers, 0 for the first row. A row without a stamp follows on the one before it.
-    placed : ndarray, shape (n_rows,), bool
-        False for rows without a stamp where those beside it leave open which samples they are.
-    irregular : int
-        Number of intervals that are off a whole number of periods by more than 1 % of a period.
-
-    Raises
-    ------
-    RecordError
-        If less than half of the intervals are one period within 5 %, or many stamps are equal although the rows
-        differ: the stamps are too coarse, or the rate is wrong.
+    `time_s`: (n_rows,); `values`: (n_rows, n_channels), tell repeated rows from a clock that was set back. Returns
+    `numbers`: (n_rows,), int64, sample numbers, 0 for the first row. A row without a stamp follows on the one before
+    it; `placed`: (n_rows,), bool, false for rows without a stamp where those beside it leave open which samples they
+    are; `irregular`: number of intervals that are off a whole number of periods by more than 1 % of a period.
     """
     known = np.flatnonzero(np.isfinite(time_s))
     rows = np.diff(known)
@@ -232,17 +176,8 @@ def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool
     The pace is that of the sample numbers. A gap takes its time, at most one second; numbers that run back take none
     but that of their samples.
 
-    Parameters
-    ----------
-    blocks : iterable of Block
-    rate_hz : float
-    stopped : callable, optional
-        Asked while waiting; True ends the stream.
-
-    Yields
-    ------
-    Frame
-        With the time at which it was due, however late it is taken.
+    `stopped`: asked while waiting; True ends the stream. Returns with the time at which it was due, however late it is
+    taken.
     """
     due, after = time.perf_counter(), None
     for block in blocks:

@@ -41,23 +41,11 @@ _RETRIES = 100  # of a frame whose check fails: its last bytes may be on their w
 class BlockRing:
     """Blocks in shared memory, one producer and one consumer. Made by `create` or `attach`; closed by ``with``.
 
-    Parameters
-    ----------
-    segment : SharedMemory
-        That holds a ring.
-    owner : bool
-        Whether to remove it in the end.
+    `segment`: that holds a ring; `owner`: whether to remove it in the end.
 
-    Attributes
-    ----------
-    name : str
-        Of the shared segment, for `attach`.
-    slots, block_samples : int
-        Capacity in blocks, and the longest block that goes into one.
-    channels : tuple of str
-    rate_hz : float
-    torn : int
-        Blocks that were passed over because their check value was wrong.
+    `name`: of the shared segment, for `attach`; `slots`: capacity in blocks, and the longest block that goes into one;
+    `block_samples`: capacity in blocks, and the longest block that goes into one; `torn`: blocks that were passed over
+    because their check value was wrong.
     """
 
     def __init__(self, segment: SharedMemory, *, owner: bool) -> None:
@@ -82,24 +70,8 @@ class BlockRing:
     def create(cls, *, rate_hz: float, channels: Sequence[str], slots: int = 64, block_samples: int = 200) -> Self:
         """Make a ring; whoever makes it removes it.
 
-        Parameters
-        ----------
-        rate_hz : float
-        channels : sequence of str
-            Their names, in the order of the columns.
-        slots : int
-            Capacity in blocks.
-        block_samples : int
-            Longest block that goes into one slot; longer ones are divided.
-
-        Returns
-        -------
-        BlockRing
-
-        Raises
-        ------
-        EstimationError
-            If the capacity, the rate or the names make no ring, or there is no shared memory for it.
+        `channels`: their names, in the order of the columns; `slots`: capacity in blocks; `block_samples`: longest
+        block that goes into one slot; longer ones are divided.
         """
         if slots < 1 or block_samples < 1 or not channels or not 0 < rate_hz < float("inf"):
             raise EstimationError(
@@ -119,19 +91,7 @@ class BlockRing:
     def attach(cls, name: str) -> Self:
         """Open a ring that another process made.
 
-        Parameters
-        ----------
-        name : str
-            Of its segment.
-
-        Returns
-        -------
-        BlockRing
-
-        Raises
-        ------
-        EstimationError
-            If there is no such segment, or it is no ring of this version.
+        `name`: of its segment.
         """
         segment = attached(name)
         fault = _fault(bytes_of(segment))
@@ -201,21 +161,8 @@ class BlockRing:
         Damaged blocks are carried as they are, for the guard to judge; only values that no slot can hold arrive as an
         empty array of a wrong type.
 
-        Parameters
-        ----------
-        block : Block
-        arrived_s : float, optional
-            When its last sample was there, by `time.perf_counter`; default now.
-
-        Returns
-        -------
-        bool
-            False if the ring was full and (a part of) the block was dropped and counted.
-
-        Raises
-        ------
-        EstimationError
-            If another process produces already.
+        `arrived_s`: when its last sample was there, by `time.perf_counter`; default now. Returns false if the ring was
+        full and (a part of) the block was dropped and counted.
         """
         self._claim(self._produced, _PRODUCER, "produces")
         arrived = time.perf_counter() if arrived_s is None else arrived_s
@@ -243,35 +190,15 @@ class BlockRing:
     def wait_for_room(self, timeout_s: float) -> bool:
         """Wait until a block would fit: for a source that can wait, such as a file.
 
-        Parameters
-        ----------
-        timeout_s : float
-
-        Returns
-        -------
-        bool
-            Whether there is room.
+        Returns whether there is room.
         """
         return self._wait(lambda: self.filled < self.slots, timeout_s)
 
     def read(self, timeout_s: float) -> Frame | None:
         """Take the next block out of the ring.
 
-        Parameters
-        ----------
-        timeout_s : float
-            How long to wait for it.
-
-        Returns
-        -------
-        Frame or None
-            None if none came in time, or none will come (`ended`). A torn block is passed over and counted in `torn`;
-            its numbers are then missing.
-
-        Raises
-        ------
-        EstimationError
-            If another process consumes already.
+        `timeout_s`: how long to wait for it. Returns none if none came in time, or none will come (`ended`). A torn
+        block is passed over and counted in `torn`; its numbers are then missing.
         """
         self._claim(self._consumed, _CONSUMER, "consumes")
         if not self.filled and not self._wait(lambda: self.filled or self._produced[_ENDED], timeout_s):

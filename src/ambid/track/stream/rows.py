@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.track.stream.outcome import Array, RowKind
+from ambid.track.stream.outcome import RowKind
 
 Mask = NDArray[np.bool_]
 Stuck = Literal["auto"] | None | int | Sequence[int | Literal["auto"] | None]
@@ -30,21 +31,7 @@ _NEVER = np.iinfo(np.int64).max
 class RowCheck:
     """Judges rows in the order of their numbers, remembering what each channel last held and how long.
 
-    Parameters
-    ----------
-    n_channels : int
-    limits : array_like, shape (n_channels,), or float, optional
-        Largest credible magnitude of each channel, SI.
-    saturation : array_like, shape (n_channels, 2), optional
-        Rails of each channel, SI: a sample at or beyond one is refused; NaN where a channel has none.
-    stuck : "auto", None, int, or a sequence of these
-        Run of equal values from which a channel counts as frozen; learned; or not watched. A commanded channel, which
-        may rest, should have None.
-
-    Raises
-    ------
-    EstimationError
-        If a setting has the wrong shape or sign.
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2).
     """
 
     def __init__(
@@ -88,19 +75,9 @@ class RowCheck:
     def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
         """Say which rows must not be used, and how many at the end are not decided yet.
 
-        Parameters
-        ----------
-        values : ndarray, shape (n_samples, n_channels)
-            Follows on the rows that were decided before.
-        last : bool
-            Nothing follows, so everything is decided: a run that goes on at the end is a normal one.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n_samples,)
-            Rows refused, by kind; a kind without any is not there, and no row is in two kinds.
-        int
-            Rows at the end that have to be given again, before the next ones.
+        `values`: (n_samples, n_channels), follows on the rows that were decided before. Returns (n_samples,), rows
+        refused, by kind; a kind without any is not there, and no row is in two kinds; rows at the end that have to be
+        given again, before the next ones.
         """
         found = self.unsound(values)
         if not self._watches:
@@ -113,14 +90,7 @@ class RowCheck:
     def unsound(self, values: Array) -> dict[RowKind, Mask]:
         """Say which rows must not be used by their own values alone.
 
-        Parameters
-        ----------
-        values : ndarray, shape (n_samples, n_channels)
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n_samples,)
-            As `judge` gives it.
+        `values`: (n_samples, n_channels). Returns (n_samples,), as `judge` gives it.
         """
         found: dict[RowKind, Mask] = {}
         # The peak is NaN if anything is: one comparison tells that all is well.

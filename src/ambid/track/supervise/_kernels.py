@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ambid.arrays import Array
+from ambid.compiled import compiled
+
 Counts = NDArray[np.int64]
 
 _QUANTILE = 0.03  # share of quiet statistics above the point by which overdispersion is learned
@@ -20,7 +21,7 @@ _SETTLE_GAIN = 12.0  # over the number of tests, while settling: one over the de
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def fold(A: Array, B: Array, s: Array) -> None:
     """Replace the upper triangle `A` (p, w), w >= p, by that of [A; B]; B is destroyed, s (w,) is scratch.
 
@@ -53,7 +54,7 @@ def fold(A: Array, B: Array, s: Array) -> None:
                 B[i, j] -= s[j] * b
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def whiten(T: Array, before: Array, extra: Array, M: Array, X: Array) -> None:
     """Fill `X` (p, p + 1) with M^-1/2 [J rho], where M = I + J P J^T and rho = r + J q.
 
@@ -92,7 +93,7 @@ def whiten(T: Array, before: Array, extra: Array, M: Array, X: Array) -> None:
             X[i, j] *= a
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _level_of(rest: float, freedom: float) -> float:
     """Return a standard normal number for rest/freedom of a chi-squared `rest` (Wilson and Hilferty 1931)."""
     if freedom < 1.0:
@@ -101,7 +102,7 @@ def _level_of(rest: float, freedom: float) -> float:
     return float(((rest / freedom) ** (1.0 / 3.0) - (1.0 - v)) / math.sqrt(v))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _copy(A: Array, B: Array) -> None:
     """Copy `A` to `B`, both (p, w)."""
     for i in range(A.shape[0]):
@@ -109,7 +110,7 @@ def _copy(A: Array, B: Array) -> None:
             B[i, j] = A[i, j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _take(inlet: Array, base: Array, note: Array, before: Array, reference: Array, block: int) -> None:
     """Store the triangle of a block, and estimate and covariance before it, at the reference point."""
     p = base.shape[0]
@@ -125,7 +126,7 @@ def _take(inlet: Array, base: Array, note: Array, before: Array, reference: Arra
     note[3] = float(block)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _test(
     X: Array, rest: float, freedom: float, row: Array, marks: Array, tested: Counts, gain: float, noise: float,
     now: Array, found: Array,
@@ -175,7 +176,7 @@ def _test(
         found[0] = 3.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def watch(
     inlet: Array, bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array,
     tested: Counts, rows: Array, state: Array, scratch: Array, result: Array,
@@ -267,14 +268,14 @@ def watch(
         state[0] += state[3] if newest / freedom_now > middle else -state[3]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _learn(row: Array, at: int, statistic: float, point: float, gain: float) -> None:
     """Move the log of a scale (at least 0) so that a share `_QUANTILE` lies above `point` times the scale."""
     up = 1.0 - _QUANTILE if statistic > point * math.exp(row[at]) else -_QUANTILE
     row[at] = max(row[at] + gain * up, 0.0)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def inform(
     R: Array, J: Array, decay: float, duration: float, limits: Array, reference: Array, fresh: Counts, out: Array,
     work: Array,
@@ -327,7 +328,7 @@ def inform(
     return changed
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@compiled(fastmath={"contract"})
 def gather(inlet: Array, T: Array, point: Array, other: Array, s: Array) -> bool:
     """Fold a block into `T` (p, p + 1), which is held at `point`; do nothing and return False if it is not finite.
 
@@ -349,7 +350,7 @@ def gather(inlet: Array, T: Array, point: Array, other: Array, s: Array) -> bool
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def weigh(T: Array, sides: Array, M: Array, X: Array, before: Array, out: Array) -> None:
     """Compare two sets of numbers on the evidence `T` (p, p + 1) held at the first of them.
 

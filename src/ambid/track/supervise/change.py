@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.track.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 _FEWEST = 4  # blocks of the longest window, at least
 # Alarms in a quiet hour over tests in that hour times the tail of one test: neighbouring windows and hypotheses share
@@ -32,52 +31,32 @@ _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm:
-    """A change that chance does not explain.
+    """A change that chance does not explain."""
 
-    Attributes
-    ----------
-    kind : {"moved", "unexplained"}
-        One number moved; or something that no one of them explains: several at once, noise, a disturbance.
-    by : {"number", "all", "noise"}
-        Which test gave it: that of one number; of all together, or of one where it does not explain the window; of what
-        no number explains alone, so that there is no sign of the numbers having moved.
-    parameter : str or None
-        Which one moved.
-    onset, end : int
-        Samples of the stream: first of the window in which the change shows best, and first after it. The change
-        happened in its first block, or in one of the first few if the window is long.
-    blocks : int
-        Length of that window.
-    size, sd : float
-        Estimated move of `parameter` and its standard deviation, in the units of the tracked numbers; 0 if unexplained.
-    statistic, threshold : float
-        Of the test that gave the alarm, over its overdispersion; chi-squared with one degree of freedom if `parameter`
-        moved or the noise did, with p if the statistic is that of all numbers together.
-    rivals : tuple of (str, float)
-        Other numbers, each with its statistic, that explain the window nearly as well: the name is not sure where
-        there are any. All that come close where the alarm is unexplained.
-    runner_up : tuple of (str, float) or None
-        Second best number and its statistic.
-    joint : float
-        Statistic of all numbers together over the window.
-    noise : float
-        What no number explains in the window per degree of freedom, over its usual level: 1 in quiet times.
-    """
-
+    # one number moved; or something that no one of them explains: several at once, noise, a disturbance
     kind: Literal["moved", "unexplained"]
+    # which test gave it: that of one number; of all together, or of one where it does not explain the window; of what
+    # no number explains alone, so that there is no sign of the numbers having moved
     by: Literal["number", "all", "noise"]
-    parameter: str | None
+    parameter: str | None  # which one moved
+    # samples of the stream: first of the window in which the change shows best, and first after it. The change
+    # happened in its first block, or in one of the first few if the window is long.
     onset: int
     end: int
-    blocks: int
+    blocks: int  # length of that window
+    # estimated move of `parameter` and its standard deviation, in the units of the tracked numbers; 0 if unexplained
     size: float
     sd: float
+    # of the test that gave the alarm, over its overdispersion; chi-squared with one degree of freedom if `parameter`
+    # moved or the noise did, with p if the statistic is that of all numbers together
     statistic: float
     threshold: float
+    # other numbers, each with its statistic, that explain the window nearly as well: the name is not sure where there
+    # are any. All that come close where the alarm is unexplained.
     rivals: tuple[tuple[str, float], ...]
-    runner_up: tuple[str, float] | None
-    joint: float
-    noise: float
+    runner_up: tuple[str, float] | None  # second best number and its statistic
+    joint: float  # statistic of all numbers together over the window
+    noise: float  # what no number explains in the window per degree of freedom, over its usual level: 1 in quiet times
 
     @property
     def why(self) -> str:
@@ -108,44 +87,13 @@ class ChangeDetector:
     Blocks should have several times as many rows (samples times outputs) as there are numbers: without degrees of
     freedom beside them, the second guard is not there.
 
-    Parameters
-    ----------
-    names : sequence of str
-        All numbers of the evidence.
-    hypotheses : sequence of str, optional
-        Those that may jump; all by default. A number that is held fixed (a sensor gain, say) has zero variance.
-    block_s : float
-        Duration of a block, s.
-    false_alarms_per_hour : float
-        Allowed rate in quiet running with Gaussian evidence.
-    longest_s : float
-        Longest window, s.
-    drift : array_like, shape (p,), or float, optional
-        Growth of the variance of each number in one block: random walk within a window. May be set anew at any time.
-    overdispersion : float
-        Where learning starts.
-    settle_s : float
-        Time from the start in which overdispersion and noise level are learned fast and nothing is alarmed, s.
-    margin : float
-        A number whose statistic is nearer than that to the largest one is a rival; 9.2 is odds of 100 to 1.
+    `names`: all numbers of the evidence; `block_s`: duration of a block, s; `false_alarms_per_hour`: allowed rate in
+    quiet running with Gaussian evidence; `longest_s`: longest window, s; `drift`: (p,), or float; `overdispersion`:
+    where learning starts.
 
-    Raises
-    ------
-    EstimationError
-        If a setting makes no sense.
-
-    Attributes
-    ----------
-    names, hypotheses : tuple of str
-    threshold : float
-        Of T_j.
-    drift : ndarray, shape (p,)
-    windows : tuple of int
-        Lengths, blocks.
-    overdispersion : ndarray, shape (n_windows, n_hypotheses + 2)
-        Present factors; the last two columns are all numbers together and the unexplained part.
-    noise : float
-        Present usual level of the unexplained part per degree of freedom. May be set anew at any time.
+    `threshold`: of T_j; `drift`: (p,); `windows`: lengths, blocks; `overdispersion`: (n_windows, n_hypotheses + 2),
+    present factors; the last two columns are all numbers together and the unexplained part; `noise`: present usual
+    level of the unexplained part per degree of freedom. May be set anew at any time..
     """
 
     def __init__(
@@ -216,23 +164,8 @@ class ChangeDetector:
     def update(self, evidence: Evidence, estimate: Array, covariance: Array) -> Alarm | None:
         """Take in one block.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        estimate : ndarray, shape (p,)
-            Predicted for this block from all data before it.
-        covariance : ndarray, shape (p, p)
-            Of that prediction.
-
-        Returns
-        -------
-        Alarm or None
-            As long as some window passes its threshold: until `restart`, or until the estimate has followed.
-
-        Raises
-        ------
-        EstimationError
-            If a number is not finite. The block changed nothing then.
+        `estimate`: (p,), predicted for this block from all data before it; `covariance`: (p, p), of that prediction.
+        Returns as long as some window passes its threshold: until `restart`, or until the estimate has followed.
         """
         if evidence.first < self._from:
             return None
@@ -263,10 +196,7 @@ class ChangeDetector:
     def restart(self, from_sample: int) -> None:
         """Forget all windows, as after a change that was handled; what was learned of quiet times stays.
 
-        Parameters
-        ----------
-        from_sample : int
-            Blocks that begin before it are not looked at.
+        `from_sample`: blocks that begin before it are not looked at.
         """
         self._counts[:] = 0
         self._state[1] = 0.0

@@ -5,62 +5,34 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Accepted:
-    """Numbers that were accepted.
+    """Numbers that were accepted."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (p,)
-    covariance : ndarray, shape (p, p)
-    t : float
-        When, s of record.
-    why : str
-    refined : bool
-        Whether they say the same as those before, only better, by the covariances of both.
-    """
-
-    values: Array
-    covariance: Array
-    t: float
+    values: Array  # (p,)
+    covariance: Array  # (p, p)
+    t: float  # when, s of record
     why: str
-    refined: bool = False
+    refined: bool = False  # whether they say the same as those before, only better, by the covariances of both
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """Candidate q against rival numbers a on evidence (J, r at q): what the gate decides on.
-
-    Attributes
-    ----------
-    blocks : int
-    gain : float
-        Loss of the rival less loss of the candidate: twice the gain in log-likelihood.
-    separation : float
-        |J (q - a)|², the gain to be expected if the candidate is the truth (minus that if the rival is).
-    sd : float
-        Standard deviation of the gain if the candidate is right up to its covariance.
-    misfit : float
-        Whitened square of the candidate's own residual: chi-squared with p degrees of freedom if it is right.
-    claim : float
-        Square of q - a over the sum of both covariances: whether the candidate says that something is not as accepted.
-    scale : float
-        Overdispersion by which these are to be judged, 1 or more.
-    """
+    """Candidate q against rival numbers a on evidence (J, r at q): what the gate decides on."""
 
     blocks: int
-    gain: float
+    gain: float  # loss of the rival less loss of the candidate: twice the gain in log-likelihood
+    # |J (q - a)|², the gain to be expected if the candidate is the truth (minus that if the rival is)
     separation: float
-    sd: float
+    sd: float  # standard deviation of the gain if the candidate is right up to its covariance
+    # whitened square of the candidate's own residual: chi-squared with p degrees of freedom if it is right
     misfit: float
+    # square of q - a over the sum of both covariances: whether the candidate says that something is not as accepted
     claim: float
-    scale: float
+    scale: float  # overdispersion by which these are to be judged, 1 or more
 
     @property
     def text(self) -> str:

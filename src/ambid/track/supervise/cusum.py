@@ -15,26 +15,10 @@ _OVERSHOOT = 1.166  # twice the mean excess of a normal random walk over a barri
 class Cusum:
     """Find a shift of the mean of a sequence that is standard normal in quiet times.
 
-    Parameters
-    ----------
-    drift : float
-        Half the smallest shift worth finding, in standard deviations.
-    threshold : float
-        See `threshold_for`.
-    mean, sd : float
-        Of the sequence in quiet times.
+    `drift`: half the smallest shift worth finding, in standard deviations; `threshold`: see `threshold_for`; `mean`,
+    `sd`: of the sequence in quiet times.
 
-    Raises
-    ------
-    EstimationError
-        If a setting is not positive.
-
-    Attributes
-    ----------
-    high, low : float
-        The two sums.
-    n : int
-        Numbers taken in since the last reset.
+    `high`: the two sums; `low`: the two sums; `n`: numbers taken in since the last reset.
     """
 
     __slots__ = ("_drift", "_mean", "_rise", "_scale", "_sink", "_threshold", "high", "low", "n")
@@ -53,15 +37,8 @@ class Cusum:
     def update(self, value: float) -> int:
         """Take in one number.
 
-        Parameters
-        ----------
-        value : float
-            One that is not finite is not used.
-
-        Returns
-        -------
-        int
-            1 if the mean rose, -1 if it fell, else 0; it stays so until `reset`, or until the sum comes down again.
+        `value`: one that is not finite is not used. Returns 1 if the mean rose, -1 if it fell, else 0; it stays so
+        until `reset`, or until the sum comes down again.
         """
         if not math.isfinite(value):
             return 0
@@ -86,19 +63,8 @@ class Cusum:
 def run_length(threshold: float, drift: float, shift: float = 0.0, *, two_sided: bool = True) -> float:
     """Return the mean number of samples to an alarm (Siegmund 1985, eq. 2.56).
 
-    Parameters
-    ----------
-    threshold, drift : float
-        Of the `Cusum`.
-    shift : float
-        Mean of the sequence, standard deviations.
-    two_sided : bool
-        Both sums, or the upper one alone.
-
-    Returns
-    -------
-    float
-        Infinite if too long for a float. Good to some per cent for thresholds over 3.
+    `threshold`, `drift`: of the `Cusum`; `shift`: mean of the sequence, standard deviations; `two_sided`: both sums, or
+    the upper one alone. Returns infinite if too long for a float. Good to some per cent for thresholds over 3.
     """
     up = _one_sided(threshold, shift - drift)
     return 1.0 / (1.0 / up + 1.0 / _one_sided(threshold, -shift - drift)) if two_sided else up
@@ -107,20 +73,7 @@ def run_length(threshold: float, drift: float, shift: float = 0.0, *, two_sided:
 def threshold_for(length: float, drift: float) -> float:
     """Return the threshold at which a quiet sequence gives a false alarm every `length` samples in the mean.
 
-    Parameters
-    ----------
-    length : float
-        Samples; larger than 2.
-    drift : float
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    EstimationError
-        If the length is not larger than 2.
+    `length`: samples; larger than 2.
     """
     if not length > 2:
         raise EstimationError(f"a run length of {length:g} samples is no quiet time. Give more than 2")

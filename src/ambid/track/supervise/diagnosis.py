@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples, Samples
@@ -38,26 +38,11 @@ _UNKNOWN = 0.3  # relative standard deviation of a parameter of which nothing is
 class Diagnosis:
     """Watches the evidence of a working estimate, and deals with what it finds.
 
-    Parameters
-    ----------
-    rpem : PhysicalRpem
-    publication : Publication
-    log : DecisionLog
-    t0 : float
-        Time of sample 0, s of record.
-    false_alarms_per_hour : float
+    `t0`: time of sample 0, s of record.
 
-    Attributes
-    ----------
-    unexplained : Unexplained
-    settling : bool
-        Whether a disturbance is being learned.
-    renewed : bool
-        Whether the working estimate was put elsewhere by the last block.
-    changes : list of Event
-        Changes found, the name being that of the number which explains the data after it.
-    update_s : float
-        Computing time of the slowest search after a change, s.
+    `settling`: whether a disturbance is being learned; `renewed`: whether the working estimate was put elsewhere by the
+    last block; `changes`: changes found, the name being that of the number which explains the data after it;
+    `update_s`: computing time of the slowest search after a change, s.
     """
 
     def __init__(
@@ -104,22 +89,14 @@ class Diagnosis:
     def keep(self, samples: Samples, last: int) -> None:
         """Keep samples for a search.
 
-        Parameters
-        ----------
-        samples : Samples
-            Those that follow the ones before.
-        last : int
-            Number of the sample after them.
+        `samples`: those that follow the ones before; `last`: number of the sample after them.
         """
         self._recent.add(samples, last)
 
     def restart(self, sample: int) -> None:
         """Start the predictor anew, as after a gap; a search waits for samples from then on.
 
-        Parameters
-        ----------
-        sample : int
-            Number of the next sample.
+        `sample`: number of the next sample.
         """
         self._rpem.stream.restart(sample)
         self._recent.clear()
@@ -127,28 +104,14 @@ class Diagnosis:
             self._recovery.restart(sample, self._rpem)
 
     def forget(self, sample: int) -> None:
-        """Look for changes from a sample on, as after a long gap.
-
-        Parameters
-        ----------
-        sample : int
-        """
+        """Look for changes from a sample on, as after a long gap."""
         self._history.clear()
         self._detector.restart(sample)
 
     def look(self, evidence: Evidence, t: float) -> bool:
         """Judge a block before it is used.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        t : float
-            Its end, s of record.
-
-        Returns
-        -------
-        bool
-            Whether the recursion may learn from it.
+        `t`: its end, s of record. Returns whether the recursion may learn from it.
         """
         rpem, self.renewed = self._rpem, False
         self._history.append((evidence, rpem.filter.copy()))

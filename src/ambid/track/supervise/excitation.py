@@ -11,13 +11,10 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.errors import EstimationError, nearest
+from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event
-
-Array = NDArray[np.float64]
 
 _RIDGE = 1e-3  # the numbers are of order one: one that nothing shows has a standard deviation of a thousand
 _WORSE = 1.5  # accuracy over `enough` at which a number is no longer fresh: hysteresis
@@ -32,36 +29,12 @@ class ExcitationMonitor:
     below `freeze` and thaws above `thaw` times the rate at identification, unless the window alone gives it better than
     `enough`: then it is fresh.
 
-    Parameters
-    ----------
-    names : sequence of str
-        All numbers of the evidence.
-    reference_rate : Mapping[str, float]
-        Information rate of each parameter at identification, 1/(sd² T), 1/s: `rate_of`. Numbers that are not in it are
-        nuisance: they take their share of information and are not judged.
-    held : sequence of str
-        Numbers that are held fixed: taken as known, they take no information from the others.
-    block_s : float
-        Duration of a block, s.
-    window_s : float
-        Time constant of the window, s.
-    freeze, thaw : float
-        Parts of the reference.
-    enough : float
-        Relative standard deviation.
+    `names`: all numbers of the evidence; `block_s`: duration of a block, s; `window_s`: time constant of the window, s;
+    `freeze`, `thaw`: parts of the reference; `enough`: relative standard deviation.
 
-    Raises
-    ------
-    EstimationError
-        If a setting makes no sense.
-
-    Attributes
-    ----------
-    fresh : Mapping[str, bool]
-        Of each parameter; all are at the start.
-    sd, rate : Mapping[str, float]
-        What the window alone gives each parameter: relative standard deviation (about a thousand: nothing), and
-        information rate, 1/s.
+    `fresh`: of each parameter; all are at the start; `sd`: what the window alone gives each parameter: relative
+    standard deviation (about a thousand: nothing), and information rate, 1/s; `rate`: what the window alone gives each
+    parameter: relative standard deviation (about a thousand: nothing), and information rate, 1/s.
     """
 
     def __init__(
@@ -116,21 +89,7 @@ class ExcitationMonitor:
     def update(self, evidence: Evidence, t: float) -> tuple[Event, ...]:
         """Take in a block.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        t : float
-            Its end, s of record.
-
-        Returns
-        -------
-        tuple of Event
-            ``frozen`` and ``thawed``, with the reason.
-
-        Raises
-        ------
-        EstimationError
-            If the evidence is not finite or of other numbers. It changed nothing then.
+        `t`: its end, s of record. Returns ``frozen`` and ``thawed``, with the reason.
         """
         J = evidence.J
         if J.shape != self._J.shape or not math.isfinite(J.sum()):
@@ -174,22 +133,7 @@ class ExcitationMonitor:
 def rate_of(sd: float, duration_s: float) -> float:
     """Return the information rate behind an estimate.
 
-    Parameters
-    ----------
-    sd : float
-        Relative standard deviation.
-    duration_s : float
-        Of the data, s.
-
-    Returns
-    -------
-    float
-        1/(sd² duration), 1/s.
-
-    Raises
-    ------
-    EstimationError
-        If one of them is not positive.
+    `sd`: relative standard deviation; `duration_s`: of the data, s. Returns 1/(sd² duration), 1/s.
     """
     if not (sd > 0 and duration_s > 0):
         raise EstimationError(f"an information rate wants sd and duration over 0; got {sd:g} and {duration_s:g} s")

@@ -11,14 +11,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event
 from ambid.track.supervise.comparison import Accepted, Comparison
-
-Array = NDArray[np.float64]
 
 
 class Gate:
@@ -31,39 +30,12 @@ class Gate:
     later data cannot tell the two apart, it waits, and is refused after `longest` blocks. After acceptance the numbers
     before it are kept on trial for `probation` blocks: if they predict better than chance allows, the gate goes back.
 
-    Parameters
-    ----------
-    names : sequence of str
-        The p numbers.
-    start : array_like, shape (p,)
-        Accepted at the start.
-    covariance : array_like, shape (p, p)
-        Of them.
-    t : float
-        Time of the start, s.
-    kept : int
-        Accepted numbers kept to go back to, the present ones included.
-    apart_s : float
-        Refinements that come sooner after one another replace one another in what is kept, s.
-    blocks, longest, probation : int
-        Blocks before the first decision, before a refusal for want of information, and on probation.
-    level : float
-        Probability that a right candidate is refused by one of the two tests.
-    back : float
-        Probability that a right candidate is rolled back by one test; there are log2(probation/blocks) tests.
-    overdispersion : float
-        Of quiet statistics, 1 or more; may be set anew at any time.
+    `names`: the p numbers; `start`: (p,), accepted at the start; `covariance`: (p, p), of them; `t`: time of the start,
+    s; `kept`: accepted numbers kept to go back to, the present ones included; `level`: probability that a right
+    candidate is refused by one of the two tests; `overdispersion`: of quiet statistics, 1 or more; may be set anew at
+    any time.
 
-    Raises
-    ------
-    EstimationError
-        If a setting makes no sense.
-
-    Attributes
-    ----------
-    overdispersion : float
-    last : Comparison or None
-        Numbers behind the last decision.
+    `last`: numbers behind the last decision.
     """
 
     def __init__(
@@ -126,19 +98,8 @@ class Gate:
     def propose(self, candidate: ArrayLike, covariance: ArrayLike, t: float, why: str) -> Event | None:
         """Offer numbers; from now on `judge` has to be given each block that comes, and none from before.
 
-        Parameters
-        ----------
-        candidate : array_like, shape (p,)
-        covariance : array_like, shape (p, p)
-        t : float
-            When it was formed, s of record.
-        why : str
-            Reason for the change.
-
-        Returns
-        -------
-        Event or None
-            Refusal of the candidate that was waiting, if one was: the newer one takes its place.
+        `candidate`: (p,); `covariance`: (p, p); `t`: when it was formed, s of record; `why`: reason for the change.
+        Returns refusal of the candidate that was waiting, if one was: the newer one takes its place.
         """
         values, P = self._checked(candidate, covariance)
         earlier, n = self._candidate, self._trial.blocks
@@ -155,16 +116,8 @@ class Gate:
     def judge(self, evidence: Evidence, t: float) -> Event | None:
         """Take in a block that came after the candidate was formed.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        t : float
-            Its end, s of record.
-
-        Returns
-        -------
-        Event or None
-            ``accepted``, ``refused``, or ``reverted`` by probation; None while there is nothing to decide.
+        `t`: its end, s of record. Returns ``accepted``, ``refused``, or ``reverted`` by probation; None while there is
+        nothing to decide.
         """
         if self._candidate is None and self._before is None:
             return None
@@ -198,15 +151,7 @@ class Gate:
     def accept(self, t: float) -> Event:
         """Accept the waiting candidate unjudged, as the operator may order; probation follows all the same.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
-
-        Returns
-        -------
-        Event
-            ``accepted``, or ``refused`` if none waits.
+        `t`: s of record. Returns ``accepted``, or ``refused`` if none waits.
         """
         if self._candidate is None:
             return Event(kind="refused", t=t, why="no candidate waits that could be accepted")
@@ -215,16 +160,8 @@ class Gate:
     def revert(self, t: float | None = None, why: str = "by order") -> Event:
         """Go back to the numbers accepted before; a waiting candidate is dropped.
 
-        Parameters
-        ----------
-        t : float, optional
-            s of record; by default when the present numbers were accepted.
-        why : str
-
-        Returns
-        -------
-        Event
-            ``reverted``, or ``refused`` if there are no earlier ones.
+        `t`: s of record; by default when the present numbers were accepted. Returns ``reverted``, or ``refused`` if
+        there are no earlier ones.
         """
         left = self.accepted
         t = left.t if t is None else t

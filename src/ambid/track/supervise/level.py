@@ -4,38 +4,18 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.track.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 
 class ErrorLevel:
     """Root mean square of the normalised innovations over recent blocks, and whether it is too large.
 
-    Parameters
-    ----------
-    limit, release : float
-        Too large from `limit` on, until it has come down to `release`.
-    window_blocks : int
-        Blocks in the mean; nothing is judged before that many.
-    usual : float
-        Level at identification, by which the error is divided.
+    `limit`, `release`: too large from `limit` on, until it has come down to `release`; `window_blocks`: blocks in the
+    mean; nothing is judged before that many; `usual`: level at identification, by which the error is divided.
 
-    Raises
-    ------
-    EstimationError
-        If a setting makes no sense.
-
-    Attributes
-    ----------
-    above : bool
-        Whether the error is too large.
-    n_blocks : int
-        Blocks used.
+    `above`: whether the error is too large; `n_blocks`: blocks used.
     """
 
     def __init__(self, limit: float, release: float, window_blocks: int, *, usual: float = 1.0) -> None:
@@ -57,16 +37,8 @@ class ErrorLevel:
     def update(self, evidence: Evidence, estimate: Array) -> float:
         """Take in a block.
 
-        Parameters
-        ----------
-        evidence : Evidence
-        estimate : ndarray, shape (p,)
-            Numbers whose error is watched: those in use.
-
-        Returns
-        -------
-        float
-            The level over the window. A block that is not finite changes nothing.
+        `estimate`: (p,), numbers whose error is watched: those in use. Returns the level over the window. A block that
+        is not finite changes nothing.
         """
         square, weight = evidence.loss(estimate), evidence.n_samples * evidence.n_outputs
         if not math.isfinite(square) or weight <= 0:

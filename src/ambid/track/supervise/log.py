@@ -8,23 +8,13 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from ambid.errors import EstimationError
-from ambid.track.lines import Event
+from ambid.recursive.lines import Event
 
 
 class DecisionLog:
     """Keep the last events and count all.
 
-    Parameters
-    ----------
-    capacity : int
-        Events kept.
-    listener : callable, optional
-        Called with each event, in the thread that adds it. What it raises is raised by `add`, after the event is kept.
-
-    Raises
-    ------
-    EstimationError
-        If the capacity is not positive.
+    `capacity`: events kept.
     """
 
     def __init__(self, capacity: int = 1000, listener: Callable[[Event], None] | None = None) -> None:
@@ -35,12 +25,7 @@ class DecisionLog:
         self._listener, self._lock = listener, threading.Lock()
 
     def add(self, event: Event) -> None:
-        """Keep an event; the oldest one goes if there is no room.
-
-        Parameters
-        ----------
-        event : Event
-        """
+        """Keep an event; the oldest one goes if there is no room."""
         with self._lock:
             self._events.append(event)
             self._counts[event.kind] = self._counts.get(event.kind, 0) + 1
@@ -62,13 +47,6 @@ class DecisionLog:
     def since(self, t: float) -> tuple[Event, ...]:
         """Return the kept events at or after a time.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
-
-        Returns
-        -------
-        tuple of Event
+        `t`: s of record.
         """
         return tuple(event for event in self.events if event.t >= t)

@@ -6,7 +6,7 @@ import threading
 from typing import Literal, get_args
 
 from ambid.errors import EstimationError, nearest
-from ambid.track.lines import Event
+from ambid.recursive.lines import Event
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Order = Literal["accept", "revert"]
@@ -19,10 +19,7 @@ class Operator:
     ``track`` and ``hold`` are states: in ``hold`` the published numbers stay as they are. ``accept`` (the candidate,
     now and unjudged) and ``revert`` (to the numbers accepted before) are orders, carried out once.
 
-    Parameters
-    ----------
-    hold : bool
-        Whether to begin in ``hold``.
+    `hold`: whether to begin in ``hold``.
     """
 
     def __init__(self, *, hold: bool = False) -> None:
@@ -45,23 +42,7 @@ class Operator:
     def set(self, flag: str, t: float = 0.0, why: str = "") -> Event:
         """Set a flag.
 
-        Parameters
-        ----------
-        flag : {"track", "hold", "accept", "revert"}
-        t : float
-            Time of the stream, s.
-        why : str
-            The operator's reason, for the log.
-
-        Returns
-        -------
-        Event
-            For the log.
-
-        Raises
-        ------
-        EstimationError
-            If there is no such flag, or the opposite order waits.
+        `t`: time of the stream, s; `why`: the operator's reason, for the log. Returns for the log.
         """
         if flag not in _FLAGS:
             raise EstimationError(f"operator flag {flag!r} is none of {', '.join(_FLAGS)}.{nearest(flag, _FLAGS)}")
@@ -78,12 +59,7 @@ class Operator:
         return Event(kind="operator", t=t, why=f"{what}: {why}" if why else what)
 
     def take(self) -> Order | None:
-        """Return the order that waits, if any: it is done now and waits no longer.
-
-        Returns
-        -------
-        {"accept", "revert"} or None
-        """
+        """Return the order that waits, if any: it is done now and waits no longer."""
         with self._lock:
             order, self._order = self._order, None
         return order

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from ambid.errors import EstimationError
+from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.supervise.comparison import Accepted
 from ambid.track.supervise.gate import Gate
@@ -25,22 +25,10 @@ _SHORT_BLOCKS = 1.5
 class Publication:
     """The published numbers of a tracker.
 
-    Parameters
-    ----------
-    rpem : PhysicalRpem
-        The working estimate; what it starts from is published first.
-    operator : Operator
-    log : DecisionLog
-    t0 : float
-        Time of the start, s of record.
+    `rpem`: the working estimate; what it starts from is published first; `t0`: time of the start, s of record.
 
-    Attributes
-    ----------
-    gate : Gate
-    unconfirmed : bool
-        Numbers were found anew after a change, and no later data have confirmed them yet.
-    updates : int
-        Times that published parameters or gains moved.
+    `unconfirmed`: numbers were found anew after a change, and no later data have confirmed them yet; `updates`: times
+    that published parameters or gains moved.
     """
 
     def __init__(self, rpem: PhysicalRpem, operator: Operator, log: DecisionLog, t0: float) -> None:
@@ -69,11 +57,7 @@ class Publication:
     def propose(self, t: float, why: str) -> None:
         """Offer the working estimate.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
-        why : str
+        `t`: s of record.
         """
         refused = self.gate.propose(self._rpem.filter.q, self._rpem.filter.covariance, t, why)
         if refused is not None and self.unconfirmed:
@@ -82,17 +66,8 @@ class Publication:
     def judge(self, evidence: Evidence, t: float) -> bool:
         """Decide on the candidate with one more block; offer the next.
 
-        Parameters
-        ----------
-        evidence : Evidence
-            Already taken in by the working estimate.
-        t : float
-            Its end, s of record.
-
-        Returns
-        -------
-        bool
-            Whether numbers that were found anew have been confirmed.
+        `evidence`: already taken in by the working estimate; `t`: its end, s of record. Returns whether numbers that
+        were found anew have been confirmed.
         """
         if self._operator.holding:
             self._held = True
@@ -128,17 +103,8 @@ class Publication:
     def obey(self, t: float, *, searching: bool) -> bool:
         """Carry out what the operator ordered.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
-        searching : bool
-            Whether the working estimate is that from before a change whose search goes on.
-
-        Returns
-        -------
-        bool
-            Whether something else is published now.
+        `t`: s of record; `searching`: whether the working estimate is that from before a change whose search goes on.
+        Returns whether something else is published now.
         """
         order = self._operator.take()
         if order is None:
@@ -162,11 +128,7 @@ class Publication:
     def order(self, flag: str, t: float) -> None:
         """Take a flag of the operator; of two orders before the next block the first counts.
 
-        Parameters
-        ----------
-        flag : {"track", "hold", "accept", "revert"}
-        t : float
-            s of record.
+        `t`: s of record.
         """
         try:
             self._log.add(self._operator.set(flag, t))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.track.lines import TrackedValue
+from ambid.recursive.lines import TrackedValue
 from ambid.track.physical.numbers import Kind, TrackedNumbers
 from ambid.track.physical.synchronous import amplitude_and_phase
 from ambid.track.supervise.comparison import Accepted
@@ -18,18 +18,7 @@ def published(
 ) -> dict[str, TrackedValue]:
     """Return the accepted numbers of one kind.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    accepted : Accepted
-    kind : str
-    fresh : Mapping[str, bool]
-        Which are informed by recent data; those that are not in it are not judged.
-
-    Returns
-    -------
-    dict of str to TrackedValue
-        SI.
+    Returns SI.
     """
     sd = np.sqrt(np.diag(accepted.covariance)) * numbers.magnitude
     values = accepted.values * numbers.magnitude
@@ -46,19 +35,8 @@ def beside(
 ) -> dict[str, TrackedValue]:
     """Return what is tracked beside the parameters: gains of sensors that were found to have changed, unbalance.
 
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    accepted : Accepted
-    active : ndarray of bool, shape (p,)
-        Which numbers the recursion may move.
-    stale : bool
-        Whether they are no longer informed, or known to be no longer right.
-
-    Returns
-    -------
-    dict of str to TrackedValue
-        SI; the unbalance in kg m, its phase in rad.
+    `active`: (p,), which numbers the recursion may move; `stale`: whether they are no longer informed, or known to be
+    no longer right. Returns SI; the unbalance in kg m, its phase in rad.
     """
     gains = tuple(numbers.names[j] for j in numbers.places("gain") if active[j])
     if not gains and not numbers.synchronous:

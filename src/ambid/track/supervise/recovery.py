@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event
 from ambid.track.physical.parameter_filter import ParameterFilter
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import RecentSamples
@@ -44,23 +44,8 @@ def begin(
 ) -> Recovery:
     """Prepare the search after an alarm.
 
-    Parameters
-    ----------
-    rpem : PhysicalRpem
-    history : sequence of (Evidence, ParameterFilter)
-        Recent blocks, each with what was known before it.
-    event : Event
-        What was said of the change.
-    onset : int
-        First sample of the window in which it was found.
-    suspects : tuple of str
-    size : float
-    blocks : int
-        Length of that window; 0 where it does not matter.
-
-    Returns
-    -------
-    Recovery
+    `history`: recent blocks, each with what was known before it; `event`: what was said of the change; `onset`: first
+    sample of the window in which it was found; `blocks`: length of that window; 0 where it does not matter.
     """
     before = next((f for e, f in reversed(history) if e.first <= onset), history[0][1])
     # the change lies somewhere in the block in which it shows first: what comes after it is clean
@@ -89,66 +74,30 @@ def _first_shown(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recovered:
-    """Numbers found anew.
+    """Numbers found anew."""
 
-    Attributes
-    ----------
-    refined : Refined or None
-        None where nothing has moved.
-    moved : tuple of str
-        Numbers that were freed.
-    computing_s : float
-    """
-
-    refined: Refined | None
-    moved: tuple[str, ...]
+    refined: Refined | None  # none where nothing has moved
+    moved: tuple[str, ...]  # numbers that were freed
     computing_s: float
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Recovery:
-    """A change that is being worked on.
+    """A change that is being worked on."""
 
-    Attributes
-    ----------
-    event : Event
-        What was said of it when it was found.
-    suspects : tuple of str
-        Numbers each of which may have moved, the likeliest first.
-    size : float
-        How far the likeliest has moved, in units of its magnitude, as far as is known.
-    onset : int
-        First sample after the change.
-    short : bool
-        The alarm came from so few blocks that as many after the change have to show it too.
-    before : ParameterFilter
-        What was known before it.
-    ready : int
-        Sample from which on a search makes sense.
-    attempts : int
-    """
-
-    event: Event
-    suspects: tuple[str, ...]
-    size: float
-    onset: int
-    short: bool
-    before: ParameterFilter
-    ready: int
+    event: Event  # what was said of it when it was found
+    suspects: tuple[str, ...]  # numbers each of which may have moved, the likeliest first
+    size: float  # how far the likeliest has moved, in units of its magnitude, as far as is known
+    onset: int  # first sample after the change
+    short: bool  # the alarm came from so few blocks that as many after the change have to show it too
+    before: ParameterFilter  # what was known before it
+    ready: int  # sample from which on a search makes sense
     attempts: int = 0
 
     def attempt(self, rpem: PhysicalRpem, recent: RecentSamples) -> Recovered | None:
         """Search in all samples since the onset.
 
-        Parameters
-        ----------
-        rpem : PhysicalRpem
-        recent : RecentSamples
-
-        Returns
-        -------
-        Recovered or None
-            None where nothing explains them; the next attempt is due when twice as many are there.
+        Returns none where nothing explains them; the next attempt is due when twice as many are there.
         """
         begun = time.thread_time()
         self.attempts += 1
@@ -168,11 +117,7 @@ class Recovery:
     def restart(self, sample: int, rpem: PhysicalRpem) -> None:
         """Wait for samples behind a gap: those before it cannot be used together with them.
 
-        Parameters
-        ----------
-        sample : int
-            First one behind the gap.
-        rpem : PhysicalRpem
+        `sample`: first one behind the gap.
         """
         self.onset = sample
         self.ready = sample + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples

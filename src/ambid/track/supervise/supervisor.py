@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.recursive.lines import Event, State, TrackedValue
 from ambid.track.evidence import Evidence
-from ambid.track.lines import Event, State, TrackedValue
 from ambid.track.physical.rpem import PhysicalRpem
 from ambid.track.physical.signals import Samples
 from ambid.track.supervise.comparison import Accepted
@@ -26,8 +26,6 @@ from ambid.track.supervise.operator import Operator
 from ambid.track.supervise.publication import Publication
 from ambid.track.supervise.published import beside, published
 
-Array = NDArray[np.float64]
-
 SILENT_S = 1.0  # without evidence, after which the published numbers are stale; sooner if there never was any
 _RELEASE = 0.8  # part of the limit under which the error has to fall to be acceptable again
 _LEVEL_S = 0.1  # over which the error is taken
@@ -36,27 +34,10 @@ _LEVEL_S = 0.1  # over which the error is taken
 class Supervisor:
     """Tracks the parameters of a bench and decides what is published.
 
-    Parameters
-    ----------
-    rpem : PhysicalRpem
-    limit : float
-        Acceptable error, in multiples of that at identification.
-    operator : Operator, optional
-    false_alarms_per_hour : float
-    t0 : float
-        Time of sample 0, s of record.
-    listener : callable, optional
-        Called with each event.
+    `limit`: acceptable error, in multiples of that at identification; `t0`: time of sample 0, s of record; `listener`:
+    called with each event.
 
-    Attributes
-    ----------
-    rpem : PhysicalRpem
-        The working estimate.
-    publication : Publication
-    diagnosis : Diagnosis
-    level : ErrorLevel
-    log : DecisionLog
-    operator : Operator
+    `rpem`: the working estimate.
     """
 
     def __init__(
@@ -145,10 +126,7 @@ class Supervisor:
     def begin(self, first: int) -> None:
         """Say where the stream begins, before anything of it comes.
 
-        Parameters
-        ----------
-        first : int
-            Number of the first sample.
+        `first`: number of the first sample.
         """
         self._heard = first
         self.diagnosis.restart(first)
@@ -159,24 +137,8 @@ class Supervisor:
     def feed(self, samples: Samples, first: int, *, restart: bool = False) -> Array:
         """Take in consecutive samples.
 
-        Parameters
-        ----------
-        samples : Samples
-            All finite.
-        first : int
-            Number of the first one.
-        restart : bool
-            Samples are missing before it.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, n_outputs), SI
-            Innovations of the working predictor.
-
-        Raises
-        ------
-        ValueError
-            If a sample is not finite.
+        `samples`: all finite; `first`: number of the first one; `restart`: samples are missing before it. Returns
+        (n_samples, n_outputs), SI, innovations of the working predictor.
         """
         if restart or first != self.rpem.stream.sample:
             self._resume(first)
@@ -198,10 +160,7 @@ class Supervisor:
     def wait(self, sample: int) -> None:
         """Let time pass: without samples, or with samples on which the predictor only settles.
 
-        Parameters
-        ----------
-        sample : int
-            Number of the sample up to which nothing more comes now.
+        `sample`: number of the sample up to which nothing more comes now.
         """
         missing = sample > self.rpem.stream.sample
         self._deaf_s = (sample - self._heard) / self._rate
@@ -219,12 +178,7 @@ class Supervisor:
         self._obey(t)
 
     def order(self, flag: str) -> None:
-        """Set a flag of the operator; of two orders before the next block the first counts.
-
-        Parameters
-        ----------
-        flag : {"track", "hold", "accept", "revert"}
-        """
+        """Set a flag of the operator; of two orders before the next block the first counts."""
         self.publication.order(flag, self._now)
 
     @property

@@ -17,14 +17,7 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 10.0  # until the next search while nothin
 def unexplained(evidence: Evidence) -> float:
     """Return the variance of what no number explains in a block.
 
-    Parameters
-    ----------
-    evidence : Evidence
-
-    Returns
-    -------
-    float
-        1 as at identification, also where a block is too short to tell.
+    Returns 1 as at identification, also where a block is too short to tell.
     """
     return evidence.rest / evidence.freedom if evidence.freedom else 1.0
 
@@ -32,14 +25,8 @@ def unexplained(evidence: Evidence) -> float:
 class Unexplained:
     """Keeps count of blocks that the model does not explain.
 
-    Attributes
-    ----------
-    blocks : int
-        Wild blocks on end.
-    deaf : bool
-        Whether nothing is learned: the error is larger than could be believed to be noise.
-    noise : float
-        Variance of the noise over that at identification, as it was taken: 1 if it never rose.
+    `blocks`: wild blocks on end; `deaf`: whether nothing is learned: the error is larger than could be believed to be
+    noise; `noise`: variance of the noise over that at identification, as it was taken: 1 if it never rose.
     """
 
     def __init__(self) -> None:
@@ -63,22 +50,14 @@ class Unexplained:
         return self.level <= _BELIEVED
 
     def count(self, variance: float) -> None:
-        """Count a wild block.
-
-        Parameters
-        ----------
-        variance : float
-        """
+        """Count a wild block."""
         self.blocks += 1
         self._sum = variance if self.blocks <= 2 else self._sum + variance
 
     def close_ears(self, t: float) -> None:
         """Learn nothing until it is over, or until a search is due.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
+        `t`: s of record.
         """
         self.deaf = True
         self._again = t + self._wait
@@ -87,14 +66,7 @@ class Unexplained:
     def search_due(self, t: float) -> bool:
         """Tell whether it is time to look again for a change that explains it.
 
-        Parameters
-        ----------
-        t : float
-            s of record.
-
-        Returns
-        -------
-        bool
+        `t`: s of record.
         """
         return self.deaf and t >= self._again
 

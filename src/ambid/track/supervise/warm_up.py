@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.track.lines import Event
+from ambid.recursive.lines import Event
 from ambid.track.physical.numbers import TrackedNumbers
 from ambid.track.physical.rpem import Memory, PhysicalRpem
 from ambid.track.physical.signals import RecentSamples, Samples
@@ -15,13 +15,7 @@ _BLOCKS = 240  # after as many the walks of the numbers have been adapted once
 
 
 def warm_up(numbers: TrackedNumbers, memory: Memory = "auto") -> None:
-    """Track noise at the operating point, and search a change in it.
-
-    Parameters
-    ----------
-    numbers : TrackedNumbers
-    memory : float, "auto" or "all"
-    """
+    """Track noise at the operating point, and search a change in it."""
     supervisor = Supervisor(PhysicalRpem(numbers, memory=memory))
     rpem, before = supervisor.rpem, supervisor.rpem.filter.copy()
     n, n_u = _BLOCKS * rpem.block_samples, len(numbers.problem.model.inputs)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
 from ambid.validate.ahead import covariance_ahead, errors_ahead
 from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.predictor import errors_elsewhere
@@ -20,47 +20,22 @@ HORIZONS = (1, 5, 20, 100)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ahead:
-    """One output, a number of steps ahead.
-
-    Attributes
-    ----------
-    output : str
-    steps : int
-    fit : float
-        1 - |error|/|y - mean|.
-    rmse : float, SI
-    expected_sd : float, SI
-        What model and innovations of the fit make of it; a larger error says that the model is wrong, or that it is
-        used where it does not hold.
-    """
+    """One output, a number of steps ahead."""
 
     output: str
     steps: int
-    fit: float
+    fit: float  # 1 - |error|/|y - mean|
     rmse: float
+    # what model and innovations of the fit make of it; a larger error says that the model is wrong, or that it is used
+    # where it does not hold
     expected_sd: float
 
 
 def ahead(fit: BlackBoxFit, data: IOData, horizons: Sequence[int] = HORIZONS) -> tuple[Ahead, ...]:
     """Predict several steps ahead, inputs known.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-        The fit's own record or another; a constant in its outputs is fitted.
-    horizons : sequence of int, optional
-        Steps; those above half the record are left out.
-
-    Returns
-    -------
-    tuple of Ahead
-        Output by output, in the order of the horizons.
-
-    Raises
-    ------
-    EstimationError
-        If a horizon is under 1, or channels or rate of the record differ from those of the fit.
+    `data`: the fit's own record or another; a constant in its outputs is fitted; `horizons`: steps; those above half
+    the record are left out. Returns output by output, in the order of the horizons.
     """
     if any(k < 1 for k in horizons):
         raise EstimationError(f"horizons of {', '.join(map(str, horizons))} samples; each must be at least 1")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.structures import structure
-from ambid.identify.estimate import Check
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.structures import structure
+from ambid.estimation.estimate import Check
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.residual_tests import ResidualTests
 from ambid.validate.checks import explained_by_inputs, residual_check
@@ -15,16 +15,7 @@ from ambid.validate.residuals import P_LEAST
 
 
 def stable_predictor(found: Errors) -> Check:
-    """Check that the one-step errors do not grow by themselves.
-
-    Parameters
-    ----------
-    found : Errors
-
-    Returns
-    -------
-    Check
-    """
+    """Check that the one-step errors do not grow by themselves."""
     m = found.model
     radius = float(np.max(np.abs(np.linalg.eigvals(m.A - m.K @ m.C)), initial=0.0)) if m.order else 0.0
     ok = radius < 1.0
@@ -39,17 +30,7 @@ def stable_predictor(found: Errors) -> Check:
 def residual_verdicts(fit: BlackBoxFit, data: IOData, found: Errors, tests: ResidualTests) -> dict[str, Check]:
     """Put residual tests into words.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-    found : Errors
-    tests : ResidualTests
-
-    Returns
-    -------
-    dict of str to Check
-        ``residuals_white``, and with inputs ``residuals_uncorrelated`` and ``feedback``.
+    Returns ``residuals_white``, and with inputs ``residuals_uncorrelated`` and ``feedback``.
     """
     of = f" of {tests.white_output}" if data.n_outputs > 1 else ""
     white = residual_check(tests.white, f"residuals{of} against past residuals")
@@ -90,18 +71,7 @@ def _feedback(fit: BlackBoxFit, tests: ResidualTests) -> Check:
 
 
 def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> list[str]:
-    """Warn where the data show feedback that the user or the structure excludes.
-
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-    tests : ResidualTests
-
-    Returns
-    -------
-    list of str
-    """
+    """Warn where the data show feedback that the user or the structure excludes."""
     if tests.feedback is None or tests.feedback.p >= P_LEAST:
         return []
     evidence = f"input {tests.feedback_input!r} depends on past residuals (p = {tests.feedback.p:.2g})"
@@ -120,15 +90,7 @@ def feedback_warning(fit: BlackBoxFit, data: IOData, tests: ResidualTests) -> li
 def coloured_warning(fit: BlackBoxFit, *, adjusted: bool) -> list[str]:
     """Say how far the standard deviations of an output-error model hold under coloured noise.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    adjusted : bool
-        Whether the covariance accounts for the colour.
-
-    Returns
-    -------
-    list of str
+    `adjusted`: whether the covariance accounts for the colour.
     """
     if adjusted:
         return [

@@ -8,34 +8,20 @@ covariance is (J'J)^-1 J' R J (J'J)^-1, R the covariance of v (Soederstrom and S
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.arrays import Array
+from ambid.blackbox.fit import BlackBoxFit
 from ambid.validate.blackbox.gradient import Gradient
 from ambid.validate.blackbox.score import coloured, power_gain, triangle
-
-Array = NDArray[np.float64]
 
 
 def coloured_covariance(fit: BlackBoxFit, e: Array, slopes: Gradient, colours: tuple[Array, ...]) -> Array | None:
     """Compute the covariance of the coefficients under coloured noise.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-        An output-error model.
-    e : ndarray, shape (n_samples, n_outputs), SI
-        Its simulation errors.
-    slopes : Gradient
-        Derivatives of its simulation.
-    colours : tuple of ndarray, shape (n + 1,) each
-        Autoregression of the errors of each output.
-
-    Returns
-    -------
-    ndarray, shape (n_theta, n_theta), or None
-        None where directions are not coefficients, or not independent. Errors of different outputs are taken to be
-        independent of each other.
+    `fit`: an output-error model; `e`: (n_samples, n_outputs), SI, its simulation errors; `slopes`: derivatives of its
+    simulation; `colours`: autoregression of the errors of each output. Returns (n_theta, n_theta), or None, none where
+    directions are not coefficients, or not independent. Errors of different outputs are taken to be independent of each
+    other.
     """
     if slopes.theta is None or fit.covariance is None:
         return None

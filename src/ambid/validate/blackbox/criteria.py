@@ -19,9 +19,8 @@ multiplied.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 NAMES = ("aic", "aicc", "bic", "mdl", "fpe")
 _SKIP = 100  # samples left out at the start, at most a tenth of the record
@@ -29,36 +28,16 @@ _FLOOR = 1e-13  # least error over the size of the output: below is rounding
 
 
 def skipped(n_samples: int) -> int:
-    """Return how many samples are left out at the start.
-
-    Parameters
-    ----------
-    n_samples : int
-
-    Returns
-    -------
-    int
-    """
+    """Return how many samples are left out at the start."""
     return min(_SKIP, n_samples // 10)
 
 
 def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
     """Compute the criteria.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_samples, n_outputs), SI
-        One-step errors.
-    y : ndarray, shape (n_samples, n_outputs), SI
-        Outputs, to tell an error from rounding.
-    n_estimated : int
-        Numbers estimated, offsets and initial states not counted.
-
-    Returns
-    -------
-    dict of str to float
-        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``; ``aicc`` and ``fpe`` are left out where the samples are too few
-        for them.
+    `e`: (n_samples, n_outputs), SI, one-step errors; `y`: (n_samples, n_outputs), SI, outputs, to tell an error from
+    rounding; `n_estimated`: numbers estimated, offsets and initial states not counted. Returns ``aic``, ``aicc``,
+    ``bic``, ``mdl``, ``fpe``; ``aicc`` and ``fpe`` are left out where the samples are too few for them.
     """
     used = e[skipped(e.shape[0]) :]
     N, n_y = used.shape
@@ -79,14 +58,7 @@ def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
 def log_determinant(e: Array, y: Array) -> float:
     """Return log det of the error covariance, no error counted smaller than rounding.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_used, n_outputs), SI
-    y : ndarray, shape (n_samples, n_outputs), SI
-
-    Returns
-    -------
-    float
+    `e`: (n_used, n_outputs), SI; `y`: (n_samples, n_outputs), SI.
     """
     size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
     s = np.linalg.svd(e / size, compute_uv=False) / np.sqrt(e.shape[0])

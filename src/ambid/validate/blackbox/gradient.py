@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.gradient import Sensitivities
-from ambid.identify.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.identify.blackbox.response import stable, states
-from ambid.identify.blackbox.transfer_model import TransferModel
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.gradient import Sensitivities
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.response import stable, states
+from ambid.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox.predictor import Errors, held_transfer
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _BLOCK = 4096  # samples at once
@@ -29,33 +29,17 @@ _BLOCK = 4096  # samples at once
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Gradient:
-    """Derivatives of the predictions, one array for each output.
-
-    Attributes
-    ----------
-    rows : tuple of ndarray, shape (n_samples, n_directions) each, SI
-    theta : tuple of ndarray, shape (n_directions,) each, or None
-        Place of each direction in ``model.theta``; None where directions are not coefficients.
-    """
+    """Derivatives of the predictions, one array for each output."""
 
     rows: tuple[Array, ...]
+    # place of each direction in ``model.theta``; None where directions are not coefficients
     theta: tuple[Indices, ...] | None
 
 
 def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
     """Differentiate the one-step predictions.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-    found : Errors
-        The data run through the fit.
-
-    Returns
-    -------
-    Gradient
-        Started from rest: the first samples are not exact.
+    `found`: the data run through the fit. Returns started from rest: the first samples are not exact.
     """
     u, y = data.u - fit.offsets.u, data.y - fit.offsets.y
     model = fit.model
@@ -79,20 +63,9 @@ def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
 def polynomial_gradient(p: Polynomials, u: Array, y: Array, e: Array) -> Array:
     """Differentiate the predictions of one output by all of its coefficients, from rest.
 
-    Parameters
-    ----------
-    p : Polynomials
-    u : ndarray, shape (n_samples, n_inputs)
-        Without offsets.
-    y : ndarray, shape (n_samples,)
-        Without offset.
-    e : ndarray, shape (n_samples,)
-        One-step errors.
-
-    Returns
-    -------
-    ndarray, shape (n_samples, n_coefficients)
-        In the order of ``Polynomials.parts``; leading ones included, as if they could move.
+    `u`: (n_samples, n_inputs), without offsets; `y`: (n_samples,), without offset; `e`: (n_samples,), one-step errors.
+    Returns (n_samples, n_coefficients), in the order of ``Polynomials.parts``; leading ones included, as if they could
+    move.
     """
     from scipy.signal import lfilter
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.structures import structure
-from ambid.identify.estimate import OutputFit
+from ambid.estimation.estimate import OutputFit
 from ambid.validate.blackbox.checks import coloured_warning, feedback_warning, residual_verdicts, stable_predictor
 from ambid.validate.blackbox.colour import coloured_covariance
 from ambid.validate.blackbox.criteria import criteria
@@ -21,8 +21,6 @@ from ambid.validate.blackbox.predictor import Errors, errors, errors_elsewhere
 from ambid.validate.blackbox.residual_tests import residual_tests
 from ambid.validate.prediction import fit_of
 
-Array = NDArray[np.float64]
-
 _MOST = 2e7  # numbers in the derivatives of one output that are kept at once
 _ASSUME_WHITE = ("fir", "oe")  # covariance of white noise; the instrumental structures allow for the colour
 _LEAST = 60  # samples from which residuals can be tested
@@ -31,26 +29,10 @@ _LEAST = 60  # samples from which residuals can be tested
 def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> BlackBoxFit:
     """Judge a fit on its own record and, where given, on another.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-        As an estimator returns it.
-    data : IOData
-        What it was estimated from.
-    second : IOData, optional
-        Data that were not used; same channels, same rate.
-
-    Returns
-    -------
-    BlackBoxFit
-        With `fit`, `criteria`, `checks` and, for a second record, `validation`:
-        ``{output: {"one_step": {"fit", "rmse"}, "simulation": {"fit", "rmse"} or None}}``. An output-error model whose
-        residuals are coloured gets the covariance that holds for coloured noise, and says so in its warnings.
-
-    Raises
-    ------
-    EstimationError
-        If channels or rate of a record differ from those of the fit.
+    `fit`: as an estimator returns it; `data`: what it was estimated from; `second`: data that were not used; same
+    channels, same rate. Returns with `fit`, `criteria`, `checks` and, for a second record, `validation`: ``{output:
+    {"one_step": {"fit", "rmse"}, "simulation": {"fit", "rmse"} or None}}``. An output-error model whose residuals are
+    coloured gets the covariance that holds for coloured noise, and says so in its warnings.
     """
     found = errors(fit, data)
     sound = bool(np.all(np.isfinite(found.one_step)))
@@ -85,22 +67,9 @@ def judged(fit: BlackBoxFit, data: IOData, *, second: IOData | None = None) -> B
 def validation(fit: BlackBoxFit, second: IOData) -> dict[str, object]:
     """Judge a fit on data that were not used in the estimation.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    second : IOData
-
-    Returns
-    -------
-    dict
-        By output: ``one_step`` and ``simulation`` (None where unstable, or without inputs), each with ``fit``
-        (1 - |e|/|y - mean|) and ``rmse`` (SI). The model is kept; initial state and a constant error are fitted,
-        because a record's operating point is not a property of the model.
-
-    Raises
-    ------
-    EstimationError
-        If channels or rate of the record differ from those of the fit, or an output of it is constant.
+    Returns by output: ``one_step`` and ``simulation`` (None where unstable, or without inputs), each with ``fit`` (1 -
+    |e|/|y - mean|) and ``rmse`` (SI). The model is kept; initial state and a constant error are fitted, because a
+    record's operating point is not a property of the model.
     """
     for j, name in enumerate(second.outputs):
         if not np.any(second.y[:, j] != second.y[0, j]):

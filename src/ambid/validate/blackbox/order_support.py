@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.polynomial_model import PolynomialModel
-from ambid.identify.blackbox.roots import roots_at
-from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.blackbox.transfer_model import TransferModel
-from ambid.identify.estimate import Check
+from ambid.arrays import Array
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.roots import roots_at
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.estimation.estimate import Check
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _CHI2_999 = (10.827566170662733, 13.815510557964274)  # of one and two degrees of freedom
@@ -30,35 +30,18 @@ _P_LEAST = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cancellation:
-    """A pole and a zero that cannot be told apart.
+    """A pole and a zero that cannot be told apart."""
 
-    Attributes
-    ----------
-    pole, zero : complex
-        In z, or rad/s for a continuous model.
-    where : str
-        Which polynomials.
-    distance : float
-        Over that at the edge of the 99.9 % region: less than 1.
-    """
-
-    pole: complex
+    pole: complex  # in z, or rad/s for a continuous model
     zero: complex
-    where: str
-    distance: float
+    where: str  # which polynomials
+    distance: float  # over that at the edge of the 99.9 % region: less than 1
 
 
 def orders_supported(fit: BlackBoxFit) -> Check | None:
     """Check whether fewer coefficients would do.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-
-    Returns
-    -------
-    Check or None
-        None where the fit has no covariance to judge by.
+    Returns none where the fit has no covariance to judge by.
     """
     if fit.covariance is None or not np.any(fit.covariance):
         return None
@@ -83,15 +66,7 @@ def orders_supported(fit: BlackBoxFit) -> Check | None:
 def cancellations(fit: BlackBoxFit) -> tuple[Cancellation, ...]:
     """Find pole-zero pairs that are within the 99.9 % region of their difference.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-        With a covariance.
-
-    Returns
-    -------
-    tuple of Cancellation
-        One of each complex pair; empty for a model without a covariance.
+    `fit`: with a covariance. Returns one of each complex pair; empty for a model without a covariance.
     """
     if fit.covariance is None:
         return ()

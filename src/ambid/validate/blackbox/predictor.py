@@ -9,61 +9,37 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.response import one_step, simulation, stable
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
-from ambid.identify.blackbox.response import one_step, simulation, stable
-from ambid.identify.blackbox.state_space import StateSpaceModel
-from ambid.identify.blackbox.transfer_model import TransferModel
 from ambid.physics.discretise import zero_order_hold
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Errors:
-    """A record run through a fit, SI.
+    """A record run through a fit, SI."""
 
-    Attributes
-    ----------
-    model : StateSpaceModel
-        Discrete innovations form that was used.
-    plant : StateSpaceModel
-        Its part from inputs to outputs: noise that wanders without bound does not keep a stable plant from simulation.
-    one_step : ndarray, shape (n_samples, n_outputs)
-        Output minus its prediction from all samples before; not a number where an unstable predictor runs away.
-    simulation : ndarray, shape (n_samples, n_outputs), or None
-        Output minus its simulation from the inputs alone; None for an unstable model, or without inputs.
-    claims_noise : bool
-        Whether the fit describes the noise; an output-error model (K = 0) does not.
-    """
-
-    model: StateSpaceModel
+    model: StateSpaceModel  # discrete innovations form that was used
+    # its part from inputs to outputs: noise that wanders without bound does not keep a stable plant from simulation
     plant: StateSpaceModel
+    # (n_samples, n_outputs), output minus its prediction from all samples before; not a number where an unstable
+    # predictor runs away
     one_step: Array
+    # (n_samples, n_outputs), or None, output minus its simulation from the inputs alone; None for an unstable model,
+    # or without inputs
     simulation: Array | None
-    claims_noise: bool
+    claims_noise: bool  # whether the fit describes the noise; an output-error model (K = 0) does not
 
 
 def errors(fit: BlackBoxFit, data: IOData) -> Errors:
     """Run a record through a fit.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-        Same inputs and outputs, same rate.
-
-    Returns
-    -------
-    Errors
-
-    Raises
-    ------
-    EstimationError
-        If channels or rate differ from those of the fit.
+    `data`: same inputs and outputs, same rate.
     """
     if abs(data.dt / fit.dt - 1) > 1e-6:
         raise EstimationError(
@@ -88,20 +64,7 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
 def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
     """Run a record with an operating point of its own through a fit: a constant in every output is fitted.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-
-    Returns
-    -------
-    Errors
-        Their means are zero.
-
-    Raises
-    ------
-    EstimationError
-        As `errors`.
+    Returns their means are zero.
     """
     found = errors(fit, data)
     m = found.model
@@ -150,14 +113,7 @@ def _mirrored(model: StateSpaceModel, noise: Array) -> StateSpaceModel:
 def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
     """Return the model of a fit as a discrete innovations form.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-
-    Returns
-    -------
-    StateSpaceModel
-        At the sampling interval of the fit.
+    Returns at the sampling interval of the fit.
     """
     model = fit.model
     if model.dt is not None:
@@ -170,14 +126,7 @@ def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
 def plant_form(fit: BlackBoxFit) -> StateSpaceModel:
     """Return the way from inputs to outputs as a discrete state space, without the states of the noise.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-
-    Returns
-    -------
-    StateSpaceModel
-        With K = 0.
+    Returns with K = 0.
     """
     return innovations_form(fit).plant() if fit.model.dt is None else fit.model.plant()
 
@@ -185,15 +134,7 @@ def plant_form(fit: BlackBoxFit) -> StateSpaceModel:
 def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
     """Discretise a continuous state space, inputs and innovations held over a sample.
 
-    Parameters
-    ----------
-    model : StateSpaceModel
-        Continuous.
-    dt : float, s
-
-    Returns
-    -------
-    StateSpaceModel
+    `model`: continuous.
     """
     A, B = zero_order_hold(model.A, np.hstack([model.B, model.K]), dt)
     n_u = model.n_inputs
@@ -203,16 +144,7 @@ def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
 def held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
     """Discretise a continuous transfer model under a zero-order hold.
 
-    Parameters
-    ----------
-    model : TransferModel
-        Continuous; may have delays.
-    dt : float, s
-
-    Returns
-    -------
-    StateSpaceModel
-        The delay of each input is a chain of states in front of it.
+    `model`: continuous; may have delays. Returns the delay of each input is a chain of states in front of it.
     """
     plain = TransferModel(num=model.num, den=model.den, dt=None).state_space()
     n, n_u = plain.order, model.n_inputs

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.blackbox.fit import BlackBoxFit
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
 from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.gradient import Gradient
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
 from ambid.validate.residuals import P_LEAST, ResidualTest
-
-Array = NDArray[np.float64]
 
 WHITE_LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 13, 16, 20, 25)
 _INPUT_LAGS, _LONGEST = 16, 400
@@ -31,75 +30,37 @@ _NORMAL_99 = 2.5758293035489004
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correlations:
-    """Correlation coefficients of a residual, with bounds, ready to be drawn.
+    """Correlation coefficients of a residual, with bounds, ready to be drawn."""
 
-    Attributes
-    ----------
-    output : str
-        Whose residual.
-    other : str
-        What it is correlated with: an output's residual (``kind`` "auto") or an input ("cross").
-    kind : {"auto", "cross"}
-    lags : ndarray, shape (n_lags,), samples
-        The other signal comes before the residual by this much; for an input also negative: after it.
-    values : ndarray, shape (n_lags,)
-    band : ndarray, shape (n_lags,)
-        99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for. For
-        negative lags: if, besides, there is no feedback.
-    """
-
-    output: str
-    other: str
+    output: str  # whose residual
+    other: str  # what it is correlated with: an output's residual (``kind`` "auto") or an input ("cross")
     kind: str
+    # (n_lags,), samples, the other signal comes before the residual by this much; for an input also negative: after it
     lags: NDArray[np.int64]
-    values: Array
+    values: Array  # (n_lags,)
+    # (n_lags,), 99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for.
+    # For negative lags: if, besides, there is no feedback.
     band: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ResidualTests:
-    """What the residuals say.
+    """What the residuals say."""
 
-    Attributes
-    ----------
-    white : ResidualTest
-        Residuals against past residuals, worst output.
-    uncorrelated : ResidualTest or None
-        Residuals against past inputs, worst output; None without inputs.
-    feedback : ResidualTest or None
-        Inputs against past residuals: small p is evidence for feedback.
-    white_output, uncorrelated_output, feedback_input : str
-        Which output, or input, that was.
-    colours : tuple of ndarray, shape (n + 1,) each
-        Autoregression of every residual where the model does not describe the noise; [1] otherwise.
-    """
-
-    white: ResidualTest
-    uncorrelated: ResidualTest | None
-    feedback: ResidualTest | None
-    white_output: str
+    white: ResidualTest  # residuals against past residuals, worst output
+    uncorrelated: ResidualTest | None  # residuals against past inputs, worst output; None without inputs
+    feedback: ResidualTest | None  # inputs against past residuals: small p is evidence for feedback
+    white_output: str  # which output, or input, that was
     uncorrelated_output: str
     feedback_input: str
+    # autoregression of every residual where the model does not describe the noise; [1] otherwise
     colours: tuple[Array, ...]
 
 
 def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_reference: bool = False) -> ResidualTests:
     """Test the residuals of a fit.
 
-    Parameters
-    ----------
-    data : IOData
-    found : Errors
-        The data run through the fit.
-    slopes : Gradient
-        Derivatives of its predictions.
-    with_reference : bool, optional
-        Test residuals against the reference of the loop instead of the inputs: in a loop, noise that a model does not
-        describe reaches the inputs, but not the reference.
-
-    Returns
-    -------
-    ResidualTests
+    `found`: the data run through the fit; `slopes`: derivatives of its predictions.
     """
     e, u = found.one_step, data.u
     source = data.reference if with_reference else u
@@ -138,16 +99,7 @@ def residual_tests(data: IOData, found: Errors, slopes: Gradient, *, with_refere
 def input_lags(n_samples: int, *, with_now: bool) -> tuple[int, ...]:
     """Return the lags at which inputs are tested.
 
-    Parameters
-    ----------
-    n_samples : int
-    with_now : bool
-        Whether to test the present input too; under feedback it may depend on the present residual.
-
-    Returns
-    -------
-    tuple of int
-        Every one up to 16, then in even ratios up to a twentieth of the record, at most 400.
+    Returns every one up to 16, then in even ratios up to a twentieth of the record, at most 400.
     """
     longest = max(3, min(n_samples // 20, _LONGEST))
     near = range(0 if with_now else 1, min(_INPUT_LAGS, longest) + 1)
@@ -160,19 +112,8 @@ def correlations(
 ) -> tuple[Correlations, ...]:
     """Correlate every residual with every residual and every input.
 
-    Parameters
-    ----------
-    fit : BlackBoxFit
-    data : IOData
-    found : Errors
-    slopes : Gradient
-    n_lags : int, optional
-        Largest lag.
-
-    Returns
-    -------
-    tuple of Correlations
-        Output by output: own residual first, then the other outputs' residuals, then the inputs.
+    `n_lags`: largest lag. Returns output by output: own residual first, then the other outputs' residuals, then the
+    inputs.
     """
     out, e = list[Correlations](), found.one_step
     ahead = np.arange(1, min(n_lags, e.shape[0] // 4) + 1)

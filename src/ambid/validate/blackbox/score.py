@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ambid.arrays import Array
 
 _SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
 _PREDICTED = 1e-16  # power from which a residual is more than rounding
@@ -23,43 +22,23 @@ _DEPENDENT = 1e-9  # singular value from which a direction of J counts
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Score:
-    """Outcome of a score test.
+    """Outcome of a score test."""
 
-    Attributes
-    ----------
-    p : float
-        Probability of at least this much if the model is right.
-    statistic : float
-    degrees : int
-    correlation : ndarray, shape (n_regressors,)
-        Correlation coefficient of the residual with each regressor.
-    sd : ndarray, shape (n_regressors,)
-        Its standard deviation if the model is right; smaller than 1/sqrt(N) where estimated numbers take part.
-    """
-
-    p: float
+    p: float  # probability of at least this much if the model is right
     statistic: float
     degrees: int
-    correlation: Array
+    correlation: Array  # (n_regressors,), correlation coefficient of the residual with each regressor
+    # (n_regressors,), its standard deviation if the model is right; smaller than 1/sqrt(N) where estimated numbers
+    # take part
     sd: Array
 
 
 def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None) -> Score:
     """Test whether regressors explain a residual.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_used,)
-    J : ndarray, shape (n_used, n_directions)
-        Derivative of the prediction by what was estimated.
-    regressors : ndarray, shape (n_used, n_regressors)
-        Known before each residual; or, with `colour`, independent of all residuals.
-    colour : ndarray, shape (n + 1,), optional
-        Autoregression [1, a1 ...] of coloured residuals. None: the residuals are white if the model is right.
-
-    Returns
-    -------
-    Score
+    `e`: (n_used,); `J`: (n_used, n_directions), derivative of the prediction by what was estimated; `regressors`:
+    (n_used, n_regressors), known before each residual; or, with `colour`, independent of all residuals; `colour`: (n +
+    1,).
     """
     from scipy.special import chdtrc
 
@@ -108,19 +87,8 @@ def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array)
     count that are orthogonal to J, so that the error of the estimate does not reach them (the overidentification
     test of Sargan 1958).
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_used,)
-    J : ndarray, shape (n_used, n_directions)
-    instruments : ndarray, shape (n_used, n_regressors)
-        Independent of all noise.
-    colour : ndarray, shape (n + 1,)
-        Autoregression of the residuals.
-
-    Returns
-    -------
-    Score
-        Correlations are those with the instruments themselves.
+    `e`: (n_used,); `J`: (n_used, n_directions); `instruments`: (n_used, n_regressors), independent of all noise;
+    `colour`: (n + 1,), autoregression of the residuals. Returns correlations are those with the instruments themselves.
     """
     centred, rest = instruments - instruments.mean(axis=0), e - e.mean()
     size = np.linalg.norm(centred, axis=0)
@@ -142,13 +110,7 @@ def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array)
 def basis(J: Array) -> Array:
     """Return an orthonormal basis of the columns of a matrix.
 
-    Parameters
-    ----------
-    J : ndarray, shape (n, n_columns)
-
-    Returns
-    -------
-    ndarray, shape (n, n_independent)
+    `J`: (n, n_columns). Returns (n, n_independent).
     """
     size = np.linalg.norm(J, axis=0)
     used = J[:, size > 0] / size[size > 0]
@@ -162,13 +124,7 @@ def basis(J: Array) -> Array:
 def triangle(a: Array) -> Array:
     """Return the factor R of a matrix Q R.
 
-    Parameters
-    ----------
-    a : ndarray, shape (n, n_columns)
-
-    Returns
-    -------
-    ndarray, shape (min(n, n_columns), n_columns)
+    `a`: (n, n_columns). Returns (min(n, n_columns), n_columns).
     """
     block = max(_ROWS, 4 * a.shape[1])
     R = np.zeros((0, a.shape[1]))
@@ -180,14 +136,7 @@ def triangle(a: Array) -> Array:
 def autoregression(e: Array) -> Array:
     """Describe the colour of a residual: an autoregression by Yule-Walker, its order by BIC.
 
-    Parameters
-    ----------
-    e : ndarray, shape (n_used,)
-
-    Returns
-    -------
-    ndarray, shape (n + 1,)
-        [1, a1, ..., an], stable; [1] for a white residual.
+    `e`: (n_used,). Returns (n + 1,), [1, a1, ..., an], stable; [1] for a white residual.
     """
     n = e.size
     longest = max(1, min(int(10 * np.log10(n)), n // 10))
@@ -212,14 +161,7 @@ def autoregression(e: Array) -> Array:
 def coloured(L: Array, a: Array) -> Array:
     """Return H' L for residuals H w of white w: L filtered by 1/A backwards in time.
 
-    Parameters
-    ----------
-    L : ndarray, shape (n_used, n_columns)
-    a : ndarray, shape (n + 1,)
-
-    Returns
-    -------
-    ndarray, shape (n_used, n_columns)
+    `L`: (n_used, n_columns); `a`: (n + 1,). Returns (n_used, n_columns).
     """
     from scipy.signal import lfilter
 
@@ -229,13 +171,7 @@ def coloured(L: Array, a: Array) -> Array:
 def power_gain(a: Array) -> float:
     """Return the variance of a residual over that of the white noise behind it.
 
-    Parameters
-    ----------
-    a : ndarray, shape (n + 1,)
-
-    Returns
-    -------
-    float
+    `a`: (n + 1,).
     """
     from scipy.signal import lfilter
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.estimate import Check
-from ambid.identify.nonlinear.fit import NonlinearFit
-from ambid.identify.nonlinear.structures import nonlinear_structure
+from ambid.blackbox.data import IOData
+from ambid.estimation.estimate import Check
+from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.structures import nonlinear_structure
 from ambid.validate.checks import explained_by_inputs, residual_check
 from ambid.validate.nonlinear.residual_tests import NonlinearTests
 from ambid.validate.nonlinear.runs import Run
@@ -22,18 +22,8 @@ _SHARE = 0.01  # of a record outside the training data, from which it is worth a
 def residual_verdicts(fit: NonlinearFit, tests: NonlinearTests, *, coloured: bool) -> dict[str, Check]:
     """Put residual tests into words.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    tests : NonlinearTests
-    coloured : bool
-        Whether the model leaves the colour of the noise open.
-
-    Returns
-    -------
-    dict of str to Check
-        ``residuals_white``, and with inputs ``residuals_uncorrelated``, ``residuals_nonlinear``, ``residual_variance``
-        and ``feedback``.
+    `coloured`: whether the model leaves the colour of the noise open. Returns ``residuals_white``, and with inputs
+    ``residuals_uncorrelated``, ``residuals_nonlinear``, ``residual_variance`` and ``feedback``.
     """
     white = residual_check(tests.white, "residuals against past residuals")
     if not white.passed and coloured:
@@ -89,16 +79,8 @@ def _variance(test: ResidualTest) -> Check:
 def feedback_biases(fit: NonlinearFit, *, coloured: bool) -> bool:
     """Return whether feedback biases a fit.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    coloured : bool
-        Whether the model leaves the colour of the noise open.
-
-    Returns
-    -------
-    bool
-        True for structures that the register calls biased, and for fits without a noise model.
+    `coloured`: whether the model leaves the colour of the noise open. Returns true for structures that the register
+    calls biased, and for fits without a noise model.
     """
     kind = nonlinear_structure(fit.structure).feedback
     return kind == "biased" or (kind == "with noise model" and coloured)
@@ -129,18 +111,8 @@ def feedback_warnings(
 ) -> list[str]:
     """Warn where feedback biases a fit, or where the data show one that the user excludes.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    records : sequence of IOData
-    tests : NonlinearTests or None
-    coloured : bool
-        Whether the model leaves the colour of the noise open.
-
-    Returns
-    -------
-    list of str
-        Nothing that the estimator has said already.
+    `coloured`: whether the model leaves the colour of the noise open. Returns nothing that the estimator has said
+    already.
     """
     if not fit.inputs:
         return []
@@ -158,16 +130,7 @@ def feedback_warnings(
 
 
 def finite_prediction(runs: Sequence[Run]) -> Check:
-    """Check that the one-step errors are finite on all records.
-
-    Parameters
-    ----------
-    runs : sequence of Run
-
-    Returns
-    -------
-    Check
-    """
+    """Check that the one-step errors are finite on all records."""
     bad = [k + 1 for k, r in enumerate(runs) if not r.finite]
     where = f"record {bad[0]}" if bad else ""
     detail = (
@@ -182,16 +145,7 @@ def simulation_stable(records: Sequence[IOData], runs: Sequence[Run], tests: Non
     An unstable plant under feedback cannot be simulated from its input: where the data show feedback, a free run that
     runs away is reported and not held against the model.
 
-    Parameters
-    ----------
-    records : sequence of IOData
-    runs : sequence of Run
-    tests : NonlinearTests or None
-
-    Returns
-    -------
-    Check or None
-        None without inputs.
+    Returns none without inputs.
     """
     if any(r.simulation is None for r in runs):
         return None
@@ -227,16 +181,7 @@ def simulation_stable(records: Sequence[IOData], runs: Sequence[Run], tests: Non
 def extrapolation_warnings(share: float, where: str) -> list[str]:
     """Warn where a record leaves what the model was trained on.
 
-    Parameters
-    ----------
-    share : float
-        Part of its samples with a novelty above 1.
-    where : str
-        Which record.
-
-    Returns
-    -------
-    list of str
+    `share`: part of its samples with a novelty above 1; `where`: which record.
     """
     if share <= _SHARE:
         return []
@@ -247,16 +192,7 @@ def extrapolation_warnings(share: float, where: str) -> list[str]:
 
 
 def unconverged_warnings(fit: NonlinearFit) -> list[str]:
-    """Say that a search did not converge, where the estimator has not.
-
-    Parameters
-    ----------
-    fit : NonlinearFit
-
-    Returns
-    -------
-    list of str
-    """
+    """Say that a search did not converge, where the estimator has not."""
     if fit.status != "stalled" or any("converge" in x or "interrupted" in x for x in fit.warnings):
         return []
     return ["the training did not converge: the best of its steps is given; more iterations may go on from there"]

@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.estimate import OutputFit
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.estimation.estimate import OutputFit
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.validate.blackbox.criteria import criteria, skipped
 from ambid.validate.nonlinear.checks import (
     extrapolation_warnings,
@@ -25,31 +24,13 @@ from ambid.validate.nonlinear.checks import (
 from ambid.validate.nonlinear.residual_tests import material, residual_tests
 from ambid.validate.nonlinear.runs import Run, beyond, looks_back, model_of, run, sizes
 
-Array = NDArray[np.float64]
-
 
 def judged(fit: NonlinearFit, records: Sequence[IOData], *, second: IOData | None = None) -> NonlinearFit:
     """Judge a fit on its own records and, where given, on another.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        As an estimator returns it.
-    records : sequence of IOData
-        What it was estimated from.
-    second : IOData, optional
-        Data that were not used; same channels, same rate.
-
-    Returns
-    -------
-    NonlinearFit
-        With `fit`, `criteria`, `checks` and, for a second record, `validation` (see `validation`). A failed fit comes
-        back as it is.
-
-    Raises
-    ------
-    EstimationError
-        If no record is given, or channels or rate of one differ from those of the fit.
+    `fit`: as an estimator returns it; `records`: what it was estimated from; `second`: data that were not used; same
+    channels, same rate. Returns with `fit`, `criteria`, `checks` and, for a second record, `validation` (see
+    `validation`). A failed fit comes back as it is.
     """
     if not records:
         raise EstimationError("there is no record to judge on. Pass those that the fit was estimated from")
@@ -85,16 +66,7 @@ def judged(fit: NonlinearFit, records: Sequence[IOData], *, second: IOData | Non
 def leaves_colour_open(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run]) -> bool:
     """Return whether a fit says nothing of the colour of its noise, so that coloured residuals are no fault of it.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    records : sequence of IOData
-    runs : sequence of Run
-
-    Returns
-    -------
-    bool
-        True for a model that was fitted to its free run, and for one that predicts without measured outputs.
+    Returns true for a model that was fitted to its free run, and for one that predicts without measured outputs.
     """
     if fit.settings.get("focus") == "simulation":
         return True
@@ -104,22 +76,9 @@ def leaves_colour_open(fit: NonlinearFit, records: Sequence[IOData], runs: Seque
 def validation(fit: NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
     """Judge a fit on data that were not used in the estimation; nothing is fitted.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-    second : IOData
-
-    Returns
-    -------
-    dict
-        By output: ``one_step`` and ``simulation`` (None where it diverges, or without inputs), each with ``fit``
-        (1 - |e|/|y - mean|) and ``rmse`` (SI), over all samples but the first `lag`, from which the free run starts;
-        ``extrapolated``, the part of the samples that lie outside the training data.
-
-    Raises
-    ------
-    EstimationError
-        If the fit has failed, channels or rate of the record differ from it, or an output is constant.
+    Returns by output: ``one_step`` and ``simulation`` (None where it diverges, or without inputs), each with ``fit`` (1
+    - |e|/|y - mean|) and ``rmse`` (SI), over all samples but the first `lag`, from which the free run starts;
+    ``extrapolated``, the part of the samples that lie outside the training data.
     """
     model = model_of(fit, second)
     for j, name in enumerate(second.outputs):
@@ -140,15 +99,7 @@ def validation(fit: NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
 def outside(found: Mapping[str, Mapping[str, Any]]) -> float:
     """Return which part of a second record lies outside the training data.
 
-    Parameters
-    ----------
-    found : Mapping[str, Mapping]
-        As `validation` gives it.
-
-    Returns
-    -------
-    float
-        0 to 1.
+    `found`: as `validation` gives it. Returns 0 to 1.
     """
     return float(next(iter(found.values()))["extrapolated"])
 

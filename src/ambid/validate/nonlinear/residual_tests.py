@@ -15,15 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.residual_tests import WHITE_LAGS, input_lags
 from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
 from ambid.validate.nonlinear.runs import Run, looks_back, model_of
 from ambid.validate.residuals import ResidualTest
-
-Array = NDArray[np.float64]
 
 _PRODUCT_LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 _LOOP_LAGS, _OWN_LAGS = 10, 20
@@ -34,72 +33,41 @@ _NORMAL_99 = 2.5758293035489004
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Material:
-    """What the tests look at, record by record, without the samples at the start.
+    """What the tests look at, record by record, without the samples at the start."""
 
-    Attributes
-    ----------
-    e : list of ndarray, shape (n_used, n_outputs)
-        One-step errors over their size.
-    u : list of ndarray, shape (n_used, n_inputs)
-        Deviations of the inputs from their mean over all records, over their size.
-    J : list of ndarray, shape (n_used, n_outputs, n_theta)
-        Derivatives of the predictions.
-    colours : tuple of ndarray, shape (n + 1,) each, or None
-        Autoregression of each output's error, where the model leaves the colour of the noise open.
-    instrumental : bool
-        Whether `J` holds noise that such errors depend on: for a model that was fitted to its free run, but predicts
-        from measured outputs. Then inputs serve as instruments.
-    """
-
-    e: list[Array]
-    u: list[Array]
-    J: list[Array]
+    e: list[Array]  # (n_used, n_outputs), one-step errors over their size
+    u: list[Array]  # (n_used, n_inputs), deviations of the inputs from their mean over all records, over their size
+    J: list[Array]  # (n_used, n_outputs, n_theta), derivatives of the predictions
+    # autoregression of each output's error, where the model leaves the colour of the noise open
     colours: tuple[Array, ...] | None
+    # whether `J` holds noise that such errors depend on: for a model that was fitted to its free run, but predicts
+    # from measured outputs. Then inputs serve as instruments.
     instrumental: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NonlinearTests:
-    """What the residuals say; each the worst output.
+    """What the residuals say; each the worst output."""
 
-    Attributes
-    ----------
-    white : ResidualTest
-        e against past e.
-    uncorrelated, squares, variance : ResidualTest or None
-        e against past u, e against past u^2, e^2 against past u^2; None without inputs, and where the model has more
-        parameters than a test has instruments.
-    products : ResidualTest or None
-        e against past e u; None without inputs, and where the model leaves the colour of the noise open.
-    feedback : ResidualTest or None
-        Inputs against past e: small p is evidence for feedback.
-    """
-
-    white: ResidualTest
+    white: ResidualTest  # e against past e
+    # e against past u, e against past u^2, e^2 against past u^2; None without inputs, and where the model has more
+    # parameters than a test has instruments
     uncorrelated: ResidualTest | None
     squares: ResidualTest | None
+    # e against past e u; None without inputs, and where the model leaves the colour of the noise open
     products: ResidualTest | None
     variance: ResidualTest | None
-    feedback: ResidualTest | None
+    feedback: ResidualTest | None  # inputs against past e: small p is evidence for feedback
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correlation:
-    """Correlation coefficients, ready to be drawn.
+    """Correlation coefficients, ready to be drawn."""
 
-    Attributes
-    ----------
-    output, title : str
-        Whose error; what is correlated with what.
-    lags : ndarray, shape (n_lags,), samples
-        The second comes before the first by this much.
-    values, band : ndarray, shape (n_lags,)
-        99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for.
-    """
-
-    output: str
+    output: str  # whose error; what is correlated with what
     title: str
-    lags: NDArray[np.int64]
+    lags: NDArray[np.int64]  # (n_lags,), samples, the second comes before the first by this much
+    # (n_lags,), 99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for
     values: Array
     band: Array
 
@@ -107,20 +75,8 @@ class Correlation:
 def material(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run], *, coloured: bool) -> Material | None:
     """Prepare errors, inputs and derivatives for the tests.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With a model.
-    records : sequence of IOData
-    runs : sequence of Run
-        Of these records, all finite.
-    coloured : bool
-        Whether the model leaves the colour of the noise open.
-
-    Returns
-    -------
-    Material or None
-        None where no record has samples enough.
+    `fit`: with a model; `runs`: of these records, all finite; `coloured`: whether the model leaves the colour of the
+    noise open. Returns none where no record has samples enough.
     """
     used = [(x, r) for x, r in zip(records, runs, strict=True) if x.n_samples - r.lag >= _LEAST]
     if not used:
@@ -146,18 +102,7 @@ def material(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run], 
 
 
 def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
-    """Test the residuals.
-
-    Parameters
-    ----------
-    of : Material
-    with_now : bool
-        Whether to test the present input too, unless feedback is seen: then it may depend on the present error.
-
-    Returns
-    -------
-    NonlinearTests
-    """
+    """Test the residuals."""
     shortest = min(x.shape[0] for x in of.e)
     white = tuple(k for k in WHITE_LAGS if k < shortest // 10) or (1,)
     products = tuple(k for k in _PRODUCT_LAGS if k < shortest // 10) or (1,)
@@ -182,17 +127,8 @@ def residual_tests(of: Material, *, with_now: bool) -> NonlinearTests:
 def correlations(of: Material, inputs: Sequence[str], outputs: Sequence[str], *, n_lags: int = 20) -> list[Correlation]:
     """Correlate the errors of each output with what the tests look at, lag by lag.
 
-    Parameters
-    ----------
-    of : Material
-    inputs, outputs : sequence of str
-        Names.
-    n_lags : int, optional
-
-    Returns
-    -------
-    list of Correlation
-        Output by output: with its own past, then for each input with u, u^2, e u, and of e^2 with u^2.
+    `inputs`, `outputs`: names. Returns output by output: with its own past, then for each input with u, u^2, e u, and
+    of e^2 with u^2.
     """
     lags = tuple(range(1, min(n_lags, min(x.shape[0] for x in of.e) // 4) + 1))
     squares = _squares(of)

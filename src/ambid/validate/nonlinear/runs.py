@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.identify.blackbox.data import IOData
-from ambid.identify.nonlinear.fit import NonlinearFit
-from ambid.identify.nonlinear.model import NonlinearModel
+from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.model import NonlinearModel
 from ambid.validate.prediction import fit_of
-
-Array = NDArray[np.float64]
 
 _ROUNDING = 1e-9  # of a novelty of 1
 _SAME = 1e-9  # one-step prediction against free run, relative to the output's size
@@ -21,21 +20,12 @@ _SAME = 1e-9  # one-step prediction against free run, relative to the output's s
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Run:
-    """One record run through a model.
+    """One record run through a model."""
 
-    Attributes
-    ----------
-    lag : int
-        Samples at the start that are not predicted.
-    one_step : ndarray, shape (n_samples, n_outputs), SI
-        Errors; the first `lag` rows are NaN.
-    simulation : ndarray, shape (n_samples, n_outputs), SI, or None
-        Errors of the free run from the first `lag` measured samples on; NaN from where it diverges on. None without
-        inputs: a free run of a time series says nothing.
-    """
-
-    lag: int
-    one_step: Array
+    lag: int  # samples at the start that are not predicted
+    one_step: Array  # (n_samples, n_outputs), SI, errors; the first `lag` rows are NaN
+    # (n_samples, n_outputs), SI, or None, errors of the free run from the first `lag` measured samples on; NaN from
+    # where it diverges on. None without inputs: a free run of a time series says nothing.
     simulation: Array | None
 
     @property
@@ -55,20 +45,7 @@ class Run:
 def run(fit: NonlinearFit, data: IOData) -> Run:
     """Run a record through the model of a fit.
 
-    Parameters
-    ----------
-    fit : NonlinearFit
-        With a model.
-    data : IOData
-
-    Returns
-    -------
-    Run
-
-    Raises
-    ------
-    EstimationError
-        If channels or rate differ from those of the fit, or the record is no longer than the model looks back.
+    `fit`: with a model.
     """
     model = model_of(fit, data)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -78,22 +55,7 @@ def run(fit: NonlinearFit, data: IOData) -> Run:
 
 
 def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
-    """Return the model of a fit if it can be run on a record.
-
-    Parameters
-    ----------
-    fit : NonlinearFit
-    data : IOData
-
-    Returns
-    -------
-    NonlinearModel
-
-    Raises
-    ------
-    EstimationError
-        If there is no model, channels or rate differ, or the record is too short.
-    """
+    """Return the model of a fit if it can be run on a record."""
     if fit.model is None:
         raise EstimationError(f"the fit has failed and holds no model: {fit.reason or 'no reason is given'}. Fit again")
     if (data.inputs, data.outputs) != (fit.inputs, fit.outputs):
@@ -115,15 +77,7 @@ def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
 def beyond(novelty: Array) -> NDArray[np.bool_]:
     """Return where a model extrapolates.
 
-    Parameters
-    ----------
-    novelty : ndarray, shape (n_samples,)
-        As `NonlinearModel.novelty` gives it; the sample at the edge, which has 1, may be above by rounding.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,)
-        True outside the training data, and where novelty is no number.
+    `novelty`: (n_samples,). Returns (n_samples,), true outside the training data, and where novelty is no number.
     """
     out: NDArray[np.bool_] = ~(novelty <= 1.0 + _ROUNDING)
     return out
@@ -132,15 +86,7 @@ def beyond(novelty: Array) -> NDArray[np.bool_]:
 def looks_back(data: IOData, found: Run) -> bool:
     """Return whether predictions use measured outputs: if not, the model leaves the colour of the noise open.
 
-    Parameters
-    ----------
-    data : IOData
-    found : Run
-
-    Returns
-    -------
-    bool
-        False where the one-step prediction is the free run, as for an output-error model.
+    Returns false where the one-step prediction is the free run, as for an output-error model.
     """
     if found.simulation is None or found.diverges_at is not None or not found.finite:
         return True
@@ -152,16 +98,9 @@ def looks_back(data: IOData, found: Run) -> bool:
 def sizes(errors: list[Array], outputs: list[Array]) -> tuple[Array, Array]:
     """Return fit and root mean square error of each output over several records.
 
-    Parameters
-    ----------
-    errors, outputs : list of ndarray, shape (n_samples, n_outputs), SI
-        One for each record, without the samples at the start that are not predicted.
-
-    Returns
-    -------
-    fit : ndarray, shape (n_outputs,)
-        1 - |e| / |y - mean|, with the mean of each record: a level that differs from record to record does not help.
-    rmse : ndarray, shape (n_outputs,), SI
+    `errors`, `outputs`: (n_samples, n_outputs), SI, one for each record, without the samples at the start that are not
+    predicted. Returns `fit`: (n_outputs,), 1 - |e| / |y - mean|, with the mean of each record: a level that differs
+    from record to record does not help; `rmse`: (n_outputs,), SI.
     """
     e, y = np.concatenate(errors), np.concatenate([x - x.mean(axis=0) for x in outputs])
     return fit_of(e, y), np.sqrt(np.mean(e**2, axis=0))

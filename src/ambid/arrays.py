@@ -1,0 +1,8 @@
+"""The one alias for numeric arrays: float64, C-ordered, time along axis 0 unless a name says otherwise."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]

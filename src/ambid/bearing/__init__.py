@@ -1,0 +1,19 @@
+"""Physical parameters of one axis: linear grey box, nonlinear magnet, coil, three blocks, physics from a black box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.bearing.blocks import ThreeBlocks as ThreeBlocks
+    from ambid.bearing.blocks import block_parameters as block_parameters
+    from ambid.bearing.blocks import three_blocks as three_blocks
+    from ambid.bearing.coil import coil_instrumental as coil_instrumental
+    from ambid.bearing.coil import coil_least_squares as coil_least_squares
+    from ambid.bearing.greybox import greybox as greybox
+    from ambid.bearing.magnet.result import NonlinearBearingEstimate as NonlinearBearingEstimate
+    from ambid.bearing.physical import physical_parameters as physical_parameters
+
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -1,0 +1,279 @@
+"""Grey-box estimation of the physical parameters of a linear model (theory.md sec. 2; Ljung 1999, sec. 7.5).
+
+Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for
+stable and unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole
+samples and then as a real number; noise is described by disturbance and sensor levels, or by a free predictor gain
+where the data ask for it. Where the starts lead nowhere, a global search gives others (`ambid.bearing.global_start`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.global_start import Rescue
+from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
+from ambid.bearing.rescue import EVALUATIONS, reason, rescued
+from ambid.errors import EstimationError
+from ambid.estimation.innovations import stable
+from ambid.estimation.likelihood import Fit, score_statistic, search
+from ambid.estimation.predictor import assemble
+from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.threads import one_thread
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter
+
+
+def greybox(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    *,
+    delay: Delay = "auto",
+    noise: Literal["auto", "levels", "gain"] = "auto",
+    tick: Callable[[], None] | None = None,
+    evaluations: int = EVALUATIONS,
+    seed: int = 0,
+    workers: int = 1,
+) -> Fit:
+    """Estimate the physical parameters of `model` from one record.
+
+    Parameters
+    ----------
+    model : LinearModel
+    signals : Signals
+        At least 10 samples for every estimated number.
+    parameters : Sequence of Parameter
+        One for each of the model's: free (a value is used as one more start), fixed, or with a prior.
+    delay : float or "auto"
+        Delay of the inputs in samples; "auto": searched from 0 to 6 samples, in fractions where the data show one.
+    noise : {"auto", "levels", "gain"}
+        Disturbance and sensor noise levels through the Riccati equation; a free predictor gain; or ("auto") the
+        simplest that does: sensor noise alone where the plant is stable, levels, or a gain, more numbers only where the
+        likelihood rises by more than they cost (BIC).
+    tick : callable, optional
+        Called after each evaluation; may raise to interrupt.
+    evaluations : int, optional
+        Of the likelihood in a global search, at most; 0 for none. It is made only where the ordinary starts fail: none
+        makes a plant, no search converges, or a linear regression on the past explains much of what the best leaves.
+    seed : int, optional
+        Of the global search: equal seeds give equal results.
+    workers : int, optional
+        Threads of the global search; the result does not hang on them, and the time hardly (most of an evaluation is a
+        small Riccati equation, which does not leave Python's lock).
+
+    Returns
+    -------
+    Fit
+        The best found; its status says whether the search converged. `global_search` says whether there was one, and
+        what it gained. A KeyboardInterrupt of `tick` within the global search ends in the best so far, ``"stalled"``.
+
+    Raises
+    ------
+    EstimationError
+        If the record is too short, a channel is constant, or no start value makes a predictor.
+    """
+    _check(model, signals, parameters, delay)
+    with one_thread():
+        rescue = Rescue(evaluations=evaluations, seed=seed, workers=workers)
+        return _greybox(model, signals, parameters, delay, noise, tick, rescue)
+
+
+def _greybox(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    delay: Delay,
+    noise: Literal["auto", "levels", "gain"],
+    tick: Callable[[], None] | None,
+    rescue: Rescue,
+) -> Fit:
+    """Ordinary starts, and others where those fail."""
+    begun = perf_counter()
+
+    def followed(candidates: Sequence[Candidate]) -> Fit:
+        return _followed(candidates, tick, noise, search_delay=delay == "auto")
+
+    try:
+        candidates = starts(model, signals, parameters, delay, tick=tick)
+    except EstimationError as failure:
+        fit = rescued(None, str(failure), model, signals, parameters, delay, rescue, followed, tick)
+        if fit is None:
+            raise
+        return fit
+    start_s = perf_counter() - begun
+    fit = followed(candidates)
+    why = reason(fit) if rescue.evaluations else ""
+    if why:
+        fit = rescued(fit, why, model, signals, parameters, delay, rescue, followed, tick) or fit
+    return replace(fit, start_s=start_s)
+
+
+def _followed(
+    candidates: Sequence[Candidate],
+    tick: Callable[[], None] | None,
+    noise: Literal["auto", "levels", "gain"],
+    *,
+    search_delay: bool,
+) -> Fit:
+    """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay."""
+    fit: Fit | None = None
+    for candidate in candidates:
+        found = _searched(candidate, tick, with_disturbances=noise != "auto")
+        fit = found if fit is None or found.criterion < fit.criterion else fit
+        if found.status == "converged":
+            break
+    assert fit is not None
+    if search_delay:
+        fit = _with_fraction(fit, tick)
+        if noise == "auto":
+            fit = _without_disturbances(fit, tick)
+    return _with_gain(fit, tick, force=noise == "gain") if noise != "levels" else fit
+
+
+def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
+    """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
+    if not with_disturbances:
+        fit = _quiet(candidate.problem, candidate.vector, tick)
+        if fit is not None and fit.status == "converged" and _gain_promise(fit) <= 0:
+            return fit
+    return search(candidate.problem, candidate.vector, tick=tick)
+
+
+def _quiet(problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None) -> Fit | None:
+    """Search with sensor noise alone; None for an unstable plant, which wants its states corrected."""
+    at = assemble(problem, vector, with_derivatives=False)
+    if at is None or not stable(at.A):
+        return None
+    quiet = replace(problem, noise="given", gain=np.zeros_like(at.gain))
+    start = np.zeros(quiet.size)
+    for group in ("physical", "fraction", "offset", "initial"):
+        start[quiet.slices[group]] = vector[problem.slices[group]]
+    return search(quiet, start, tick=tick)
+
+
+def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
+    """Drop the disturbances again where a wrong delay was all that they stood for."""
+    if fit.problem.noise != "levels":
+        return fit
+    quiet = _quiet(fit.problem, fit.vector, tick)
+    price = (fit.problem.size - (quiet.problem.size if quiet else 0)) * np.log(fit.problem.n_used)
+    return quiet if quiet is not None and quiet.criterion - fit.criterion < price else fit
+
+
+def _gain_promise(fit: Fit) -> float:
+    """Fall of the criterion that a free gain promises, less what its numbers cost (BIC)."""
+    free = replace(fit.problem, noise="gain")
+    price = (free.size - fit.problem.size) * float(np.log(fit.problem.n_used))
+    return score_statistic(free, carry(fit, free), fit.covariance) - price
+
+
+def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> None:
+    n_estimated = sum(p.role != "fixed" for p in parameters)
+    if n_estimated == 0:
+        raise EstimationError("every parameter of the rig is fixed; nothing is left to identify. Free at least one")
+    least = 10 * (n_estimated + 3 * len(model.states)) + MAX_DELAY
+    if signals.y.shape[0] < least:
+        raise EstimationError(
+            f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters wants at least "
+            f"{least}. Record longer, or cut less"
+        )
+    if delay != "auto" and not 0 <= delay <= signals.y.shape[0] - least:
+        raise EstimationError(
+            f"the delay is given as {delay:g} samples; in a record of {signals.y.shape[0]} samples at most "
+            f"{signals.y.shape[0] - least} leave enough to identify from. Correct channels.<input>.delay"
+        )
+    for roles, values in ((model.inputs, signals.u), (model.outputs, signals.y)):
+        for role, column in zip(roles, values.T, strict=True):
+            if np.ptp(column) == 0:
+                raise EstimationError(
+                    f"channel {role!r} is constant at {column[0]:g} over the whole record; nothing can be identified "
+                    "from it. Check the sensor and its wiring, or the column the rig names"
+                )
+
+
+def carry(fit: Fit, problem: PredictorProblem) -> Array:
+    """Write a fit's numbers in the vector of another problem of the same model and scales.
+
+    `problem`: may differ in delay, noise form and whether the delay is estimated. Returns (problem.size,).
+    """
+    old, vector = fit.problem, np.zeros(problem.size)
+    for group in ("physical", "offset", "initial"):
+        vector[problem.slices[group]] = fit.vector[old.slices[group]]
+    if problem.fractional:
+        vector[problem.slices["fraction"]] = old.delay_samples(fit.vector) - problem.delay
+    if problem.noise == old.noise:
+        vector[problem.slices["noise"]] = fit.vector[old.slices["noise"]]
+    elif problem.noise == "gain":
+        predictor = assemble(old, fit.vector, with_derivatives=False)
+        assert predictor is not None
+        vector[problem.slices["noise"]] = predictor.gain.ravel()
+    return vector
+
+
+def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
+    """Estimate the delay as a real number where the score test says that the data show a fraction of a sample."""
+    price = np.log(fit.problem.n_used)  # BIC: one number more
+    for _ in range(8):
+        delay = fit.problem.delay
+        free = replace(fit.problem, fractional=True, lag=0.0, skip=max(fit.problem.skip, delay + 2))
+        start = carry(fit, free)
+        promise = score_statistic(free, start, fit.covariance)
+        before = start.copy()
+        if delay > 0:  # from the other side of the whole sample the slope differs
+            before[free.slices["fraction"]] = -1e-9
+            promise = max(promise, score_statistic(free, before, fit.covariance))
+        if promise < price:
+            return fit
+        neighbour = _better_neighbour(fit, tick)
+        if neighbour is not None:
+            fit = neighbour
+            continue
+        found = search(free, start, tick=tick)
+        total = free.delay_samples(found.vector)
+        if found.status == "failed" or fit.criterion - found.criterion < price:
+            return fit
+        nearest = round(total)
+        if abs(total - nearest) < 0.1:  # a whole number of samples after all?
+            exact = replace(free, fractional=False, delay=nearest, skip=max(free.skip, nearest + 2))
+            back = search(exact, carry(found, exact), tick=tick)
+            if back.status == "converged" and back.criterion - found.criterion < price:
+                return back
+        whole = int(np.floor(total))
+        if whole == delay:
+            return found
+        # the neighbour's interval: start again from there, so that delay + fraction is written with 0 <= fraction < 1
+        moved = replace(found.problem, delay=whole, skip=max(free.skip, whole + 2))
+        again = search(moved, carry(found, moved), tick=tick)
+        if 0.0 <= moved.delay_samples(again.vector) - whole < 1.0:
+            return again
+        fit = again
+    return fit
+
+
+def _better_neighbour(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
+    """The fit with one sample of delay more or less, if one of them is better: a start may have missed the delay."""
+    best = fit
+    for delay in (fit.problem.delay + 1, fit.problem.delay - 1):
+        if delay >= 0:
+            problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
+            found = search(problem, carry(fit, problem), tick=tick)
+            # compared per sample, because a longer delay may leave one sample less
+            if found.criterion / found.problem.n_used < best.criterion / best.problem.n_used:
+                best = found
+    return best if best is not fit else None
+
+
+def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit:
+    """Free the predictor gain where the likelihood rises by more than the added numbers cost."""
+    free = replace(fit.problem, noise="gain")
+    price = (free.size - fit.problem.size) * np.log(fit.problem.n_used)
+    if not force and (price <= 0 or _gain_promise(fit) <= 0):
+        return fit
+    found = search(free, carry(fit, free), tick=tick)
+    return found if force or fit.criterion - found.criterion > price else fit

@@ -1,0 +1,314 @@
+"""Maximum likelihood of the extended Kalman predictor over all records, by Levenberg-Marquardt on Fisher information.
+
+Minimised is the sum of log s + e^2/s over all innovations e with their predicted variances s (Ljung 1999, sec. 7.4;
+Astrom 1980), exact in state and covariance. Its gradient and Fisher information are inner products of rows
+(`_kernels`), reduced by QR record by record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.bearing.magnet.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
+from ambid.estimation.progress import Tick
+
+Status = Literal["converged", "stalled", "failed"]
+
+_BATCHES = 30  # stretches of all records together for the robust covariance
+_ITERATIONS = 60
+_SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
+_SEARCHING = "identify"
+_ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
+_LONGEST = 1.0  # step of a logarithm at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linear:
+    """The criterion about one vector."""
+
+    J: Array  # (n_rows, size), J'J is the Fisher information, priors included
+    r: Array  # (n_rows,), J'r is half the gradient of the criterion
+    criterion: float
+    scores: Array  # (n_stretches, size), half gradients of the stretches of the records
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingFit:
+    """Where a search ended."""
+
+    problem: BearingProblem
+    vector: Array  # (size,)
+    at: Linear | None  # the criterion about it; None where the search failed
+    criterion: float  # twice the negative log-likelihood but for constants, with the squared residuals of the priors
+    status: Status
+    evaluations: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Innovations:
+    """One-step prediction errors of one record."""
+
+    # (n_samples, 2), innovations of position in m and current in A, and their predicted variances; NaN where nothing
+    # was measured
+    e: Array
+    s: Array
+    rows: Array  # see `_kernels.predict`
+    columns: NDArray[np.int64]  # (n_columns,), place of each column in the vector; -1 where it has none
+
+
+def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Innovations | None:
+    """Run the predictor over one record.
+
+    `vector`: (size,); `r`: which record; `slopes`: whether the rows of the likelihood are wanted. Returns none where
+    there is no predictor.
+    """
+    from ambid.bearing.magnet._kernels import predict
+
+    record, n_e = problem.records[r], len(problem.estimated)
+    theta, whole = problem.theta(vector, record.rate_hz)
+    if whole < 0 or whole > problem.skip - 1 or not np.all(np.isfinite(theta)):
+        return None
+    if abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
+        return None
+    names = [n.name for n in problem.numbers]
+    active = [names.index(n.name) for n in problem.estimated]
+    chain, columns = problem.chain(vector), list(range(n_e))
+    if record.rate_hz in problem.free_delay:
+        active.append(len(names))
+        chain = np.append(chain, 1.0)
+        columns.append(n_e + problem.rates.index(record.rate_hz))
+    place, levels = problem.noise_slices[r], problem.levels(r)
+    columns += [place.start + levels.index(j) if j in levels else -1 for j in range(5)]
+    noise2, flags = problem.noise2(vector, r), problem.flags(r)
+    n = record.u.size
+    e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
+    rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
+    steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
+    valid, numbers = record.valid & np.array([not record.held, True]), np.array(active, dtype=np.int64)
+    for first, end in record.parts:
+        begin = max(first + (_ABOUT if first else 0), problem.skip)
+        if end - begin < _ABOUT:
+            continue
+        z, P = _initial(problem, r, begin)
+        done = predict(
+            record.u[:end], loose[:end], knocks[:end], record.y[:end], valid[:end], begin, whole, theta, numbers,
+            chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes, e, s, rows,
+        )  # fmt: skip
+        if not done:
+            return None
+    return Innovations(e=e, s=s, rows=rows if slopes else np.zeros((0, 0)), columns=np.array(columns))
+
+
+def _knocks(problem: BearingProblem, r: int) -> Array:
+    """Variances (n, 2) of force and motional voltage while the rotor is knocked; they do not hang on the vector."""
+    record = problem.records[r]
+    if record.knock is None or not record.knock.any():
+        return np.zeros((record.u.size, 2))
+    begun, at = {n.name: n.value for n in problem.numbers}, record.knock > 0.0
+    x = np.array([record.y[at, 0].min(), record.y[at, 0].max()]) - begun["x_offset"]
+    i = np.full(2, np.sqrt(np.mean(record.y[:, 1] ** 2)))
+    k_i = float(np.max(np.abs(problem.law.table(x, i, begun)[0][:, 2])))
+    return np.column_stack([begun["m"] * record.knock, k_i * record.knock / record.rate_hz]) ** 2
+
+
+def _steps(problem: BearingProblem, r: int) -> int:
+    """Steps in a sample, a power of two: more where a slow record joins a fast one, for an eddy pole, for a drop."""
+    record = problem.records[r]
+    slow = 0.25 * max(problem.delays) / record.rate_hz
+    wanted = problem.substeps * max(slow, EDDY_STEPS if problem.flags(r)[2] else 1.0, _through(problem, record), 1.0)
+    return int(2 ** round(np.log2(wanted)))
+
+
+def _through(problem: BearingProblem, record: BearingRecord) -> float:
+    """Steps in a sample that a stage's drop wants, two while the current runs through its width, and at most eight."""
+    drop, width = (next(n for n in problem.numbers if n.name == name) for name in ("v_drop", "i_drop"))
+    if not (drop.estimated or drop.value) or not record.kept[:, 1].min() < width.value > -record.kept[:, 1].max():
+        return 1.0
+    return min(2.0 * float(np.sqrt(np.mean(np.diff(record.kept[:, 1]) ** 2))) / width.value, 8.0)
+
+
+def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]:
+    """State before sample `begin`, and its covariance, which is generous and does not hang on the vector."""
+    record, flags = problem.records[r], problem.flags(r)
+    rate, n = record.rate_hz, 3 + int(flags[2]) + int(flags[3])
+    noise, begun = np.exp(problem.noise_center[r]), {n.name: n.value for n in problem.numbers}
+    first = record.y[max(begin - _ABOUT, 0) : begin + _ABOUT]
+    x = record.y[:, 0].mean() if record.held else first[:, 0].mean()
+    z, P = np.zeros(n), np.zeros((n, n))
+    z[0], z[2] = x - begun["x_offset"], first[:, 1].mean() - begun["i_offset"]
+    moved = max(float(np.ptp(first[:, 0])), noise[0])
+    if not record.held:
+        z[1] = (first[-1, 0] - first[0, 0]) * rate / (len(first) - 1)
+        P[0, 0], P[1, 1] = (3.0 * moved) ** 2, (moved * rate) ** 2
+    P[2, 2] = (3.0 * max(float(np.ptp(first[:, 1])), noise[1])) ** 2
+    # an offset that moves takes the state with it: the start must not hold it where the search began
+    free, spread = {n.name for n in problem.estimated}, record.kept.std(axis=0)
+    for name, place, c in (("x_offset", 0, 0), ("i_offset", 2, 1)):
+        if name in free and not (record.held and c == 0):
+            P[place, place] += float(spread[c]) ** 2
+    if flags[2]:  # the force behind the eddy pole starts at that of the weight
+        z[3] = -begun["m"] * begun["g"]
+        P[3, 3] = (0.3 * z[3]) ** 2 + (10.0 * noise[2]) ** 2
+        if begin > problem.skip:  # after a stretch that was left out, the force need not be about that
+            z[3] = problem.law.table(z[:1], z[2:3], begun)[0][0, 0]
+            P[3, 3] += z[3] ** 2
+    if flags[3]:
+        P[-1, -1] = (10.0 * noise[2]) ** 2
+    return z, P
+
+
+def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
+    """Return residual and Jacobian rows of the priors: those of the numbers, and the weak one on log noise levels.
+
+    `vector`: (size,). Returns `r`: (n_priors,); `J`: (n_priors, size).
+    """
+    values, chain = problem.values(vector), problem.chain(vector)
+    r, J = [], []
+    for j, n in enumerate(problem.estimated):
+        row = np.zeros(problem.size)
+        if np.isfinite(n.prior_sd):
+            r.append((values[n.name] - n.value) / n.prior_sd)
+            row[j] = chain[j] / n.prior_sd
+            J.append(row)
+        elif not n.signed:
+            r.append((vector[j] - np.log(n.value)) / NOISE_PRIOR_SD)
+            row[j] = 1.0 / NOISE_PRIOR_SD
+            J.append(row)
+    first = problem.noise_slices[0].start
+    centre = problem.start()[first:]
+    rows = np.zeros((centre.size, problem.size))
+    rows[:, first:] = np.eye(centre.size) / NOISE_PRIOR_SD
+    return np.concatenate([r, (vector[first:] - centre) / NOISE_PRIOR_SD]), np.vstack([*J, rows])
+
+
+def criterion(problem: BearingProblem, vector: Array) -> float:
+    """Return the criterion at a vector: infinite where there is no predictor.
+
+    `vector`: (size,).
+    """
+    total = 0.0
+    for r in range(len(problem.records)):
+        found = run(problem, vector, r, slopes=False)
+        if found is None:
+            return np.inf
+        total += _sum(found)
+    prior, _ = prior_rows(problem, vector)
+    total += float(prior @ prior)
+    return total if np.isfinite(total) else np.inf
+
+
+def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
+    """Return the criterion, its gradient and Fisher information at a vector, as rows.
+
+    `vector`: (size,). Returns none where there is no predictor.
+    """
+    prior, J_prior = prior_rows(problem, vector)
+    total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], []
+    stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
+    for r in range(len(problem.records)):
+        found = run(problem, vector, r, slopes=True)
+        if found is None or not np.all(np.isfinite(found.rows)):
+            return None
+        total += _sum(found)
+        used = np.flatnonzero(found.columns >= 0)
+        local = np.delete(found.rows, np.flatnonzero(found.columns < 0), axis=1)
+        for first in range(0, local.shape[0], 4 * stretch):
+            part, score = local[first : first + 4 * stretch], np.zeros(problem.size)
+            score[found.columns[used]] = part[:, :-1].T @ part[:, -1]
+            scores.append(score)
+        triangle, short = np.zeros((local.shape[1], problem.size + 1)), _triangle(local)
+        triangle[: short.shape[0], np.append(found.columns[used], problem.size)] = short
+        parts.append(triangle)
+    whole = _triangle(np.vstack(parts))
+    return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
+
+
+def _triangle(rows: Array) -> Array:
+    """R of a QR decomposition."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
+    """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
+
+    `loose`: (size,), bool, which numbers may move; None: all.
+    """
+    J = at.J if loose is None else at.J[:, loose]
+    norm = np.linalg.norm(J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, _ = np.linalg.svd(J / norm, full_matrices=False)
+    inside = u[:, s > 1e-10 * s[0]].T @ at.r
+    return float(inside @ inside)
+
+
+def search(
+    problem: BearingProblem, start: Array, *, iterations: int = _ITERATIONS, tick: Tick | None = None
+) -> BearingFit:
+    """Minimise the criterion from `start`.
+
+    `start`: (size,); `iterations`: bound on linearisations. Returns with status ``"failed"`` where there is no
+    predictor at `start`.
+    """
+    upper = problem.upper()
+    vector, damping, count, status = np.minimum(start, upper), 1e-3, 1, "stalled"
+    at = linearise(problem, vector)
+    if at is None:
+        return BearingFit(problem=problem, vector=vector, at=None, criterion=np.inf, status="failed", evaluations=1)
+    try:
+        begun, share = promise(at), 0.0
+        for n in range(iterations):
+            loose = ~((vector >= upper) & (at.J.T @ at.r < 0.0))  # what stands at its bound, and would go beyond, rests
+            left = promise(at, loose)
+            if left < _SETTLED:
+                status = "converged"
+                break
+            share = max(share, n / iterations, _approach(begun, left))
+            moved, first = None, True
+            while damping < 1e8:
+                trial = np.minimum(vector + _step(at, damping, loose), upper)
+                # the first step is mostly right, and wants its slopes anyway; after a refusal the criterion alone asks
+                if first or criterion(problem, trial) < at.criterion:
+                    moved = linearise(problem, trial)
+                count, first = count + 1, False
+                if tick is not None:
+                    tick(_SEARCHING, share)
+                if moved is not None and moved.criterion < at.criterion:
+                    break
+                moved, damping = None, max(10.0 * damping, 1e-6)
+            if moved is None:
+                # no way down from here: converged where what a step promises is below what rounding leaves
+                status = "converged" if promise(at, loose) < 1.0 else "stalled"
+                break
+            vector, at, damping = trial, moved, damping / 10.0
+    except KeyboardInterrupt:
+        status = "stalled"
+    final: Status = "converged" if status == "converged" else "stalled"
+    return BearingFit(problem=problem, vector=vector, at=at, criterion=at.criterion, status=final, evaluations=count)
+
+
+def _approach(begun: float, left: float) -> float:
+    """Guess how much of a search is over from how far its promise has fallen, in powers of ten."""
+    if not begun > _SETTLED:
+        return 0.0
+    return float(np.clip(np.log(begun / max(left, _SETTLED)) / np.log(begun / _SETTLED), 0.0, 1.0))
+
+
+def _step(at: Linear, damping: float, loose: NDArray[np.bool_]) -> Array:
+    norm = np.linalg.norm(at.J, axis=0)
+    norm[norm == 0] = 1.0
+    u, s, vt = np.linalg.svd(at.J / norm * loose, full_matrices=False)
+    step = np.asarray(-(vt.T @ (s / (s**2 + damping) * (u.T @ at.r))) / norm)
+    longest = float(np.max(np.abs(step)))
+    return step if longest <= _LONGEST else step * (_LONGEST / longest)
+
+
+def _sum(found: Innovations) -> float:
+    with np.errstate(all="ignore"):
+        used = ~np.isnan(found.s)
+        e, s = found.e[used], found.s[used]
+        return float(np.sum(np.log(s) + e * e / s))

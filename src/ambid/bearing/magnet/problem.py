@@ -1,0 +1,225 @@
+"""What is estimated from what: records, magnet law, numbers, and the layout of the vector that the search moves.
+
+The vector holds, in this order: the free and prior numbers (the logarithm of those that physics wants positive, the
+others over their magnitudes), one delay for each sampling rate where delays are free, and the log noise levels of each
+record (position, current, force, voltage, drift; of a held rotor current and voltage alone).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.physics.coenergy_law import MagnetLaw
+
+BODY = ("m", "R", "c", "g", "a", "x_offset", "i_offset", "v_offset", "v_drop", "i_drop")
+"""Numbers after those of the magnet, in the order of the kernels."""
+
+SIGNED = frozenset({"g", "x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"})
+"""Numbers that may have either sign with any law; the others are positive, or zero where they are fixed."""
+
+UNITS: Mapping[str, str] = {
+    "k": "N m^2/A^2", "s": "m", "L_g": "H", "zeta": "m", "sigma": "1/A^2", "L_leak": "H", "L_rise": "H", "i_knee": "A",
+    "i0": "A", "m": "kg", "R": "ohm", "c": "N s/m", "g": "m/s^2", "a": "rad/s", "x_offset": "m", "i_offset": "A",
+    "v_offset": "V", "v_drop": "V", "i_drop": "A", "k_asym": "1", "i0_asym": "A",
+}  # fmt: skip
+"""SI unit of every number."""
+
+LEVELS = ("position", "current", "force", "voltage", "drift")
+"""Noise levels in the order of the kernels: rms of one sample, the last three held over it."""
+
+EDDY_STEPS = 8
+"""Steps in a sample where there is an eddy pole; it may be as fast as one of them."""
+
+NOISE_PRIOR_SD = 5.0
+"""Of a log noise level: keeps a level that the data do not see from running to minus infinity."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingRecord:
+    """One record as the predictor sees it."""
+
+    name: str
+    rate_hz: float
+    u: Array  # (n_samples,), V, voltage, held over a sample
+    # (n_samples,), V, standard deviation of what is not known of the voltage; zero where it is what was logged
+    loose: Array
+    y: Array  # (n_samples, 2), position in m and current in A
+    # (n_samples, 2), bool, which of them are measured; the predictor runs on through the others
+    valid: NDArray[np.bool_]
+    held: bool = False  # the rotor is held at rest at the mean position: only the coil moves
+    # (n_samples,), m/s^2, or None, standard deviation of an acceleration of unknown origin during each sample, such as
+    # at a stop (see `touching`); None: of none
+    knock: Array | None = None
+    # (n_samples,), bool, or None, samples that are left out, such as those of a rotor that lies on a stop; the
+    # predictor begins anew after them. None: none.
+    cut: NDArray[np.bool_] | None = None
+
+    @property
+    def parts(self) -> tuple[tuple[int, int], ...]:
+        """First sample, and that after the last, of each stretch that is used."""
+        if self.cut is None:
+            return ((0, self.u.size),)
+        edges = np.flatnonzero(np.diff(np.concatenate([[True], self.cut, [True]])))
+        return tuple(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+    @property
+    def kept(self) -> Array:
+        """Position and current of the samples that are used, in shape (n_kept, 2)."""
+        return self.y if self.cut is None else self.y[~self.cut]
+
+    def first(self, count: int) -> BearingRecord:
+        """Return the beginning of the record.
+
+        `count`: samples in it that are used.
+        """
+        n = count if self.cut is None else int(np.searchsorted(np.cumsum(~self.cut), count)) + 1
+        return replace(
+            self,
+            u=self.u[:n],
+            loose=self.loose[:n],
+            y=self.y[:n],
+            valid=self.valid[:n],
+            knock=None if self.knock is None else self.knock[:n],
+            cut=None if self.cut is None else self.cut[:n],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number:
+    """One number of the model, in SI units."""
+
+    name: str
+    value: float  # start, fixed value, or mean of the prior
+    estimated: bool
+    prior_sd: float = np.inf  # infinite without a prior
+    # whether it may have either sign (`SIGNED`, and the s of one magnet, which is that of a position); else it is
+    # positive, and the vector holds its logarithm
+    signed: bool = False
+    magnitude: float = 1.0  # scale of a signed number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingProblem:
+    """Records, law and what is estimated."""
+
+    law: MagnetLaw
+    records: tuple[BearingRecord, ...]
+    numbers: tuple[Number, ...]  # one for each name of the law and of `BODY`, in that order
+    delays: Mapping[float, float]  # by sampling rate: delay of the voltage in samples (start where free)
+    free_delay: frozenset[float]  # rates at which it is estimated
+    eddy: bool  # whether the force has a pole a/(s + a), and whether a random-walk force acts
+    drift: bool
+    noise_center: Array  # (n_records, 5), centres of the weak prior on log noise levels
+    skip: int = 8  # samples left out at the start of each record
+    substeps: int = 1  # runge-Kutta steps in a sample, at least; a power of two
+
+    @property
+    def estimated(self) -> tuple[Number, ...]:
+        """Numbers in the vector."""
+        return tuple(n for n in self.numbers if n.estimated)
+
+    @property
+    def rates(self) -> tuple[float, ...]:
+        """Sampling rates whose delay is in the vector."""
+        return tuple(r for r in self.delays if r in self.free_delay)
+
+    def levels(self, r: int) -> tuple[int, ...]:
+        """Return which noise levels record `r` has, as places in `LEVELS`."""
+        if self.records[r].held:
+            return (1, 3)
+        return (0, 1, 2, 3, 4) if self.drift else (0, 1, 2, 3)
+
+    @property
+    def noise_slices(self) -> tuple[slice, ...]:
+        """Places of each record's noise levels in the vector."""
+        found, first = [], len(self.estimated) + len(self.rates)
+        for r in range(len(self.records)):
+            found.append(slice(first, first + len(self.levels(r))))
+            first = found[-1].stop
+        return tuple(found)
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return int(self.noise_slices[-1].stop)
+
+    @property
+    def n_used(self) -> int:
+        """Measured values that enter the fit."""
+        return int(sum(np.count_nonzero(r.valid[self.skip :, 1 if r.held else 0 :]) for r in self.records))
+
+    def start(self) -> Array:
+        """Return the vector at the numbers' own values and the centres of the noise, in shape (size,)."""
+        vector = np.zeros(self.size)
+        for j, n in enumerate(self.estimated):
+            vector[j] = n.value / n.magnitude if n.signed else np.log(n.value)
+        first = len(self.estimated)
+        vector[first : first + len(self.rates)] = [self.delays[r] for r in self.rates]
+        for r, place in enumerate(self.noise_slices):
+            vector[place] = self.noise_center[r, list(self.levels(r))]
+        return vector
+
+    def upper(self) -> Array:
+        """Return the largest values of the vector, in shape (size,): an eddy pole faster than a step cannot be seen."""
+        found = np.full(self.size, np.inf)
+        if self.eddy:
+            rate = min(r.rate_hz for r in self.records if not r.held)
+            found[[j for j, n in enumerate(self.estimated) if n.name == "a"]] = np.log(EDDY_STEPS * rate)
+        return found
+
+    def values(self, vector: Array) -> dict[str, float]:
+        """Return all numbers at a vector, SI.
+
+        `vector`: (size,).
+        """
+        found = {n.name: n.value for n in self.numbers}
+        for n, v in zip(self.estimated, vector.tolist(), strict=False):
+            found[n.name] = v * n.magnitude if n.signed else float(np.exp(v))
+        return found
+
+    def chain(self, vector: Array) -> Array:
+        """Return d(number)/d(vector) of the estimated numbers.
+
+        `vector`: (size,). Returns (n_estimated,).
+        """
+        values = self.values(vector)
+        return np.array([n.magnitude if n.signed else values[n.name] for n in self.estimated])
+
+    def delay_at(self, vector: Array, rate_hz: float) -> float:
+        """Return the delay in samples at a rate.
+
+        `vector`: (size,).
+        """
+        if rate_hz in self.free_delay:
+            return float(vector[len(self.estimated) + self.rates.index(rate_hz)])
+        return self.delays[rate_hz]
+
+    def theta(self, vector: Array, rate_hz: float) -> tuple[Array, int]:
+        """Return the kernels' numbers at a vector, and the whole samples of delay.
+
+        `vector`: (size,); `rate_hz`: whose delay. Returns `theta`: (20,).
+        """
+        values, delay = self.values(vector), self.delay_at(vector, rate_hz)
+        whole = int(np.floor(delay))
+        body = [values[name] for name in BODY]
+        return np.concatenate([self.law.vector(values), body, [delay - whole]]), whole
+
+    def flags(self, r: int) -> NDArray[np.bool_]:
+        """Return (exponential, pair, eddy, drift, held) of record `r`, in shape (5,)."""
+        held = self.records[r].held
+        drift, eddy = self.drift and not held, self.eddy and not held
+        return np.array([self.law.gap == "exponential", self.law.pair, eddy, drift, held])
+
+    def noise2(self, vector: Array, r: int) -> Array:
+        """Return the squared noise levels of one record.
+
+        `vector`: (size,); `r`: which record. Returns (5,).
+        """
+        found = np.zeros(len(LEVELS))
+        found[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
+        return found

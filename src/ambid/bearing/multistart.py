@@ -1,0 +1,243 @@
+"""Many start values, one search: the weak-form candidates of all bands and delays are scored by the likelihood.
+
+Each candidate is scored on the busiest stretch of the record, the best on all of it and at several noise levels;
+candidates that differ in more than chance are searched a little way, and the search goes on from the winner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation import start as weak_form
+from ambid.estimation.likelihood import evaluate, search, with_linear_part
+from ambid.estimation.problem import PredictorProblem, Scales
+from ambid.estimation.scaling import noise_floor, scales_for
+from ambid.estimation.sensitivity import Workspace
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter
+
+Delay = float | Literal["auto"]
+
+MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
+FARTHEST = 24  # samples: the search goes no farther
+_LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
+_STRETCH = 8192  # samples on which candidates are first compared
+_SHORT = 4096  # samples on which racers are searched
+_KEPT = 6  # candidates scored on the whole record
+_RACE = 3  # candidates searched a little way
+_CLOSE = 0.5  # difference of the criterion per sample within which candidates race
+_ALIKE = 0.3  # relative difference of all parameters within which candidates are taken for the same
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Signals:
+    """What the estimator sees of a record."""
+
+    u: Array  # (n_samples, n_inputs), SI, inputs in the order of the model's, held over a sample
+    y: Array  # (n_samples, n_outputs), SI
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A place to search from."""
+
+    criterion: float  # at `vector`, see `ambid.estimation.likelihood.criterion`
+    problem: PredictorProblem
+    vector: Array  # (size,)
+
+    def like(self, other: Candidate) -> bool:
+        """Return whether a search from here would end where one from `other` does."""
+        a, b = self.problem.parameters(self.vector), other.problem.parameters(other.vector)
+        same = all(abs(a[k] - b[k]) <= _ALIKE * max(abs(a[k]), abs(b[k])) for k in self.problem.estimated)
+        return same and self.problem.delay == other.problem.delay
+
+
+def starts(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    delay: Delay,
+    *,
+    tick: Callable[[], None] | None = None,
+) -> list[Candidate]:
+    """Score all start values and race the best that differ.
+
+    `tick`: called after each evaluation of a search. Returns best first; noise described by levels, delays whole where
+    they are searched.
+    """
+    delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
+    scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
+    while delay == "auto" and scored and scored[0].problem.delay == delays[-1] < FARTHEST:
+        delays = [float(d) for d in range(int(delays[-1]) - 1, int(delays[-1]) + MAX_DELAY + 1)]
+        scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
+    if not scored:
+        raise EstimationError(
+            "no start values make a physical plant (positive m and L) with this record: it holds too little "
+            "excitation, or voltage, current and position are not what the rig says. Check columns and signs, or give "
+            "start values"
+        )
+    racers: list[Candidate] = []
+    for candidate in scored:
+        close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
+        if close and not any(candidate.like(r) for r in racers):
+            racers.append(candidate)
+    return sorted((raced(c, tick) for c in racers[:_RACE]), key=lambda c: c.criterion)
+
+
+def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
+    """Search a little way on a short stretch, and keep what does best on the whole record.
+
+    `tick`: called after each evaluation.
+    """
+    problem, vector = candidate.problem, candidate.vector
+    stretch = busiest(problem.u, _SHORT)
+    part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
+    fit = search(part, at_first_sample(part, vector), rounds=3, tick=tick)
+    moved = at_first_sample(problem, fit.vector)
+    # noise levels move slowly on a logarithmic scale: look again where they stand best
+    work = Workspace(problem)
+    both = (moved, with_linear_part(problem, moved, work), vector)
+    vectors = [w for v in both for w in (v, *(_with_level(problem, v, level) for level in _LEVELS))]
+    scored = [(evaluate(problem, v, work)[0], j) for j, v in enumerate(vectors)]
+    value, best = min(scored)
+    return Candidate(criterion=value, problem=problem, vector=vectors[best])
+
+
+def _scored(
+    model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float]
+) -> list[Candidate]:
+    """Return the best candidates of all bands and delays, each at several noise levels."""
+    centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
+    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u, centred.y]).T, strict=True))
+    moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
+    coarse = _coarse(model, centred, parameters, moments, delays)
+    found = []
+    for _, problem, values in coarse[:_KEPT]:
+        work = Workspace(problem)
+        for level in _LEVELS:
+            vector = _with_level(problem, _vector(problem, values), level)
+            value, _ = evaluate(problem, vector, work)
+            if np.isfinite(value):
+                found.append(Candidate(criterion=value, problem=problem, vector=vector))
+    return found
+
+
+def _coarse(
+    model: LinearModel,
+    centred: Signals,
+    parameters: Sequence[Parameter],
+    moments: weak_form.Moments,
+    delays: Sequence[float],
+) -> list[tuple[float, PredictorProblem, dict[str, float]]]:
+    """Criterion on the busiest stretch, problem and start values of each band and delay, best first."""
+    stretch, floor, spread = busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
+    noise = dict(zip(model.outputs, floor.tolist(), strict=True))
+    found: list[tuple[float, PredictorProblem, dict[str, float]]] = []
+    for d in delays:
+        work: Workspace | None = None
+        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, fixed_values(parameters))
+        for values, sizes in _possible(model, list(from_data), parameters):
+            scales = scales_for(model, values, spread, floor, centred.rate_hz)
+            problem = candidate_problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
+            part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
+            work = work or Workspace(part)  # the scaled data are the same for all candidates of a delay
+            found.append((evaluate(part, _vector(part, values), work)[0], problem, values))
+    return sorted(found, key=lambda c: c[0])
+
+
+def fixed_values(parameters: Sequence[Parameter]) -> dict[str, float]:
+    """Return the values of those that are fixed."""
+    return {p.name: p.value for p in parameters if p.value is not None and p.role == "fixed"}
+
+
+def _possible(
+    model: LinearModel, from_data: list[dict[str, float]], parameters: Sequence[Parameter]
+) -> Iterator[tuple[dict[str, float], dict[str, float]]]:
+    """Yield start values that make a plant, and sizes: from the data, and with the values given (which may be zero)."""
+    given = {p.name: p.value for p in parameters if p.value is not None}
+    bases = (from_data or [given])[:3] if given != fixed_values(parameters) else []
+    for values, sizes in [*((v, v) for v in from_data), *(({**v, **given}, v) for v in bases)]:
+        finite = all(np.isfinite(v) for v in values.values())
+        if finite and len(values) == len(model.parameters) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0:
+            yield values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
+
+
+def busiest(u: Array, length: int) -> slice:
+    """Return the stretch of at most `length` samples in which the inputs move most.
+
+    `u`: (n_samples, n_inputs).
+    """
+    n = u.shape[0]
+    if n <= length:
+        return slice(0, n)
+    power = np.cumsum(np.concatenate([[0.0], np.sum((u / np.std(u, axis=0)) ** 2, axis=1)]))
+    first = int(np.argmax(power[length:] - power[:-length]))
+    return slice(first, first + length)
+
+
+def candidate_problem(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    sizes: Mapping[str, float],
+    scales: Scales,
+    delay: float,
+    skip: int,
+) -> PredictorProblem:
+    """Set up the problem of one candidate.
+
+    `signals`: means taken off; `sizes`: of the parameters, not negative, SI; `delay`: samples; `skip`: samples left out
+    at the start.
+    """
+    estimated = [p for p in parameters if p.role != "fixed"]
+    reference = model.references(sizes)
+    return PredictorProblem(
+        model=model,
+        rate_hz=signals.rate_hz,
+        u=signals.u,
+        y=signals.y,
+        estimated=tuple(p.name for p in estimated),
+        known={p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None},
+        magnitude=np.array([max(sizes[p.name], 1e-3 * reference.get(p.name, 0.0)) or 1.0 for p in estimated]),
+        prior_mean=np.array([p.value if p.role == "prior" and p.value is not None else 0.0 for p in estimated]),
+        prior_sd=np.array([p.sd if p.sd is not None else np.inf for p in estimated]),
+        scales=scales,
+        delay=int(delay),
+        lag=delay - int(delay),
+        skip=skip,
+        noise_center=np.concatenate([np.full(len(model.disturbances), _LEVELS[0]), np.zeros(len(model.outputs) - 1)]),
+    )
+
+
+def _vector(problem: PredictorProblem, values: Mapping[str, float]) -> Array:
+    """Write start values as a vector; nothing is known of offsets."""
+    vector = np.zeros(problem.size)
+    vector[problem.slices["physical"]] = np.array([values[k] for k in problem.estimated]) / problem.magnitude
+    return at_first_sample(problem, _with_level(problem, vector, _LEVELS[0]))
+
+
+def at_first_sample(problem: PredictorProblem, vector: Array) -> Array:
+    """Return a copy whose initial state is that of the problem's data: its outputs at the first sample.
+
+    `vector`: (size,). Returns (size,).
+    """
+    out, model = vector.copy(), problem.model
+    first, initial = problem.y[problem.skip], problem.slices["initial"].start
+    for j, state in enumerate(model.states):
+        measured = state in model.outputs
+        out[initial + j] = first[model.outputs.index(state)] / problem.scales.state[j] if measured else 0.0
+    return out
+
+
+def _with_level(problem: PredictorProblem, vector: Array, level: float) -> Array:
+    """Return a copy with all log disturbance levels at `level`."""
+    out, first = vector.copy(), problem.slices["noise"].start
+    out[first : first + len(problem.model.disturbances)] = level
+    return out

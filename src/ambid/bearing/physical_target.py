@@ -1,0 +1,219 @@
+"""What a physical model has to meet: the response of a black box, reduced to the numbers that its covariance knows.
+
+Points of the response that the black box does not know itself are left out; the others are weighed by what the black
+box knows at each frequency, and come with their whole covariance, whose rank is that of the black box's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.bearing.physical_weight import point_weight
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.spread import response_covariance
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.errors import EstimationError
+from ambid.estimation.start import Moments
+from ambid.physics.linear_model import LinearModel
+
+Complex = NDArray[np.complex128]
+
+_KNOWN = 0.3  # relative standard deviation up to which a point of the response is used
+_RANK = 1e-7  # singular values below this part of the largest are rounding
+_POINTS = 160  # frequencies of the match, half of them in equal steps, half in equal ratios
+_LINES = 800  # frequencies of a start's regression
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Target:
+    """What a physical model has to meet."""
+
+    response: Complex  # (n_frequencies, n_outputs, n_inputs), complex, of the black box, channels in the model's order
+    known: NDArray[np.bool_]  # (n_frequencies, n_outputs, n_inputs), bool, where it knows its own response
+    # (2 n_known,), what real and imaginary parts at the known points are multiplied by: about one over their noise, if
+    # it were independent from point to point
+    root: Array
+    noise: Array  # (2 n_known, rank), half factor of the covariance of the numbers that result
+    # groups of a jackknife from which the covariance was estimated; None where it is not an estimate by scatter
+    groups: int | None
+    omega: Array  # (n_frequencies,), rad/s
+    dt: float | None  # none for a model in continuous time
+    period_s: float  # sampling interval of the record
+    own_delay: float  # delay that the black box's structure holds beside its poles, samples beyond the hold
+    moments: tuple[Moments, ...]  # the response on the grids of the starts
+
+    @property
+    def rank(self) -> int:
+        """Number of independent numbers."""
+        return int(self.noise.shape[1])
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency used, Hz."""
+        used = self.omega[np.any(self.known, axis=(1, 2))] / (2 * np.pi)
+        return float(used[0]), float(used[-1])
+
+    def numbers(self, response: Complex) -> Array:
+        """Reduce a response, or a derivative of one, to the weighed numbers.
+
+        `response`: (n_frequencies, n_outputs, n_inputs, ...), complex. Returns (2 n_known, ...).
+        """
+        points = response[self.known]
+        return np.asarray((np.concatenate([points.real, points.imag]).T * self.root).T)
+
+
+def target_of(
+    fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str], band_hz: tuple[float, float] | None
+) -> Target:
+    """Take out of a black box what a physical model has to meet.
+
+    `roles`: role -> channel, where names do not tell.
+    """
+    rows = [_place(role, fit.outputs, fit, model, roles, "output") for role in model.outputs]
+    columns = [_place(role, fit.inputs, fit, model, roles, "input") for role in model.inputs]
+    _check_poles(fit, model, rows, columns)
+    if fit.covariance is None:
+        raise EstimationError(
+            f"the {fit.structure} model has no covariance, so no uncertainty follows from it. Use a method that gives "
+            "one (arx, armax, oe, bj, sspem, pbsid)"
+        )
+    if isinstance(fit.model, TransferModel) and fit.model.delay_estimated:
+        # the match holds the delay where it was found: what is open about it stands in the coefficients' own spread
+        plain = replace(fit.model, delay_estimated=False)
+        n = plain.theta.size
+        fit = replace(fit, model=plain, covariance=fit.covariance[:n, :n])
+    nyquist = np.pi / fit.dt
+    samples = fit.record.get("samples")
+    low = 4 * np.pi / (fit.dt * (samples if isinstance(samples, int) and samples > 64 else 8192))
+    high = 0.9 * nyquist
+    if band_hz is not None:
+        low, high = max(low, 2 * np.pi * band_hz[0]), min(high, 2 * np.pi * band_hz[1])
+    if not 0 < low < high:
+        raise EstimationError(f"no frequencies between {low / 6.2832:.3g} and {high / 6.2832:.3g} Hz. Widen the band")
+    omega = np.unique(np.concatenate([np.linspace(low, high, _POINTS // 2), np.geomspace(low, high, _POINTS // 2)]))
+    response, known = _known(fit, omega, rows, columns)
+    if not np.any(known):
+        raise EstimationError(
+            f"the {fit.structure} model knows its response nowhere to {_KNOWN:.0%}. Excite more, or record longer"
+        )
+    grids = (np.linspace(0.0, high, _LINES), np.geomspace(low, high, _LINES // 2))
+    everywhere = np.all(known, axis=(1, 2)).astype(np.float64)
+    moments = tuple(
+        _moments(fit, model, grid, np.interp(grid, omega, everywhere, left=0.0) > 0.5, rows, columns) for grid in grids
+    )
+    root, noise = _weight(fit, omega, known, rows, columns)
+    return Target(
+        response=response,
+        known=known,
+        root=root,
+        noise=noise,
+        groups=_groups(fit),
+        omega=omega,
+        dt=fit.model.dt,
+        period_s=fit.dt,
+        own_delay=_own_delay(fit, rows, columns),
+        moments=moments,
+    )
+
+
+def _place(
+    role: str, names: tuple[str, ...], fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str], what: str
+) -> int:
+    """Find the channel of a role: as told, by name, or by unit."""
+    name = roles.get(role, role)
+    if name in names:
+        return names.index(name)
+    alike = [k for k in names if fit.units.get(k) == model.units[role]]
+    if role not in roles and len(alike) == 1:
+        return names.index(alike[0])
+    raise EstimationError(
+        f"the {fit.structure} model has no {what} for {role!r} of {model.name!r} (it has "
+        f"{', '.join(names) or 'none'}). Identify it with that {what}, or name the channel in roles"
+    )
+
+
+def _check_poles(fit: BlackBoxFit, model: LinearModel, rows: list[int], columns: list[int]) -> None:
+    least = len(model.states)
+    for o in rows:
+        for i in columns:
+            if isinstance(fit.model, PolynomialModel):
+                p = fit.model.outputs[o]
+                poles = p.A.size + p.F[i].size - 2
+            elif isinstance(fit.model, TransferModel):
+                poles = fit.model.den[o][i].size - 1
+            else:
+                poles = fit.model.state_space().order
+            if poles < least:
+                raise EstimationError(
+                    f"the {fit.structure} model has {poles} pole(s) from {fit.inputs[i]!r} to {fit.outputs[o]!r}; "
+                    f"{model.name!r} has {least}. Identify it with an order of at least {least}"
+                )
+
+
+def _own_delay(fit: BlackBoxFit, rows: list[int], columns: list[int]) -> float:
+    """Delay in samples: that of a transfer function, or leading zeros of B but one, which the hold makes; else none."""
+    if isinstance(fit.model, TransferModel):
+        hold = 0.0 if fit.model.dt is None else 1.0
+        degrees = [fit.model.den[o][i].size - fit.model.num[o][i].size for o in rows for i in columns]
+        beyond = max(0.0, min(degrees) - hold) if hold else 0.0
+        return min(fit.model.delay[i] for i in columns) / fit.dt + beyond
+    if isinstance(fit.model, PolynomialModel):
+        leading = [int(np.argmax(fit.model.outputs[o].B[i] != 0)) for o in rows for i in columns]
+        return float(max(0, min(leading) - 1))
+    return 0.0
+
+
+def _known(fit: BlackBoxFit, omega: Array, rows: list[int], columns: list[int]) -> tuple[Complex, NDArray[np.bool_]]:
+    """Response in the model's channels, and where its relative standard deviation is small."""
+    assert fit.covariance is not None
+    g = fit.model.frequency_response(omega)[np.ix_(range(omega.size), rows, columns)]
+    spread = response_covariance(fit.model, fit.covariance, omega)[np.ix_(range(omega.size), rows, columns)]
+    variance = np.trace(spread, axis1=-2, axis2=-1)
+    return g, np.asarray(np.isfinite(variance) & (variance >= 0) & (variance < (_KNOWN * np.abs(g)) ** 2))
+
+
+def _weight(
+    fit: BlackBoxFit, omega: Array, known: NDArray[np.bool_], rows: list[int], columns: list[int]
+) -> tuple[Array, Array]:
+    """Weight of the response at the known points, and what its covariance becomes by it."""
+    assert fit.covariance is not None
+    slope = fit.model.frequency_response_derivative(omega)[np.ix_(range(omega.size), rows, columns)][known]
+    size = np.tile(np.abs(fit.model.frequency_response(omega)[np.ix_(range(omega.size), rows, columns)][known]), 2)
+    sd = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    used = sd > 0
+    values, ways = np.linalg.eigh(fit.covariance[np.ix_(used, used)] / np.outer(sd[used], sd[used]))
+    half = ways * np.sqrt(np.maximum(values, 0.0)) * sd[used, None]
+    spread = np.vstack([slope.real[:, used] @ half, slope.imag[:, used] @ half]) / size[:, None]
+    left, s, _ = np.linalg.svd(spread, full_matrices=False)
+    kept = s > _RANK * s[0]
+    spread = left[:, kept] * s[kept]
+    frequency, row, column = np.nonzero(known)
+    root = np.sqrt(np.tile(point_weight(spread, frequency, row * len(columns) + column, omega), 2))
+    return root / size, root[:, None] * spread
+
+
+def _groups(fit: BlackBoxFit) -> int | None:
+    """Number of groups of a jackknife, None for a covariance of another kind."""
+    said = fit.details.get("covariance")
+    groups = said.get("groups") if isinstance(said, Mapping) else None
+    return groups if isinstance(groups, int) else None
+
+
+def _moments(
+    fit: BlackBoxFit, model: LinearModel, omega: Array, use: NDArray[np.bool_], rows: list[int], columns: list[int]
+) -> Moments:
+    """The response as if it were the spectra of a record with a flat, held input; zero where it is not to be used."""
+    g = np.zeros((omega.size, len(rows), len(columns)), dtype=np.complex128)
+    g[use] = fit.model.frequency_response(omega[use])[np.ix_(range(int(use.sum())), rows, columns)]
+    jw = 1j * omega
+    half = 0.5 * omega * fit.dt
+    entered = np.sinc(half / np.pi) * np.exp(-1j * half) if fit.model.dt is not None else np.ones_like(jw)
+    signals = {role: g[:, o, 0] for o, role in enumerate(model.outputs)}
+    signals[model.inputs[0]] = entered * use
+    return Moments(omega=omega, signals={role: (v, jw * v, jw**2 * v) for role, v in signals.items()})

@@ -1,0 +1,48 @@
+"""Black-box models from records and from frequency responses; one file or folder a method."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.blackbox.convert import to_control as to_control
+    from ambid.blackbox.convert import to_scipy as to_scipy
+    from ambid.blackbox.data import IOData as IOData
+    from ambid.blackbox.fit import BlackBoxFit as BlackBoxFit
+    from ambid.blackbox.frequency.laguerre import best_conditioned as best_conditioned
+    from ambid.blackbox.frequency.laguerre import block_rows_condition as block_rows_condition
+    from ambid.blackbox.frequency.measured import Measured as Measured
+    from ambid.blackbox.frequency.rational import frf_ml as frf_ml
+    from ambid.blackbox.frequency.subspace import frf_subspace as frf_subspace
+    from ambid.blackbox.instrumental import cliv as cliv
+    from ambid.blackbox.instrumental import clsrivc as clsrivc
+    from ambid.blackbox.instrumental import iv4 as iv4
+    from ambid.blackbox.instrumental import srivc as srivc
+    from ambid.blackbox.instrumental import two_stage as two_stage
+    from ambid.blackbox.nonparametric import correlation_analysis as correlation_analysis
+    from ambid.blackbox.nonparametric import impulse_response as impulse_response
+    from ambid.blackbox.nonparametric import step_response as step_response
+    from ambid.blackbox.polynomial import ararmax as ararmax
+    from ambid.blackbox.polynomial import ararx as ararx
+    from ambid.blackbox.polynomial import arma as arma
+    from ambid.blackbox.polynomial import armax as armax
+    from ambid.blackbox.polynomial import arx as arx
+    from ambid.blackbox.polynomial import bj as bj
+    from ambid.blackbox.polynomial import fir as fir
+    from ambid.blackbox.polynomial import oe as oe
+    from ambid.blackbox.polynomial_model import PolynomialModel as PolynomialModel
+    from ambid.blackbox.polynomial_model import Polynomials as Polynomials
+    from ambid.blackbox.state_space import StateSpaceModel as StateSpaceModel
+    from ambid.blackbox.subspace import cva as cva
+    from ambid.blackbox.subspace import moesp as moesp
+    from ambid.blackbox.subspace import n4sid as n4sid
+    from ambid.blackbox.subspace import pbsid as pbsid
+    from ambid.blackbox.subspace import sspem as sspem
+    from ambid.blackbox.subspace import subspace_models as subspace_models
+    from ambid.blackbox.transfer_model import TransferModel as TransferModel
+    from ambid.blackbox.weakform import weak_parameters as weak_parameters
+    from ambid.blackbox.weakform import weakform as weakform
+
+__getattr__, __dir__, __all__ = exports(__name__)

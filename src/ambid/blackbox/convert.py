@@ -1,0 +1,188 @@
+"""Models to and from the objects of ``scipy.signal`` and python-control.
+
+What has no place in the other object is refused or named, never dropped silently: objects of both libraries know
+neither noise models nor operating points, and control's transfer functions no delay in continuous time.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ambid.blackbox.model import BlackBoxModel
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.errors import ModelError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+
+def to_scipy(model: BlackBoxModel) -> Any:
+    """Return the input-output part of a model as an object of ``scipy.signal``.
+
+    Parameters
+    ----------
+    model : BlackBoxModel
+
+    Returns
+    -------
+    scipy.signal.StateSpace or scipy.signal.TransferFunction
+        A transfer function (in z or s) for one input and one output, else a state space; `dt` is set where the model is
+        discrete. The noise model (K, or C and D) has no place there.
+
+    Raises
+    ------
+    ModelError
+        If the model has no inputs, or a delay in continuous time.
+    """
+    from scipy.signal import StateSpace, TransferFunction
+
+    _with_inputs(model)
+    timing = {} if model.dt is None else {"dt": model.dt}
+    if isinstance(model, StateSpaceModel) or model.n_inputs * model.n_outputs > 1:
+        s = model.state_space()
+        return StateSpace(s.A, s.B, s.C, s.D, **timing)
+    num, den = _num_den(model)
+    return TransferFunction(num, den, **timing)
+
+
+def from_scipy(system: Any) -> BlackBoxModel:
+    """Read a system of ``scipy.signal``.
+
+    `system`: state space, transfer function or zeros, poles and gain. Returns with white output noise (K = 0).
+    """
+    from scipy.signal import StateSpace, TransferFunction, ZerosPolesGain
+
+    if not isinstance(system, (StateSpace, TransferFunction, ZerosPolesGain)):
+        raise ModelError(f"a {type(system).__name__} is no system of scipy.signal. Give an lti or dlti object")
+    dt = _sampling(system.dt)
+    if isinstance(system, StateSpace):
+        return _state_space(system.A, system.B, system.C, system.D, dt)
+    tf = system.to_tf()
+    num = np.atleast_2d(tf.num)
+    rows = tuple((_reduced(n),) for n in num)
+    return _transfer(rows, tuple((np.asarray(tf.den),) for _ in rows), dt)
+
+
+def to_control(model: BlackBoxModel) -> Any:
+    """Return the input-output part of a model as an object of python-control.
+
+    Parameters
+    ----------
+    model : BlackBoxModel
+
+    Returns
+    -------
+    control.StateSpace or control.TransferFunction
+        A transfer function for transfer and polynomial models, a state space for state-space models.
+
+    Raises
+    ------
+    ModelError
+        If python-control is not installed, the model has no inputs, or a delay in continuous time.
+    """
+    control = _control()
+    _with_inputs(model)
+    dt = 0 if model.dt is None else model.dt
+    if isinstance(model, StateSpaceModel):
+        return control.ss(model.A, model.B, model.C, model.D, dt)
+    if isinstance(model, PolynomialModel):
+        pairs = [[_entry(p, i) for i in range(model.n_inputs)] for p in model.outputs]
+    else:
+        assert isinstance(model, TransferModel)
+        pairs = [[_delayed(model, o, i) for i in range(model.n_inputs)] for o in range(model.n_outputs)]
+    return control.tf([[n for n, _ in row] for row in pairs], [[d for _, d in row] for row in pairs], dt)
+
+
+def from_control(system: Any) -> BlackBoxModel:
+    """Read a system of python-control.
+
+    Returns with white output noise (K = 0).
+    """
+    control = _control()
+    if isinstance(system, control.StateSpace):
+        return _state_space(system.A, system.B, system.C, system.D, _sampling(system.dt))
+    if isinstance(system, control.TransferFunction):
+        num = tuple(tuple(_reduced(np.asarray(n)) for n in row) for row in _rows(system.num))
+        return _transfer(num, tuple(tuple(np.asarray(d) for d in r) for r in _rows(system.den)), _sampling(system.dt))
+    raise ModelError(f"a {type(system).__name__} is no system of python-control. Give a StateSpace or TransferFunction")
+
+
+def _control() -> Any:
+    try:
+        import control
+    except ImportError:
+        raise ModelError("python-control is not installed. Install ambid[control]") from None
+    return control
+
+
+def _rows(table: Any) -> list[list[Any]]:
+    """Entries by output, then input, from lists or object arrays."""
+    return [list(row) for row in table]
+
+
+def _with_inputs(model: BlackBoxModel) -> None:
+    if not model.n_inputs:
+        raise ModelError("a time series has no transfer function from inputs. Use its state_space() with the gain K")
+
+
+def _sampling(dt: Any) -> float | None:
+    if dt is None or dt == 0:
+        return None
+    if dt is True or not float(dt) > 0:
+        raise ModelError(f"the system is discrete with sampling interval {dt}; seconds are wanted. Set its dt")
+    return float(dt)
+
+
+def _state_space(A: Any, B: Any, C: Any, D: Any, dt: float | None) -> StateSpaceModel:
+    A, C = np.atleast_2d(A), np.atleast_2d(C)
+    return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], C.shape[0])), dt=dt)
+
+
+def _transfer(num: Any, den: Any, dt: float | None) -> TransferModel:
+    monic = [
+        [(np.asarray(n) / d[0], np.asarray(d) / d[0]) for n, d in zip(*r, strict=True)]
+        for r in zip(num, den, strict=True)
+    ]
+    return TransferModel(
+        num=tuple(tuple(n for n, _ in row) for row in monic),
+        den=tuple(tuple(d for _, d in row) for row in monic),
+        dt=dt,
+    )
+
+
+def _reduced(num: Array) -> Array:
+    """Take leading zeros off."""
+    used = np.nonzero(num)[0]
+    return np.asarray(num[used[0] :] if used.size else num[-1:])
+
+
+def _num_den(model: BlackBoxModel) -> tuple[Array, Array]:
+    if isinstance(model, PolynomialModel):
+        return _entry(model.outputs[0], 0)
+    assert isinstance(model, TransferModel)
+    return _delayed(model, 0, 0)
+
+
+def _entry(p: Polynomials, i: int) -> tuple[Array, Array]:
+    """B/(A F) of one input with powers of z, highest first."""
+    den = np.convolve(p.A, p.F[i])
+    size = max(den.size, p.B[i].size)
+    return _reduced(np.pad(p.B[i], (0, size - p.B[i].size))), np.pad(den, (0, size - den.size))
+
+
+def _delayed(model: TransferModel, o: int, i: int) -> tuple[Array, Array]:
+    later = 0
+    if model.delay[i]:
+        if model.dt is None:
+            raise ModelError(
+                f"the continuous model has a delay of {model.delay[i]:g} s, which has no place in a rational transfer "
+                "function. Set the delay apart, or use a discrete structure"
+            )
+        later = round(model.delay[i] / model.dt)
+    return model.num[o][i], np.concatenate([model.den[o][i], np.zeros(later)])

@@ -1,0 +1,208 @@
+"""Inputs and outputs of one record, as a black-box estimator takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.record import Record
+
+_LARGEST = 1e60  # squares of ratios of channels have to stay inside the range of floating-point numbers
+_SMALLEST = 1e-60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IOData:
+    """Inputs, outputs and, for methods that want it, the reference of a loop.
+
+    Attributes
+    ----------
+    u : ndarray, shape (n_samples, n_inputs), SI
+        No columns for a time series.
+    y : ndarray, shape (n_samples, n_outputs), SI
+    dt : float, s
+    inputs, outputs : tuple of str
+        Names of the columns.
+    units : Mapping[str, str]
+        SI unit by name.
+    open_loop : bool
+        Whether the user says that no feedback was at work. False means "not told so".
+    reference : ndarray, shape (n_samples, n_references), SI
+        Outer excitation of the loop, independent of the noise; no columns where there is none.
+    references : tuple of str
+    record : Mapping[str, object]
+        ``samples``, ``rate_hz``, ``sha256``, ``file`` of the record.
+    """
+
+    u: Array
+    y: Array
+    dt: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    open_loop: bool = False
+    reference: Array = field(default_factory=lambda: np.empty((0, 0)))
+    references: tuple[str, ...] = ()
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.dt) and self.dt > 0):
+            raise EstimationError(f"the sampling interval is {self.dt} s; it must be positive. Correct the rate")
+        if not self.outputs or np.ndim(self.y) != 2 or np.shape(self.y)[0] < 1:
+            raise EstimationError(
+                "no output samples; a model needs at least one output. Name one, shape (n_samples, 1)"
+            )
+        n = int(np.shape(self.y)[0])
+        for attribute, what, names in (
+            ("u", "input", self.inputs),
+            ("y", "output", self.outputs),
+            ("reference", "reference", self.references),
+        ):
+            values = _columns(getattr(self, attribute), what, names, n)
+            object.__setattr__(self, attribute, values)
+        names = (*self.inputs, *self.outputs, *self.references)
+        twice = sorted({x for x in names if names.count(x) > 1})
+        if twice:
+            raise EstimationError(
+                f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ. Leave one out"
+            )
+        _no_copies(np.hstack([self.u, self.y]), (*self.inputs, *self.outputs))
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples."""
+        return int(self.y.shape[0])
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs, 0 for a time series."""
+        return len(self.inputs)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    def part(self, first: int, last: int) -> IOData:
+        """Return samples `first` to `last` (not included).
+
+        Parameters
+        ----------
+        first, last : int
+
+        Returns
+        -------
+        IOData
+
+        Raises
+        ------
+        EstimationError
+            If the part is empty or outside the record.
+        """
+        if not 0 <= first < last <= self.n_samples:
+            raise EstimationError(f"samples {first} to {last} of a record of {self.n_samples}; give a part inside it")
+        return IOData(
+            u=self.u[first:last],
+            y=self.y[first:last],
+            dt=self.dt,
+            inputs=self.inputs,
+            outputs=self.outputs,
+            units=self.units,
+            open_loop=self.open_loop,
+            reference=self.reference[first:last],
+            references=self.references,
+            record=self.record,
+        )
+
+
+def io_data(
+    record: Record,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    references: Sequence[str] = (),
+    open_loop: bool = False,
+) -> IOData:
+    """Take inputs and outputs out of a record.
+
+    `inputs`, `outputs`: channel names; no inputs for a time series; `references`: channels of the loop's outer
+    excitation; `open_loop`: say that no feedback was at work.
+    """
+    if not outputs:
+        raise EstimationError("no output is named; a model needs at least one. Give --output COLUMN")
+    n = record.n_samples
+
+    def columns(names: Sequence[str]) -> Array:
+        return np.stack([record[x] for x in names], axis=1) if names else np.empty((n, 0))
+
+    return IOData(
+        u=columns(inputs),
+        y=columns(outputs),
+        dt=1.0 / record.rate_hz,
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        units={x: record.channel(x).unit for x in (*inputs, *outputs, *references)},
+        open_loop=open_loop,
+        reference=columns(references),
+        references=tuple(references),
+        record={
+            "samples": n,
+            "rate_hz": record.rate_hz,
+            "sha256": record.provenance.get("sha256"),
+            "file": record.provenance.get("file"),
+            "history": [str(step) for step in record.history],
+        },
+    )
+
+
+def _columns(values: Array, what: str, names: tuple[str, ...], n: int) -> Array:
+    """Check one group of channels and return it as read-only (n, n_channels)."""
+    array = np.array(values, dtype=np.float64, order="C")
+    if not names and not array.size:
+        return np.empty((n, 0))
+    if array.shape != (n, len(names)):
+        raise EstimationError(
+            f"the {what}s have shape {array.shape} for {len(names)} name(s) and {n} samples of the outputs; "
+            "they must be (n_samples, n_channels), time along axis 0. Pass one column for each name"
+        )
+    if not np.all(np.isfinite(array)):
+        row, column = (int(i[0]) for i in np.nonzero(~np.isfinite(array)))
+        raise EstimationError(
+            f"{what} {names[column]!r} is not finite at sample {row}; every value must be a number. "
+            "Cut the part out, or replace it (signals.replace_samples)"
+        )
+    _check_size(array, what, names)
+    array.flags.writeable = False
+    return array
+
+
+def _no_copies(values: Array, names: tuple[str, ...]) -> None:
+    """Refuse two inputs or outputs that hold the same numbers: no method can say which of them does what.
+
+    Channels that stand still are left to the estimators, which say so.
+    """
+    for i in range(values.shape[1]):
+        for k in range(i):
+            if np.array_equal(values[:, i], values[:, k]) and np.ptp(values[:, i]) > 0:
+                raise EstimationError(
+                    f"channels {names[k]!r} and {names[i]!r} hold the same numbers; a model cannot tell them apart. "
+                    "Leave one out"
+                )
+
+
+def _check_size(array: Array, what: str, names: tuple[str, ...]) -> None:
+    """Refuse values whose squares leave the range of floating-point numbers; a channel that stands still may pass."""
+    for name, column in zip(names, array.T, strict=True):
+        low, high = float(column.min()), float(column.max())
+        peak, span = max(-low, high), high / 2 - low / 2
+        if peak > _LARGEST or 0.0 < span < _SMALLEST:
+            size = f"reaches {peak:.3g}" if peak > _LARGEST else f"moves by only {2 * span:.3g}"
+            raise EstimationError(
+                f"{what} {name!r} {size} in SI units; {_SMALLEST:g} to {_LARGEST:g} can be computed with. "
+                "Check its unit, or scale it"
+            )

@@ -1,0 +1,239 @@
+"""Matrices of transfer functions num/den, continuous (in s) or discrete (in z), highest power first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.roots import roots_at
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.errors import ModelError
+
+Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TransferModel:
+    """G[o][i] = num[o][i] / den[o][i] * exp(-s delay[i]), output noise white (H = I).
+
+    Attributes
+    ----------
+    num, den : tuple of tuple of ndarray, shape (degree + 1,) each
+        By output, then input; highest power first, den monic.
+    dt : float or None
+        Sampling interval in s; None for continuous time.
+    delay : tuple of float, s
+        One for each input (whole samples times dt for a discrete model).
+    delay_estimated : bool
+        Whether the delays are real numbers that were estimated: `theta` then ends with them, so that what is open about
+        them goes into every spread.
+    """
+
+    num: tuple[tuple[Array, ...], ...]
+    den: tuple[tuple[Array, ...], ...]
+    dt: float | None
+    delay: tuple[float, ...] = ()
+    delay_estimated: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("num", "den"):
+            rows = tuple(
+                tuple(np.atleast_1d(np.array(p, dtype=np.float64)) for p in row) for row in getattr(self, name)
+            )
+            object.__setattr__(self, name, rows)
+        if not self.delay:
+            object.__setattr__(self, "delay", (0.0,) * len(self.num[0]))
+        shapes = {len(row) for row in (*self.num, *self.den)}
+        if shapes != {len(self.delay)} or len(self.num) != len(self.den):
+            raise ModelError("num, den and delay of a transfer function do not have the same inputs and outputs")
+        for n, d in ((n, d) for rn, rd in zip(self.num, self.den, strict=True) for n, d in zip(rn, rd, strict=True)):
+            if d[0] != 1.0 or n.size > d.size:
+                raise ModelError(f"a transfer function {n}/{d}; its denominator must be monic and of no lower degree")
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.delay)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.num)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, ``delay[i]``, as in `theta`."""
+        variable = "s" if self.dt is None else "z"
+        coefficients = tuple(
+            f"{which}[{o},{i}]{variable}{p.size - 1 - k}" for o, i, which, p, _ in self.parts() for k in range(p.size)
+        )
+        return coefficients + tuple(f"delay[{i}]" for i in range(self.n_inputs) if self.delay_estimated)
+
+    @property
+    def theta(self) -> Array:
+        """All coefficients, leading ones included, and estimated delays in s, as in `names`, shape (n_theta,)."""
+        return np.concatenate([*(p for _, _, _, p, _ in self.parts()), self.delay if self.delay_estimated else ()])
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
+        s, lag = self._points(omega)
+        g = np.empty((omega.size, self.n_outputs, self.n_inputs), dtype=np.complex128)
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
+        return g
+
+    def noise_response(self, omega: Array) -> Complex:
+        """Return the identity.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
+        return np.broadcast_to(np.eye(self.n_outputs, dtype=np.complex128), (omega.size,) + (self.n_outputs,) * 2)
+
+    def frequency_response_derivative(self, omega: Array) -> Complex:
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
+        s, lag = self._points(omega)
+        out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
+        for o, i, which, p, place in self.parts():
+            powers = s[:, None] ** np.arange(p.size - 1, -1, -1)
+            den = np.polyval(self.den[o][i], s)
+            factor = lag[:, i] / den if which == "num" else -lag[:, i] * np.polyval(self.num[o][i], s) / den**2
+            out[:, o, i, place] = powers * factor[:, None]
+        if self.delay_estimated:
+            g, first = self.frequency_response(omega), self.theta.size - self.n_inputs
+            for i in range(self.n_inputs):
+                out[:, :, i, first + i] = -1j * omega[:, None] * g[:, :, i]
+        return out
+
+    def poles(self) -> Complex:
+        """Return the roots of every denominator.
+
+        Returns
+        -------
+        ndarray, shape (n_poles,), complex
+        """
+        return self._roots("den")[0]
+
+    def pole_derivative(self) -> Complex:
+        """Return the derivative of `poles` by `theta`.
+
+        Returns
+        -------
+        ndarray, shape (n_poles, n_theta), complex
+        """
+        return self._roots("den")[1]
+
+    def zeros(self) -> Complex:
+        """Return the roots of every numerator.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros,), complex
+        """
+        return self._roots("num")[0]
+
+    def zero_derivative(self) -> Complex:
+        """Return the derivative of `zeros` by `theta`.
+
+        Returns
+        -------
+        ndarray, shape (n_zeros, n_theta), complex
+        """
+        return self._roots("num")[1]
+
+    def plant(self) -> StateSpaceModel:
+        """Return G as a state space.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+
+        Raises
+        ------
+        ModelError
+            As `state_space`.
+        """
+        return self.state_space()
+
+    def state_space(self) -> StateSpaceModel:
+        """Return an innovations form with K = 0; delays of a discrete model become states.
+
+        Returns
+        -------
+        StateSpaceModel
+
+        Raises
+        ------
+        ModelError
+            If a continuous model has a delay, which no finite state holds.
+        """
+        from scipy.linalg import block_diag
+        from scipy.signal import tf2ss
+
+        if self.dt is None and any(self.delay):
+            raise ModelError("a continuous model with a delay has no state space. Set the delay apart, or discretise")
+        blocks, n_u, n_y = [], self.n_inputs, self.n_outputs
+        D = np.zeros((n_y, n_u))
+        for o, i in np.ndindex(n_y, n_u):
+            later = 0 if self.dt is None else round(self.delay[i] / self.dt)
+            num, den = self.num[o][i], np.concatenate([self.den[o][i], np.zeros(later)])
+            if den.size == 1:
+                D[o, i] = num[0]
+                continue
+            used = int(np.nonzero(num)[0][0]) if np.any(num) else num.size - 1
+            a, b, c, d = tf2ss(num[used:], den)
+            D[o, i] = d[0, 0]
+            wide_b, wide_c = np.zeros((a.shape[0], n_u)), np.zeros((n_y, a.shape[0]))
+            wide_b[:, i], wide_c[o] = b[:, 0], c[0]
+            blocks.append((a, wide_b, wide_c))
+        A = block_diag(*[b[0] for b in blocks]) if blocks else np.zeros((0, 0))
+        B = np.vstack([np.zeros((0, n_u)), *[b[1] for b in blocks]])
+        C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
+        return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
+
+    def parts(self) -> Iterator[tuple[int, int, str, Array, slice]]:
+        """Yield (output, input, "num" or "den", coefficients, place in `theta`)."""
+        first = 0
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            for which, p in (("num", self.num[o][i]), ("den", self.den[o][i])):
+                yield o, i, which, p, slice(first, first + p.size)
+                first += p.size
+
+    def _points(self, omega: Array) -> tuple[Complex, Complex]:
+        s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
+        return np.asarray(s, dtype=np.complex128), np.asarray(np.exp(-1j * np.outer(omega, self.delay)))
+
+    def _roots(self, wanted: str) -> tuple[Complex, Complex]:
+        theta = self.theta
+        found = [roots_at(theta, place) for _, _, which, _, place in self.parts() if which == wanted]
+        if not found:
+            return np.empty(0, dtype=np.complex128), np.zeros((0, theta.size), dtype=np.complex128)
+        return np.concatenate([r for r, _ in found]), np.vstack([d for _, d in found])

@@ -1,0 +1,137 @@
+"""Global search by differential evolution (Storn and Price 1997), a start for fits whose ordinary starts fail.
+
+Numbers are searched for between bounds, scaled to 0 .. 1; SciPy's `differential_evolution` does it, strategy best1bin
+with dithered mutation, from a Sobol sequence. A generation is drawn as a whole before it is evaluated, so that the
+result hangs on the seed alone and not on the number of workers. Local refinement is the caller's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.progress import Tick, silent
+
+STAGE = "global search"
+_MUTATION = (0.5, 1.0)  # factor of the difference vectors, drawn anew for each generation
+_RECOMBINATION = 0.9  # numbers of a physical model hang together: most of them change at once
+_MEMBERS = 8  # of the population, for each number
+_FEWEST = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GlobalFound:
+    """Where a global search ended."""
+
+    vector: Array  # (n,), with the least cost that was seen
+    cost: float  # infinite where no vector has a finite one
+    evaluations: int
+    seconds: float
+    # (n,), members of the last generation, best first: where refinement may begin, as several may lie in different
+    # minima
+    best: tuple[Array, ...]
+
+
+def global_search(
+    cost: Callable[[Array], float],
+    low: Array,
+    high: Array,
+    *,
+    seed: int | Sequence[int],
+    evaluations: int,
+    starts: Sequence[Array] = (),
+    workers: int = 1,
+    tolerance: float = 1e-3,
+    tick: Tick = silent,
+    stage: str = STAGE,
+    keep: Callable[[Array, float], None] | None = None,
+) -> GlobalFound:
+    """Search for the least cost between bounds.
+
+    `low`, `high`: (n,), finite, low below high. Scale what spans decades before (logarithm, inverse hyperbolic sine);
+    `seed`: equal seeds give equal results, with any number of workers; `evaluations`: of `cost`, at most; `starts`:
+    (n,), vectors of the first generation; moved to the bounds where they lie outside; `workers`: threads: they help
+    where `cost` leaves Python's lock (compiled loops, linear algebra).
+    """
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    if low.shape != high.shape or not np.all(np.isfinite(low) & np.isfinite(high)) or not np.all(low < high):
+        raise ValueError("bounds of a global search must be finite, and each lower one below its upper one")
+    began = perf_counter()
+    run = _Run(cost=cost, low=low, span=high - low, budget=evaluations, tick=tick, stage=stage, keep=keep)
+    first = _first_generation(low.size, evaluations, seed, [(np.asarray(s) - low) / (high - low) for s in starts])
+    if workers > 1:
+        with ThreadPoolExecutor(workers) as pool:
+            last = _evolved(run, first, seed, tolerance, pool.map)
+    else:
+        last = _evolved(run, first, seed, tolerance, map)
+    return GlobalFound(
+        vector=run.vector,
+        cost=run.least,
+        evaluations=run.done,
+        seconds=perf_counter() - began,
+        best=tuple(low + z * (high - low) for z in last),
+    )
+
+
+class _Run:
+    """What a search has seen so far; written by one thread, in the order of the members."""
+
+    def __init__(
+        self, *, cost: Callable[[Array], float], low: Array, span: Array, budget: int, tick: Tick, stage: str,
+        keep: Callable[[Array, float], None] | None,
+    ) -> None:  # fmt: skip
+        self.cost, self.low, self.span, self.budget = cost, low, span, budget
+        self.tick, self.stage, self.keep = tick, stage, keep
+        self.done, self.least, self.vector = 0, np.inf, low + 0.5 * span
+
+    def value(self, z: Array) -> float:
+        found = float(self.cost(self.low + z * self.span))
+        return found if np.isfinite(found) else np.inf
+
+    def told(self, members: Iterable[Array], values: Iterable[float]) -> Iterator[float]:
+        for z, value in zip(members, values, strict=True):
+            self.done += 1
+            if value < self.least:
+                self.least, self.vector = value, self.low + np.asarray(z) * self.span
+                if self.keep is not None:
+                    self.keep(self.vector, value)
+            self.tick(self.stage, min(self.done / self.budget, 1.0))
+            yield value
+
+
+def _first_generation(n: int, budget: int, seed: int | Sequence[int], starts: Sequence[Array]) -> Array:
+    """A Sobol sequence, some of it replaced by the starts given."""
+    from scipy.stats import qmc
+
+    size = max(_FEWEST, min(_MEMBERS * n, budget // 10))
+    power = int(np.ceil(np.log2(size)))
+    out = np.asarray(qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(power), dtype=np.float64)[:size]
+    for k, z in enumerate(starts[: size // 2]):
+        out[k] = np.clip(z, 0.0, 1.0)
+    return out
+
+
+def _evolved(
+    run: _Run, first: Array, seed: int | Sequence[int], tolerance: float, share: Callable[..., Iterable[Any]]
+) -> Array:
+    """Members of the last generation, best first."""
+    from scipy.optimize import differential_evolution
+
+    def evaluated(_: Callable[..., float], members: Iterable[Array]) -> list[float]:
+        whole = list(members)  # SciPy draws a whole generation before it asks for the first value
+        open_ = whole[: max(run.budget - run.done, 0)]
+        return [*run.told(open_, share(run.value, open_)), *[np.inf] * (len(whole) - len(open_))]
+
+    found = differential_evolution(
+        run.value, [(0.0, 1.0)] * first.shape[1], strategy="best1bin", init=first, mutation=_MUTATION,
+        recombination=_RECOMBINATION, maxiter=max(run.budget // first.shape[0] - 1, 1), tol=tolerance, polish=False,
+        updating="deferred", workers=evaluated, seed=np.random.default_rng(seed),
+    )  # fmt: skip
+    order = np.argsort(found.population_energies, kind="stable")
+    return np.asarray(found.population, dtype=np.float64)[order]

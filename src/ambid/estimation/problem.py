@@ -1,0 +1,131 @@
+"""What is estimated from what: data, model, and the layout of the vector of estimated numbers.
+
+The vector holds, in this order: free and prior physical parameters (over their magnitudes), the delay where it is
+estimated, the noise description (log levels, or the gain itself), constant disturbances (offsets), initial state.
+States, inputs and outputs are scaled to order one before anything is factorised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.physics.linear_model import LinearModel
+
+NoiseForm = Literal["levels", "gain", "given"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scales:
+    """Units in which the predictor works."""
+
+    state: Array  # (n_states,)
+    input: Array  # (n_inputs,)
+    output: Array  # (n_outputs,), about the sensor noise of each output
+    # (n_disturbances,), level at which a disturbance moves an output by about its noise within a few samples
+    disturbance: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictorProblem:
+    """Data, model and what is to be estimated."""
+
+    model: LinearModel
+    rate_hz: float
+    u: Array  # (n_samples, n_inputs), deviations from the operating point, SI
+    y: Array  # (n_samples, n_outputs), deviations from the operating point, SI
+    estimated: tuple[str, ...]  # physical parameters in the vector
+    known: Mapping[str, float]  # the others, SI
+    magnitude: Array  # (n_estimated,), scale of each estimated physical parameter, SI
+    prior_mean: Array  # (n_estimated,), SI, standard deviation infinite where there is no prior
+    prior_sd: Array
+    scales: Scales
+    delay: int = 0  # whole samples of delay on all inputs
+    lag: float = 0.0  # fraction of a sample of delay on top, 0 <= lag < 1, where it is not estimated
+    # whether the delay is estimated as a real number near `delay`: delay - 1 < total < delay + 2
+    fractional: bool = False
+    # samples left out at the start, so that fits with different delays see the same data; at least ``delay + 2``
+    skip: int = 2
+    # the predictor sees every stride-th output (all inputs act); more than 1 only with noise "gain" or "given"
+    stride: int = 1
+    # noise as disturbance and sensor levels through the Riccati equation, as a free predictor gain, or as `gain`
+    noise: NoiseForm = "levels"
+    # (n_noise,), centre of the weak prior on the log noise levels
+    noise_center: Array = field(default_factory=lambda: np.zeros(0))
+    # (n_states, n_outputs), predictor gain in scaled units, for noise "given"
+    gain: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        if self.skip < self.delay + 2 or self.y.shape[0] <= self.skip:
+            raise ValueError(f"skip {self.skip} must exceed the delay {self.delay} by two and leave samples")
+        if self.stride > 1 and self.noise == "levels":
+            raise ValueError("a stride above 1 wants the noise as a gain")
+
+    @property
+    def n_physical(self) -> int:
+        """Number of estimated physical parameters."""
+        return len(self.estimated)
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Places of the groups in the vector."""
+        n, n_y, n_d = len(self.model.states), len(self.model.outputs), len(self.model.disturbances)
+        sizes = {
+            "physical": self.n_physical,
+            "fraction": int(self.fractional),
+            "noise": {"levels": n_d + n_y - 1, "gain": n * n_y, "given": 0}[self.noise],
+            "offset": n_d,
+            "initial": n,
+        }
+        edges = [0]
+        for size in sizes.values():
+            edges.append(edges[-1] + size)
+        return {name: slice(a, b) for name, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)}
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return int(self.slices["initial"].stop)
+
+    @property
+    def taps(self) -> tuple[int, ...]:
+        """Lags beyond `delay`, in samples, at which the input acts over one sample."""
+        if self.fractional:
+            return (-1, 0, 1, 2)
+        return (0, 1) if self.lag else (0,)
+
+    @property
+    def lags(self) -> tuple[int, ...]:
+        """Lags beyond `delay` at which the input enters one step of the recursion, which is `stride` samples long."""
+        return tuple(range(self.taps[0] - (self.stride - 1), self.taps[-1] + 1))
+
+    @property
+    def n_used(self) -> int:
+        """Samples of each output that enter the fit."""
+        return int(-(-(self.y.shape[0] - self.skip) // self.stride))
+
+    def parameters(self, vector: Array) -> dict[str, float]:
+        """Return all physical parameters in SI at `vector`.
+
+        `vector`: (size,).
+        """
+        values = vector[self.slices["physical"]] * self.magnitude
+        return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
+
+    def lag_at(self, vector: Array) -> float:
+        """Return the delay in samples beyond `delay` at a vector.
+
+        `vector`: (size,).
+        """
+        return float(vector[self.slices["fraction"]][0]) if self.fractional else self.lag
+
+    def delay_samples(self, vector: Array) -> float:
+        """Return the whole delay in samples at a vector.
+
+        `vector`: (size,).
+        """
+        return self.delay + self.lag_at(vector)

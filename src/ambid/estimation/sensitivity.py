@@ -1,0 +1,195 @@
+"""Innovations of a record and their exact Jacobian, compressed by QR block after block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.predictor import assemble
+from ambid.estimation.problem import PredictorProblem
+
+_BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
+_QR_ROWS = 256  # rows of one small QR: below the size at which the linear algebra library starts threads
+
+
+class Workspace:
+    """What repeated evaluations of one problem share: scaled data, and the last gain to start the next Riccati
+    solve.
+
+    `y`: (n_used, n_outputs), scaled outputs; `w`: (n_used, n_states + n_lags n_inputs + n_outputs + 1), room for the
+    states of the predictor, and what drives it: inputs at the problem's lags, y, 1; `z`: (n_used, n_lags n_inputs +
+    n_outputs + 1), what drives the predictor, a view of `w`.
+    """
+
+    def __init__(self, problem: PredictorProblem) -> None:
+        n_samples, d = problem.y.shape[0], problem.delay
+        at = np.arange(problem.skip, n_samples, problem.stride)
+        self.y = np.ascontiguousarray(problem.y[at] / problem.scales.output)
+        # inputs after the last sample do not exist; they would act only after the last output
+        u = problem.u / problem.scales.input
+        lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
+        n = len(problem.model.states)
+        self.w = np.hstack([np.zeros((at.size, n)), *lagged, self.y, np.ones((at.size, 1))])
+        self.z = self.w[:, n:]
+        self.gain: Array | None = None
+        self._weight, self._weighted = np.zeros((0, 0)), self.y
+        self._buffers: tuple[Array, ...] = ()
+
+    def buffers(self, *shapes: tuple[int, ...]) -> tuple[Array, ...]:
+        """Return scratch arrays, the same ones as long as the shapes stay the same: fresh pages cost more than sums.
+
+        Returns not initialised.
+        """
+        if tuple(b.shape for b in self._buffers) != shapes:
+            self._buffers = tuple(_aligned(shape) for shape in shapes)
+        return self._buffers
+
+    def weighted(self, weight: Array) -> Array:
+        """Return the outputs times a weight, kept while the weight stays the same.
+
+        `weight`: (n_outputs, n_outputs). Returns (n_used, n_outputs).
+        """
+        if not np.array_equal(weight, self._weight):
+            self._weight, self._weighted = weight.copy(), self.y @ weight.T
+        return self._weighted
+
+
+def _aligned(shape: tuple[int, ...]) -> Array:
+    """Return an array that begins where a cache line does: vector instructions want that."""
+    size = int(np.prod(shape))
+    raw = np.empty(size + 8)
+    first = -(raw.ctypes.data // 8) % 8
+    return raw[first : first + size].reshape(shape)
+
+
+def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> Array | None:
+    """Return the innovations in scaled output units.
+
+    `vector`: (size,); `work`: of this problem, to save making it again. Returns (n_used, n_outputs), or None where
+    there is no predictor at `vector`.
+    """
+    from ambid.estimation.kernels import state_scan
+
+    work = work or Workspace(problem)
+    predictor = assemble(problem, vector, near=work.gain, with_derivatives=False)
+    if predictor is None:
+        return None
+    work.gain = predictor.gain
+    state_scan(predictor.M, work.w, predictor.x0.copy())
+    e = work.y - work.w[:, : predictor.x0.size] @ predictor.C.T
+    return e if np.all(np.isfinite(e[-1])) else None
+
+
+def run(M: Array, z: Array, x0: Array) -> Array:
+    """Run the recursion x+ = M [x; z].
+
+    `M`: (n, n + n_z); `z`: (n_samples, n_z); `x0`: (n,). Returns (n_samples + 1, n), states before each sample, and
+    after the last.
+    """
+    from ambid.estimation.kernels import state_scan
+
+    n = x0.size
+    w, x = np.empty((z.shape[0], n + z.shape[1])), x0.copy()
+    w[:, n:] = z
+    state_scan(M, w, x)
+    return np.vstack([w[:, :n], x])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Linearisation:
+    """Weighted innovations and Jacobian at one vector, compressed by QR."""
+
+    r: Array  # (size + 1,)
+    # (size + 1, size), same norm, gradient and singular values as the full residual and Jacobian: they differ by an
+    # orthogonal matrix
+    J: Array
+    covariance: Array  # (n_outputs, n_outputs), mean of e e^T, scaled output units
+
+
+def linearise(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace | None = None
+) -> Linearisation | None:
+    """Return the compressed weighted residual and its exact Jacobian.
+
+    `vector`: (size,); `weight`: (n_outputs, n_outputs), lower triangular W with W^T W the inverse innovation covariance
+    (scaled); `work`: of this problem.
+    """
+    work = work or Workspace(problem)
+    p, moment = problem.size, np.zeros_like(weight)
+    blocks = []
+    for rows in residual_blocks(problem, vector, weight, work):
+        e = rows[:, :, p]
+        moment += e.T @ e
+        blocks.append(reduce_rows(rows.reshape(-1, p + 1)))
+    if not blocks or not np.all(np.isfinite(moment)):
+        return None
+    back = np.linalg.inv(weight)
+    reduced = reduce_rows(np.vstack(blocks), last=True)
+    full = np.zeros((p + 1, p + 1))
+    full[: reduced.shape[0]] = reduced
+    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=back @ moment @ back.T / problem.n_used)
+
+
+def reduce_rows(rows: Array, *, last: bool = False) -> Array:
+    """Replace rows by fewer that differ by an orthogonal matrix (QR of short stacks).
+
+    `rows`: (n_rows, n_columns); `last`: reduce to at most n_columns rows, instead of that many for each stack. Returns
+    (fewer, n_columns).
+    """
+    if last:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+    whole = rows.shape[0] // _QR_ROWS * _QR_ROWS
+    if not whole:
+        return rows.copy()
+    factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, _QR_ROWS, rows.shape[1]), mode="r"))
+    return np.vstack([factors.reshape(-1, rows.shape[1]), rows[whole:]])
+
+
+def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, work: Workspace) -> Iterator[Array]:
+    """Yield rows [W de/dq, W e] block after block, so that memory does not grow with the record.
+
+    `vector`: (size,); `weight`: (n_outputs, n_outputs). Returns (block, n_outputs, size + 1), a view, overwritten by
+    the next block. Nothing is yielded where there is no predictor at `vector`.
+    """
+    from ambid.estimation.kernels import sensitivity_scan, state_scan
+
+    predictor = assemble(problem, vector, near=work.gain)
+    if predictor is None:
+        return
+    work.gain = predictor.gain
+    n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
+    # a state basis whose first states are the weighted predicted outputs with their sign turned: weighted innovations
+    # are then W y plus a state, and sensitivities of innovations are read off, not multiplied
+    whitened = weight @ predictor.C
+    basis = -np.vstack([whitened, null_space(whitened)])
+    turned = np.linalg.inv(basis)
+    M = basis @ predictor.M
+    M[:, :n] = M[:, :n] @ turned
+    # vector instructions take eight numbers at a time, and pay from sixteen on: columns of zeros fill up to that
+    width, length = max(16, -(-(p + 1) // 8) * 8), min(_BLOCK, n_used)
+    forcing = np.zeros((n, M.shape[1], width))
+    forcing[:, :, :p] = np.tensordot(basis, predictor.dM, axes=1)
+    forcing[:, :n] = turned.T @ forcing[:, :n]
+    rows, s = work.buffers((n, length, width), (n, width))
+    s[:], x = 0.0, basis @ predictor.x0
+    s[:, problem.slices["initial"]] = basis
+    F, outputs = np.ascontiguousarray(M[:, :n]), work.weighted(weight)
+    for a in range(0, n_used, _BLOCK):
+        part = work.w[a : a + _BLOCK]
+        block = rows[:, : part.shape[0]]
+        state_scan(M, part, x)
+        np.matmul(part, forcing, out=block)
+        sensitivity_scan(F, part, outputs[a : a + _BLOCK], s, block, p)
+        yield block[:n_y, :, : p + 1].swapaxes(0, 1)
+
+
+def null_space(a: Array) -> Array:
+    """Return orthonormal rows that complete the row space of a full-rank wide matrix.
+
+    `a`: (r, n), r <= n. Returns (n - r, n).
+    """
+    q, _ = np.linalg.qr(a.T, mode="complete")
+    return np.ascontiguousarray(q[:, a.shape[0] :].T)

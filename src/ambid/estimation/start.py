@@ -1,0 +1,112 @@
+"""Start values found without the user's help: weak-form regression over frequency bands.
+
+Each equation of motion is integrated against Fourier modulating functions (`ambid.estimation.modulating`;
+theory.md sec. 2.7, thesis eq. 3.8), so that no measured signal is differentiated. Each band gives a candidate; the
+likelihood chooses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.estimation.modulating import Moments, moments
+
+__all__ = ["Moments", "candidates", "moments", "regress"]
+
+Spectrum = NDArray[np.complexfloating]
+
+# upper band edges as fractions of the Nyquist frequency: wide bands want the errors-in-variables regression (sensor
+# noise dominates up there), narrow ones plain least squares (disturbances dominate, and few lines are left)
+_BANDS = (
+    (0.6, True),
+    (0.3, True),
+    (0.15, True),
+    (0.06, True),
+    (0.15, False),
+    (0.06, False),
+    (0.025, False),
+    (0.01, False),
+)
+_LOWEST_LINE = 3  # the window's main lobe: lines below see the constant
+
+
+def candidates(
+    model_name: str,
+    m: Moments,
+    noise: Mapping[str, float],
+    delay_samples: float,
+    rate_hz: float,
+    known: Mapping[str, float],
+) -> Iterator[dict[str, float]]:
+    """Yield start values for the named model, one set for each band.
+
+    `model_name`: ``"one-axis"``, ``"coil"`` or ``"rotor"``; `delay_samples`: delay of the input; `known`: fixed values,
+    SI; they are used, and returned unchanged. Returns all parameters of the model, SI.
+    """
+    for part, errors_in_variables in _BANDS:
+        lines = slice(_LOWEST_LINE, int(part * m.omega.size))
+        omega = m.omega[lines]
+        if omega.size < 8:
+            continue
+        jw, corner = 1j * omega, omega[-1] / 3
+        s = {role: tuple(v[lines] for v in values) for role, values in m.signals.items()}
+        lag = np.exp(-jw * delay_samples / rate_hz)
+        level = noise if errors_in_variables else {}
+        found: dict[str, float] = dict(known)
+        if model_name in ("one-axis", "coil"):
+            i0, i1, _ = s["current"]
+            terms = [("", 0 * jw, s["voltage"][0] * lag), ("current", 1 + 0 * jw, i0), ("current", jw, i1)]
+            if model_name == "one-axis":
+                terms.append(("position", jw, s["position"][1]))
+            r, ell, *k = regress(terms, 1.0 / np.abs(jw + corner), level)
+            found = {"R": r, "L": ell, **({"k_i": k[0]} if k else {}), **known}
+        if model_name in ("one-axis", "rotor"):
+            x0, x1, x2 = s["position"]
+            damping = known.get("c", 0.0)
+            rate = damping / found.get("m", np.inf) if damping else 0.0
+            force = s["current"][0] * (lag if model_name == "rotor" else 1.0)
+            terms = [
+                ("position", jw**2 + rate * jw, x2 + rate * x1),
+                ("position", -1 + 0 * jw, -x0),
+                ("current", 1 + 0 * jw, force),
+            ]
+            stiffness, current = regress(terms, 1.0 / np.abs(jw + corner) ** 2, level)
+            if "m" not in known:  # its sign may come out wrong where the motional voltage is lost in the noise
+                found["m"] = abs(found["k_i"] / current) if "k_i" in found and current != 0 else 1.0
+            found = {**found, "k_x": stiffness * found["m"], "k_i": current * found["m"], "c": damping, **known}
+        yield {name: float(value) for name, value in found.items()}
+
+
+def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: Mapping[str, float]) -> Array:
+    """Regress the first term on the others, over complex lines with real coefficients.
+
+    With noise levels given, generalised total least squares: the combination of terms that is smallest against what the
+    noise alone would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares by QR.
+
+    `weight`: (n_lines,); `noise`: role -> noise standard deviation; empty: ordinary least squares. Returns (n_terms -
+    1,), naN where the noise description cannot be used.
+    """
+    a = np.stack([t[2] for t in terms], axis=1) * weight[:, None]
+    a = np.vstack([a.real, a.imag])
+    norm = np.linalg.norm(a, axis=0)
+    norm[norm == 0] = 1.0
+    a = a / norm
+    if not noise:
+        found = np.linalg.lstsq(a[:, 1:], a[:, 0], rcond=None)[0]
+        return np.asarray(found / norm[1:] * norm[0], dtype=np.float64)
+    spread = np.full((len(terms), len(terms)), 0.0)
+    for role, sd in noise.items():
+        f = np.stack([t[1] * (t[0] == role) for t in terms], axis=1) * (weight * sd)[:, None] / norm
+        spread += (f.conj().T @ f).real
+    spread += 1e-12 * np.trace(spread) * np.eye(len(terms))
+    if not spread[0, 0] > 0:
+        return np.full(len(terms) - 1, np.nan)
+    # smallest generalised singular vector of a against the noise: exact columns get a tiny one
+    factor, short = np.linalg.cholesky(spread), np.asarray(np.linalg.qr(a, mode="r"))
+    _, _, vt = np.linalg.svd(np.linalg.solve(factor, short.T).T)
+    v = np.linalg.solve(factor.T, vt[-1]) / norm
+    return -v[1:] / v[0] if v[0] != 0 else np.full(len(terms) - 1, np.nan)

@@ -1,1 +1,0 @@
-"""What all black-box estimators share: data in, models, results, files."""

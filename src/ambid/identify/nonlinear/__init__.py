@@ -1,1 +1,0 @@
-"""Nonlinear black-box models: what they share; each family is a package or file of its own beside this one."""

@@ -1,0 +1,117 @@
+"""The result of every nonlinear estimator: model, covariance, fit, criteria, checks, warnings, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.estimate import Check, OutputFit
+from ambid.nonlinear.model import NonlinearModel
+
+Settings = Mapping[str, int | float | str | tuple[int, ...]]
+"""What a structure is told: lags, degrees, neurons, ..., by name; what is left out the method chooses and reports."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LearningCurve:
+    """How a training went."""
+
+    method: str  # what trained, e.g. ``"Levenberg-Marquardt"``.
+    seconds: Array  # (n_iterations,), s, since it began
+    # (n_iterations,), root mean square errors in multiples of the outputs' standard deviations; `held_out` is empty
+    # where nothing was
+    training: Array
+    held_out: Array = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NonlinearFit:
+    """An identified nonlinear model, file schema ``ambid.fit/1``.
+
+    Attributes
+    ----------
+    structure : str
+        Name in `ambid.nonlinear.structures`.
+    settings : Mapping[str, object]
+        As used, nothing left open.
+    model : NonlinearModel or None
+        None where `status` is ``failed``.
+    covariance : ndarray, shape (n_theta, n_theta) or None
+        Of ``model.theta``; zeros where a parameter was not estimated. None where the method has none to give.
+    covariance_from : str
+        How it came about: ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white),
+        ``"bootstrap"``; empty without.
+    n_estimated : int
+        Numbers that were estimated.
+    noise_covariance : ndarray, shape (n_outputs, n_outputs), SI
+        Of the one-step errors (of the simulation errors for a model that was fitted to those).
+    inputs, outputs : tuple of str
+        Channels.
+    units : Mapping[str, str]
+        SI unit by channel.
+    dt : float
+        s.
+    records : tuple of Mapping
+        ``samples``, ``rate_hz``, ``sha256``, ``file`` of each record that it was estimated from.
+    seed : int
+        Of everything random: equal seeds give equal results.
+    status : {"converged", "stalled", "failed"}
+        ``failed`` has its reason in `reason`, and no model.
+    reason : str
+        One line; empty unless failed.
+    curves : tuple of LearningCurve
+        Of each training that was done.
+    fit : Mapping[str, OutputFit]
+        By output, over all records.
+    criteria : Mapping[str, float]
+        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
+    checks : Mapping[str, Check]
+        Made by `ambid.validate.nonlinear`.
+    validation : Mapping[str, object] or None
+        By output, on a second record.
+    warnings : tuple of str
+        One line each.
+    timing_s : Mapping[str, float]
+        By stage.
+    details : Mapping[str, object]
+        Further results of the method as JSON-able values (terms with their error reduction ratios, chosen lags).
+    """
+
+    structure: str
+    settings: Mapping[str, object]
+    model: NonlinearModel | None
+    covariance: Array | None
+    n_estimated: int
+    noise_covariance: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    dt: float
+    records: tuple[Mapping[str, object], ...]
+    seed: int = 0
+    covariance_from: str = ""
+    status: Literal["converged", "stalled", "failed"] = "converged"
+    reason: str = ""
+    curves: tuple[LearningCurve, ...] = ()
+    fit: Mapping[str, OutputFit] = field(default_factory=lambda: MappingProxyType({}))
+    criteria: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
+    validation: Mapping[str, object] | None = None
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def sd(self) -> Array | None:
+        """Standard deviation of ``model.theta``, shape (n_theta,), or None."""
+        return None if self.covariance is None else np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the search converged and every check passed."""
+        return self.status == "converged" and all(c.passed for c in self.checks.values())

@@ -1,0 +1,78 @@
+"""Records in units of their typical size, so that results do not depend on the user's units.
+
+Levels are taken off only where a signal stands far from zero: they change what a polynomial's terms mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+
+_FAR = 2.0  # a mean of more than so many standard deviations makes powers of a signal alike
+_FEWEST = 10  # rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scaled:
+    """Outputs and inputs of all records as deviations from common levels, in common units."""
+
+    parts: tuple[tuple[Array, Array], ...]  # by record
+    y_level: Array  # (n_outputs,), SI
+    y_scale: Array
+    u_level: Array  # (n_inputs,), SI
+    u_scale: Array
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return int(self.y_level.size)
+
+
+def scaled_records(name: str, records: Sequence[IOData], *, lag: int, levels: str) -> Scaled:
+    """Check that records belong together and scale them.
+
+    `name`: of the structure, for messages; `lag`: samples of each record that are only past.
+    """
+    first = records[0]
+    for r, x in enumerate(records):
+        if (x.inputs, x.outputs) != (first.inputs, first.outputs):
+            raise EstimationError(
+                f"{name}: record {r + 1} has channels {x.inputs} and {x.outputs}, the first {first.inputs} and "
+                f"{first.outputs}; all must be of one bench. Name the same columns"
+            )
+        if abs(x.dt - first.dt) > 1e-6 * first.dt:
+            raise EstimationError(
+                f"{name}: record {r + 1} has {1 / x.dt:g} Hz, the first {1 / first.dt:g} Hz; one model has one rate. "
+                "Resample one of them"
+            )
+        if x.n_samples < lag + _FEWEST:
+            raise EstimationError(
+                f"{name}: record {r + 1} has {x.n_samples} samples; lags up to {lag} need {lag + _FEWEST}. "
+                "Give a longer record, or lower ny, nu, nk or ne"
+            )
+    y, y_level, y_scale = _group(name, [x.y for x in records], first.outputs, levels)
+    u, u_level, u_scale = _group(name, [x.u for x in records], first.inputs, levels)
+    return Scaled(
+        parts=tuple(zip(y, u, strict=True)), y_level=y_level, y_scale=y_scale, u_level=u_level, u_scale=u_scale
+    )
+
+
+def _group(name: str, values: list[Array], names: tuple[str, ...], levels: str) -> tuple[list[Array], Array, Array]:
+    whole = np.concatenate(values)
+    mean, sd = whole.mean(axis=0), whole.std(axis=0)
+    for k, channel in enumerate(names):
+        if not sd[k] > 1e-13 * max(abs(mean[k]), 1e-300):
+            raise EstimationError(
+                f"{name}: {channel!r} does not move (constant at {whole[0, k]:g}); nothing can be learnt from it. "
+                "Excite it, or leave it out"
+            )
+    far = np.abs(mean) > _FAR * sd if levels == "auto" else np.full(mean.shape, levels == "mean")
+    level = np.where(far, mean, 0.0)
+    scale = np.where(far, sd, np.hypot(mean, sd))
+    return [(x - level) / scale for x in values], level, scale

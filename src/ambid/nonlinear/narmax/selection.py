@@ -1,0 +1,246 @@
+"""Forward regression with orthogonal least squares (FROLS): which terms explain the output, in the order they do.
+
+Step by step that candidate is taken which, orthogonalised against those chosen before, has the largest error reduction
+ratio (Chen, Billings, Luo 1989; Billings 2013, sec. 3.2). One pass over the data makes the Gram matrix of candidates of
+unit length; steps then cost nothing beside. Where digits run short the candidates are made orthogonal to the chosen
+ones explicitly, by QR, and the Gram matrix anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import lgamma, log
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError, nearest
+from ambid.nonlinear.narmax.candidates import Candidates, MatrixCandidates
+
+CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
+_SHORT = 1e-6  # squared length left of a candidate below which its Gram matrix has too few digits to choose it
+_SPENT = 1e-10  # the same for the output
+_DEPENDENT = 1e-20  # squared length left, by QR, of a candidate that the chosen ones hold already
+_ROUNDING = 1e-14  # of an entry of the Gram matrix
+_EXACT = 1e-26  # part of the output's energy below which nothing is left to explain
+_MOST_PASSES = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Selection:
+    """Terms in the order in which they were chosen."""
+
+    # all that were looked at, places in the list of candidates; the first `n_best` of them are the choice
+    order: tuple[int, ...]
+    err: Array  # (n_order,), error reduction ratio: part of the output's energy that each adds to what is explained
+    left: Array  # (n_order + 1,), part of the energy that is not explained by the first 0, 1, ... terms.
+    criterion: Array  # (n_order + 1,), information criterion of the first 0, 1, ... terms.
+    n_best: int  # where it is least
+    passes: int  # how often the candidates were gone through
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """The choice, in the order of the error reduction ratios."""
+        return self.order[: self.n_best]
+
+
+def select_terms(
+    found: Candidates | MatrixCandidates,
+    y: Array,
+    *,
+    most: int,
+    criterion: str = "ebic",
+    first: Sequence[int] = (),
+    tick: Callable[[float], object] | None = None,
+) -> Selection:
+    """Choose terms by orthogonal least squares.
+
+    Parameters
+    ----------
+    found : Candidates or MatrixCandidates
+        The regressors.
+    y : ndarray, shape (n_rows,)
+        What they have to explain.
+    most : int
+        Look at so many terms at most.
+    criterion : {"ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc"}, optional
+        What ends the choice; ``ebic`` also pays for the number of candidates chosen from (Chen and Chen 2008).
+    first : sequence of int, optional
+        Candidates that are in the model in any case; they come first.
+    tick : callable, optional
+        Called now and then with a guess at the share that is over, 0 to 1.
+
+    Returns
+    -------
+    Selection
+
+    Raises
+    ------
+    EstimationError
+        If the criterion is not known.
+    """
+    penalty(criterion, 1, 10, 1)
+    state = _Gram(found, np.ascontiguousarray(y, dtype=np.float64), tick)
+    n, m = state.y.size, len(found.terms)
+    most = min(max(most, len(first)), m, n - 1)
+    err: list[float] = []
+    while len(state.order) < most and state.unexplained():
+        pick = state.winner(first[len(state.order)] if len(state.order) < len(first) else None)
+        if pick is None:
+            break
+        err.append(state.take(pick))
+    left = np.array([1.0, *state.path])
+    values = np.array([information(criterion, x, k, n, m) for k, x in enumerate(left)])
+    low = min(len(first), len(err))
+    return Selection(
+        order=tuple(state.order),
+        err=np.array(err),
+        left=left,
+        criterion=values,
+        n_best=low + int(np.argmin(values[low:])),
+        passes=state.passes,
+    )
+
+
+def information(criterion: str, left: float, k: int, n: int, m: int) -> float:
+    """Return an information criterion of a least-squares fit, up to a constant.
+
+    `criterion`: one of `CRITERIA`; `left`: mean square error, in any unit; `k`, `n`, `m`: terms, samples, candidates.
+    """
+    return n * log(max(left, _EXACT)) + penalty(criterion, k, n, m)
+
+
+def penalty(criterion: str, k: int, n: int, m: int) -> float:
+    """Return what k of m candidates cost on n samples.
+
+    Returns infinite where there are too few samples.
+    """
+    if criterion in ("bic", "mdl"):
+        return k * log(n)
+    if criterion == "ebic":
+        j = min(k, m // 2)  # beyond, fewer and fewer choices would make terms cheap: none of all could go again
+        return k * log(n) + 2.0 * (lgamma(m + 1) - lgamma(j + 1) - lgamma(m - j + 1))
+    if criterion == "aic":
+        return 2.0 * k
+    if criterion == "aicc":
+        return 2.0 * k * n / (n - k - 1) if n > k + 1 else float("inf")
+    if criterion == "fpe":
+        return n * log((n + k) / (n - k)) if n > k else float("inf")
+    if criterion == "lilc":
+        return 2.0 * k * log(max(log(n), 1.0))
+    raise EstimationError(
+        f"criterion {criterion!r} is not known; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
+    )
+
+
+class _Gram:
+    """Scalar products of what is left of candidates and output, orthogonal to those chosen so far."""
+
+    def __init__(self, found: Candidates | MatrixCandidates, y: Array, tick: Callable[[float], object] | None) -> None:
+        self.found, self.y, self.tick = found, y, tick
+        self.order: list[int] = []
+        self.path: list[float] = []
+        self.passes = 0
+        self.energy = float(y @ y)
+        self.lengths: Array | None = None
+        self.base = 1.0
+        self.gram, self.product, self.squared = np.empty((0, 0)), np.empty(0), np.empty(0)
+        self.alive = np.ones(len(found.terms), dtype=bool)
+        self.left = 1.0 if self.energy > 0 else 0.0
+        self.rows, self.since = np.empty((8, self.alive.size)), 0
+        self._measure()
+
+    def unexplained(self) -> bool:
+        """Whether something is left to explain, looked at closely where digits have run short."""
+        if self.since and self.left <= _SPENT * self.base and self.passes < _MOST_PASSES:
+            self._measure()
+        return self.left > _EXACT
+
+    def winner(self, wanted: int | None) -> int | None:
+        """Return the candidate with the largest error reduction ratio; None where none explains anything."""
+        for _ in range(2):
+            if wanted is not None and not self.alive[wanted]:
+                return None
+            safe = self.squared > _SHORT
+            if wanted is not None:
+                pick = wanted
+            else:
+                hopeful = np.where(
+                    self.alive, (np.abs(self.product) + _ROUNDING) ** 2 / np.maximum(self.squared, _ROUNDING), -1.0
+                )
+                exact = np.where(self.alive & safe, self.product**2 / np.where(safe, self.squared, 1.0), -1.0)
+                pick = int(np.argmax(exact))
+                rival = int(np.argmax(np.where(safe, -1.0, hopeful)))
+                if not safe[rival] and hopeful[rival] > exact[pick]:
+                    pick = rival
+            if not self.alive[pick]:
+                return None
+            fresh = not self.since
+            if fresh or (safe[pick] and self.left > _SPENT * self.base) or self.passes >= _MOST_PASSES:
+                return pick if safe[pick] else None
+            self._measure()
+        return None
+
+    def take(self, pick: int) -> float:
+        """Add a candidate; returns its error reduction ratio."""
+        length = np.sqrt(self.squared[pick])
+        row = self.gram[pick].copy()
+        if self.since:
+            done = self.rows[: self.since]
+            row -= done[:, pick] @ done
+        row /= length
+        gain = self.product[pick] / length
+        self.squared = self.squared - row**2
+        self.product = self.product - gain * row
+        if self.since == self.rows.shape[0]:
+            self.rows = np.concatenate([self.rows, np.empty_like(self.rows)])
+        self.rows[self.since] = row
+        self.since += 1
+        self.alive[pick] = False
+        self.order.append(pick)
+        ratio = float(gain**2) * self.base
+        self.left = max(self.left - ratio, 0.0)
+        self.path.append(self.left)
+        return ratio
+
+    def _measure(self) -> None:
+        """Make candidates and output orthogonal to the chosen ones, and multiply them with each other."""
+        self._tell(0.0)
+        m, k = self.alive.size, len(self.order)
+        Q = np.linalg.qr(self.found.columns(self.order))[0] if k else np.empty((self.y.size, 0))
+        rest = self.y - Q @ (Q.T @ self.y)
+        rest -= Q @ (Q.T @ rest)
+        C = np.zeros((k, m))
+        for rows, values in self.found.blocks() if k else ():
+            C += Q[rows].T @ values.T
+        gram, product, again = np.zeros((m, m)), np.zeros(m), np.zeros((k, m))
+        for rows, values in self.found.blocks():
+            self._tell(rows.start / self.y.size)
+            if k:
+                values -= C.T @ Q[rows].T
+                again += Q[rows].T @ values.T
+            gram += values @ values.T
+            product += values @ rest[rows]
+        gram -= again.T @ again
+        squared = np.maximum(np.diag(gram), 0.0)
+        if self.lengths is None:
+            self.lengths = squared.copy()
+        self.alive &= squared > _DEPENDENT * np.maximum(self.lengths, 1e-300)
+        self.alive[self.order] = False
+        scale = np.where(self.alive, 1.0 / np.sqrt(np.where(self.alive, squared, 1.0)), 0.0)
+        energy = float(rest @ rest)
+        self.base = energy / self.energy if self.energy > 0 else 0.0
+        self.left = self.base
+        if self.path:
+            self.path[-1] = self.base
+        self.gram = gram * scale[:, None] * scale
+        self.product = product * scale / np.sqrt(energy if energy > 0 else 1.0)
+        self.squared = np.where(self.alive, 1.0, 0.0)
+        self.rows, self.since = np.empty((8, m)), 0
+        self.passes += 1
+
+    def _tell(self, part: float) -> None:
+        """Say what share is over: the first pass is half of the work or more, each further one half of the rest."""
+        if self.tick is not None:
+            self.tick(1.0 - 0.5**self.passes * (1.0 - 0.5 * part))

@@ -1,0 +1,71 @@
+"""Records of one bench in deviations from their common means, in common deviations: results hang on no unit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+
+Parts = tuple[tuple[Array, Array], ...]
+"""Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
+
+_FEWEST = 20  # rows of a record beyond its lags
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scaled:
+    """Outputs and inputs of all records."""
+
+    parts: Parts  # by record
+    y_level: Array  # (n_outputs,), SI, mean and standard deviation over all records
+    y_scale: Array
+    u_level: Array  # (n_inputs,), SI
+    u_scale: Array
+
+
+def scaled_records(structure: str, records: Sequence[IOData], *, lag: int) -> Scaled:
+    """Check that records belong together and scale them.
+
+    `structure`: for messages; `lag`: samples of each record that are only past.
+    """
+    if not records:
+        raise EstimationError(f"{structure}: no record is given. Pass one at least")
+    first = records[0]
+    for r, x in enumerate(records):
+        if (x.inputs, x.outputs) != (first.inputs, first.outputs):
+            raise EstimationError(
+                f"{structure}: record {r + 1} has channels {x.inputs} and {x.outputs}, the first {first.inputs} and "
+                f"{first.outputs}; all must be of one bench. Name the same columns"
+            )
+        if abs(x.dt - first.dt) > 1e-6 * first.dt:
+            raise EstimationError(
+                f"{structure}: record {r + 1} has {1 / x.dt:g} Hz, the first {1 / first.dt:g} Hz; one model has one "
+                "rate. Resample one of them"
+            )
+        if x.n_samples < lag + _FEWEST:
+            raise EstimationError(
+                f"{structure}: record {r + 1} has {x.n_samples} samples; {lag + _FEWEST} are needed. "
+                "Give a longer record, or a smaller model"
+            )
+    y, y_level, y_scale = _group(structure, [x.y for x in records], first.outputs)
+    u, u_level, u_scale = _group(structure, [x.u for x in records], first.inputs)
+    return Scaled(
+        parts=tuple(zip(y, u, strict=True)), y_level=y_level, y_scale=y_scale, u_level=u_level, u_scale=u_scale
+    )
+
+
+def _group(structure: str, values: list[Array], names: tuple[str, ...]) -> tuple[list[Array], Array, Array]:
+    whole = np.concatenate(values)
+    level, scale = whole.mean(axis=0), whole.std(axis=0)
+    for k, channel in enumerate(names):
+        if not scale[k] > 1e-13 * max(abs(level[k]), 1e-300):
+            raise EstimationError(
+                f"{structure}: {channel!r} does not move (constant at {whole[0, k]:g}); nothing can be learnt from it. "
+                "Excite it, or leave it out"
+            )
+    return [(x - level) / scale for x in values], level, scale

@@ -1,0 +1,174 @@
+"""Covariance of weights from the scores of a fit (slope of each sample's error times the error), where errors are not
+taken as white: the sandwich in closed form, and a bootstrap in blocks of time.
+
+Both keep the correlation of the scores over about n^0.6 samples (Kuensch 1989; Newey and West 1987). The inputs are
+what was measured and are never made anew, so that a controller's reaction to the noise stays in: no residual bootstrap
+that holds the inputs fixed would be right under feedback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.progress import Tick
+from ambid.nonlinear.search import information_inverse, triangle_of
+
+REPEATS = 200
+_MANY = 20  # records from which on whole records are drawn
+_FEWEST = 8  # blocks of a record
+_BEGINS = 4  # of blocks, that are averaged over
+_SHOWN_ALONE = 0.1  # share of a direction's information that all other blocks count as having at least
+
+
+def block_length(n: int) -> int:
+    """Return the samples over which scores are taken to hang together.
+
+    `n`: of a record.
+    """
+    length: int = max(min(round(float(n) ** 0.6), n // _FEWEST), 1)
+    return length
+
+
+def score_covariance(scores: Sequence[Array], part: float = 0.0, slopes: Sequence[Array] | None = None) -> Array:
+    """Return the covariance of the sum of all scores, from blocks of time that begin at several places.
+
+    With `slopes`, each block's sum is that which the estimate moves by when the block is left out (jackknife; Cameron,
+    Gelbach and Miller 2008, CV3): errors at samples that pull the fit towards themselves are too small.
+
+    `scores`: (n_samples, n_theta), of each record; `slopes`: (n_samples, n_outputs, n_theta). Returns (n_theta,
+    n_theta).
+    """
+    by_record = len(scores) >= _MANY
+    lengths = _lengths(scores, part)
+    begins = [0] if by_record else [(k * max(lengths)) // _BEGINS for k in range(min(_BEGINS, max(lengths)))]
+    out = np.zeros((scores[0].shape[1],) * 2)
+    for begin in begins:
+        found = []
+        for k, (own, length) in enumerate(zip(scores, lengths, strict=True)):
+            n = own.shape[0]
+            edges = [0, *range(begin % length or length, n - length // 2, length), n]
+            for a, b in pairwise(edges):
+                block = own[a:b].sum(axis=0)
+                found.append(block if slopes is None else _left_out(slopes[k][a:b], block))
+        sums = np.array(found)
+        sums -= sums.mean(axis=0)
+        out += sums.T @ sums * (len(found) / max(len(found) - 1.0, 1.0))
+    mean: Array = out / len(begins)
+    return mean
+
+
+def _lengths(scores: Sequence[Array], part: float) -> list[int]:
+    """Samples of a block, by record; whole records where there are many."""
+    sizes = [s.shape[0] for s in scores]
+    return sizes if len(sizes) >= _MANY else [max(block_length(n), round(part * n)) for n in sizes]
+
+
+def _left_out(slopes: Array, score: Array) -> Array:
+    """(I - Q'Q)^-1 Q'e of a block; along what the block alone shows (its record's first state) nothing is blown up."""
+    Q = slopes.reshape(-1, slopes.shape[-1])
+    held, V = np.linalg.eigh(Q.T @ Q)
+    out: Array = V @ ((V.T @ score) / np.maximum(1.0 - held, _SHOWN_ALONE))
+    return out
+
+
+def widening(scores: Sequence[Array], part: float = 0.0) -> float:
+    """Return what a covariance from few blocks is to be multiplied by, so that 1.96 deviations still hold 95 %.
+
+    `scores`: (n_samples, n_theta); `part`: as for `score_covariance`. Returns square of Student's quantile over the
+    normal one.
+    """
+    from scipy.special import stdtrit
+
+    blocks = sum(max(round(s.shape[0] / k), 1) for s, k in zip(scores, _lengths(scores, part), strict=True))
+    return float((stdtrit(max(blocks - 1, 2), 0.975) / 1.959964) ** 2)
+
+
+def sandwich(
+    R: Array, scores: Sequence[Array], prior: Array | None = None, slopes: Sequence[Array] | None = None
+) -> tuple[Array | None, float]:
+    """Return the covariance of the estimate, inverse information times score covariance times inverse information.
+
+    `R`: (n_rows, n_theta), triangle of the slopes, priors included; `scores`: (n_samples, n_theta), of each record,
+    without those of priors; `prior`: (n_theta, n_theta), information of the priors, which counts as that much data;
+    `slopes`: (n_samples, n_outputs, n_theta). Returns `covariance`: (n_theta, n_theta), or None, none where a direction
+    is not seen.
+    """
+    P, condition = information_inverse(R)
+    if P is None:
+        return None, condition
+    scale = np.sqrt(np.diag(P))
+    root = np.linalg.cholesky(P / scale[:, None] / scale) * scale[:, None]  # root root' = P
+    if slopes is None:
+        n = sum(s.shape[0] for s in scores)
+        middle = score_covariance([s @ root for s in scores]) * (n / max(n - R.shape[1], 1.0))
+    else:
+        middle = score_covariance([s @ root for s in scores], 0.0, [s @ root for s in slopes])
+    middle *= widening(scores)
+    if prior is not None:
+        middle += root.T @ prior @ root
+    out: Array = root @ middle @ root.T
+    return (out + out.T) / 2.0, condition
+
+
+def bootstrapped(
+    rows: Sequence[Array], priors: Array, seed: int, tick: Tick | None = None, *, repeats: int = REPEATS
+) -> Array:
+    """Return the covariance of weights after a Gauss-Newton step on blocks of time drawn with replacement.
+
+    One step from the optimum stays where the network is linear in its weights: whole trainings end in weights that
+    differ while the function does not, and their covariance says nothing of the function. Errors of a block are those
+    of a fit without it, and few blocks widen, as in the sandwich. The first block of a record is always there: it alone
+    shows the first state. Whole records are drawn where there are 20 or more.
+
+    `rows`: (n_samples, n_outputs, n_theta + 1), slopes and errors of each record, of unit variance; `priors`:
+    (n_priors, n_theta + 1), rows that stay as they are. Returns (n_theta, n_theta).
+    """
+    whole = len(rows) >= _MANY
+    blocks = [_triangles(r, r.shape[0] if whole else block_length(r.shape[0])) for r in rows]
+    _lift(blocks, priors)
+    rng = np.random.default_rng([seed, 1])
+    found = []
+    for k in range(repeats):
+        if tick is not None:
+            tick("bootstrap", k / repeats)
+        if whole:
+            drawn = [blocks[j][0] for j in rng.integers(0, len(blocks), size=len(blocks))]
+        else:
+            drawn = []
+            for own in blocks:
+                times = np.bincount(rng.integers(1, len(own), size=len(own) - 1), minlength=len(own))
+                times[0] = 1
+                drawn += [np.sqrt(t) * b for t, b in zip(times, own, strict=True) if t]
+        R = triangle_of([np.concatenate([*drawn, priors])])
+        scale = np.maximum(np.linalg.norm(R[:, :-1], axis=0), 1e-150)
+        found.append(np.linalg.lstsq(R[:, :-1] / scale, R[:, -1], rcond=1e-10)[0] / scale)
+    return np.atleast_2d(np.cov(np.array(found), rowvar=False)) * widening([r[:, 0] for r in rows])
+
+
+def _lift(blocks: list[list[Array]], priors: Array) -> None:
+    """Raise each block's errors to those that the fit without it has: its own are too small by what it pulled."""
+    R = triangle_of([np.concatenate([*(b for own in blocks for b in own), priors])])[:, :-1]
+    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-150)
+    _, s, Vt = np.linalg.svd(R / scale, full_matrices=False)
+    root = (Vt.T / np.maximum(s, 1e-10 * s[0])) / scale[:, None]
+    for own in blocks:
+        for k, block in enumerate(own):
+            U, held, _ = np.linalg.svd(block[:, :-1] @ root, full_matrices=False)
+            along = U.T @ block[:, -1]
+            own[k] = block.copy()
+            own[k][:, -1] += U @ (along / np.maximum(1.0 - held**2, _SHOWN_ALONE) - along)
+
+
+def _triangles(rows: Array, length: int) -> list[Array]:
+    """Each block of time reduced to a triangle; the last one takes what is left over."""
+    n, width = rows.shape[0], rows.shape[2]
+    edges = [*range(0, n - length + 1, length), n]
+    if len(edges) > 2 and edges[-2] + length > n:
+        edges.pop(-2)
+    if len(edges) < 3 and length < n:
+        edges = [0, n // 2, n]
+    return [triangle_of([rows[a:b].reshape(-1, width)]) for a, b in pairwise(edges)]

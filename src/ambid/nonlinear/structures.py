@@ -1,0 +1,202 @@
+"""The register of nonlinear structures: what each is called, what it is told, what feedback does to it.
+
+An estimator is a function ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit``: `records` a sequence
+of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.progress.Tick`) called now and
+then with the name of the stage and the share of the whole search that is over; it may raise KeyboardInterrupt, upon
+which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers that are not finite, end
+in status ``failed`` with the reason, never in an exception; an exception is a request that makes no sense. The
+estimator leaves `fit`, `criteria` and `checks` to `ambid.validate.nonlinear`. It is imported only when it is asked for.
+`tests/nonlinear/test_conformance.py` runs on every entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Literal
+
+from ambid.errors import EstimationError, nearest
+from ambid.nonlinear.fit import NonlinearFit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NonlinearStructure:
+    """One nonlinear structure."""
+
+    name: str  # for lists
+    summary: str
+    # what it may be told, each with a line that says what it is and what is chosen without it
+    settings: Mapping[str, str]
+    home: str  # ``module:function`` of its estimator
+    # what feedback does to it: nothing; bias; nothing as long as its noise model holds the true one
+    feedback: Literal["consistent", "biased", "with noise model"]
+
+    @property
+    def estimator(self) -> Callable[..., NonlinearFit]:
+        """The function that fits it."""
+        module, function = self.home.split(":")
+        found: Callable[..., NonlinearFit] = getattr(import_module(module), function)
+        return found
+
+
+_ENTRIES: tuple[NonlinearStructure, ...] = (
+    NonlinearStructure(
+        name="narmax",
+        summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
+        settings={
+            "ny": "largest lag of the outputs; 2",
+            "nu": "number of lags of each input; 2",
+            "nk": "smallest lag of the inputs; 1",
+            "ne": "largest lag of the innovations, 0 for NARX; 2",
+            "degree": "of the polynomial; 2",
+            "noise_degree": "of the terms with innovations; 1, a linear noise model",
+            "terms": "process terms that are looked at for each output, at most; 30, fewer on a short record",
+            "constant": "1 to let a constant be chosen, 0 for none; 1",
+            "criterion": "what ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic",
+            "pruning": "what decides on terms to leave out again: prediction, simulation, none; prediction",
+            "kind": "polynomial or rational; polynomial",
+            "selection": "frols (by ratios), simulation (by the free run), all (every candidate), auto (frols; all if a"
+            " plant is sampled so fast that the ratios say little, and all predict better); auto",
+            "focus": "prediction or simulation: which errors the coefficients make small at last; prediction",
+            "levels": "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
+            "output": "magnitude, or mean magnitude (over a sample), where the sensor sees no sign; signed",
+            "symmetry": "odd where the plant is the same the other way round: terms of odd degree alone; none",
+        },
+        home="ambid.nonlinear.narmax.estimate:narmax",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="nn",
+        summary="state-space network whose weights are A and B (thesis fig. 5.9), beside a network G(x, u)",
+        settings={
+            "form": "one-axis (entries of thesis eq. 4.8), free, auto (one-axis where units are V, m, A); auto",
+            "states": "of the form free; chosen by Bayes' criterion. one-axis has 3",
+            "delay": "samples by which inputs act late; auto (0 to 20, by the errors of short trainings)",
+            "connections": "of one-axis: thesis (five), damped (a22 as well), all (second and third row); thesis",
+            "output": "magnitude where the sensor sees no sign (free, no gain, up to four states, odd units); signed",
+            "neurons": "hidden units of G(x, u); 0; with output=magnitude chosen by how runs go on behind training",
+            "residual": "anchored (no slope of G at the operating point), orthogonal (to A, B on the data); anchored",
+            "prior": "standard deviation of G's weights before the data, scaled; 3, with output=magnitude 1",
+            "starts": "random starts of G; 3, with output=magnitude 20",
+            "noise": "output, innovations (predictor gain), auto (gain where errors are not white); auto",
+            "shooting": "samples of a shot in multiple shooting, for unstable plants; 0 for none",
+            "descent": "iterations of the thesis's steepest descent, shown beside; 10",
+            "iterations": "of each training, at most; 50",
+            "evaluations": "of the global search of one-axis, where ordinary starts fail; 0 for none; 2000",
+            "uncertainty": "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich if not white); auto",
+        },
+        home="ambid.nonlinear.networks.nn:nn",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="narx",
+        summary="neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
+        settings={
+            "ny": "lags of the outputs; chosen by held-out error",
+            "nu": "lags of each input; chosen by held-out error",
+            "nk": "smallest lag of the inputs; 1",
+            "neurons": "hidden units; chosen by held-out error",
+            "starts": "random starts; 3",
+            "held_out": "part at the end of each record that training is watched on; 0.2",
+            "prior": "standard deviation of the hidden layer's weights before the data, scaled signals; 10",
+            "iterations": "of each training, at most; 60",
+            "focus": "prediction or simulation: which errors are made small at last; prediction",
+            "uncertainty": "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich for simulation); auto",
+        },
+        home="ambid.nonlinear.networks.narx:narx",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="lpv",
+        summary="linear model whose coefficients follow a scheduling signal such as the set point; error model",
+        settings={
+            "schedule": "scheduling signal: an input, the output, or level (set point: output, low-passed); level",
+            "time_constant": "of the low-pass of level, in s; chosen, at least five of the plant's own",
+            "exciting": "yes where the scheduling input acts on the output as well; no",
+            "order": "of the system model; 2",
+            "nb": "coefficients of each input; order",
+            "nk": "smallest lag of the inputs; 1",
+            "degree": "of the coefficients in the scheduling signal; chosen, up to 3",
+            "criterion": "what chooses the degree: aicc, aic, bic; aicc",
+            "basis": "legendre (polynomials) or hats (piecewise linear, degree pieces); legendre",
+            "form": "output (noise on the output) or equation (noise in it; unstable plants); chosen by bic",
+            "error_order": "of the error model, 0 for white noise; 5",
+            "error_form": "ar, ma, arma; chosen by bic",
+            "error_degree": "of the error model's coefficients in the scheduling signal; 0",
+            "iterations": "of each search, at most; 60",
+        },
+        home="ambid.nonlinear.lpv.estimate:lpv",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="hybrid",
+        summary="polynomial, network for what it leaves, noise model C (thesis eqs 3.23-3.24)",
+        settings={
+            "ny": "largest lag of the outputs; 2",
+            "nu": "number of lags of each input; 2",
+            "nk": "smallest lag of the inputs; 1",
+            "ne": "order of C; chosen by the criterion, 4 at most",
+            "degree": "of the polynomial; 2",
+            "terms": "terms of the polynomial that are looked at for each output, at most; 30, fewer on a short record",
+            "constant": "1 to let a constant be chosen, 0 for none; 1",
+            "neurons": "hidden units, 0 for none; chosen by held-out error, 8 at most",
+            "starts": "random starts of the network; 3",
+            "held_out": "part at the end of each record by which the number of neurons is chosen; 0.2",
+            "prior": "standard deviation of the network's weights before the data, scaled signals; 3",
+            "iterations": "of each training, at most; 60",
+            "criterion": "for terms and ne: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic",
+            "pruning": "prediction (terms are revised once the network is there), none; prediction",
+            "selection": "frols, all (every candidate); frols",
+            "levels": "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
+            "innovations": "linear (through C alone), network (they are its regressors too); linear",
+        },
+        home="ambid.nonlinear.hybrid.estimate:hybrid",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="rbf",
+        summary="radial basis functions of lagged outputs and inputs, beside a linear part (thesis eqs 1.13-1.14)",
+        settings={
+            "ny": "lags of the outputs; chosen by held-out error",
+            "nu": "lags of each input; chosen by held-out error",
+            "nk": "smallest lag of the inputs; 1",
+            "linear": "1 for a linear part beside the units, 0 for none; 1",
+            "neurons": "units; chosen",
+            "unit": "gaussian, inverse-multiquadric, thin-plate; gaussian",
+            "seen": "regressors that the units see: all, outputs, inputs; chosen",
+            "metric": "of the distance from a centre: scaled, whitened (all directions of the data alike); scaled",
+            "centres": "ols (orthogonal least squares among the data) or kmeans; ols",
+            "widths": "common, or by the distance of neighbours; common for ols, neighbours for kmeans",
+            "width": "in sizes of the data, or in distances of neighbours; chosen",
+            "choice": "what chooses number and width of the units: held_out, bic, aicc, aic; held_out",
+            "held_out": "part at the end of each record that is held out for it; 0.2",
+            "prior": "standard deviation of the units' weights before the data, scaled; by restricted likelihood",
+            "training": "linear (least squares), recursive (Gauss-Newton by sample), descent (3.18-3.22); linear",
+            "trained": "weights, or all (centres, widths too; by Levenberg-Marquardt if training is linear); weights",
+            "rate": "descent: of the steps, 0.02; recursive: least gain, 0 to count all samples alike",
+            "bounded": "1 to bound the rate so that no sample's error grows, 0 as in the thesis; 1",
+            "passes": "over the records, recursive or descent; 1 for the weights recursively, otherwise 20",
+            "iterations": "of Levenberg-Marquardt, at most; 60",
+            "focus": "prediction or simulation: which errors are made small at last; prediction",
+            "uncertainty": "laplace, sandwich (errors not taken as white), none; auto: sandwich for simulation errors",
+        },
+        home="ambid.nonlinear.rbf.estimate:rbf",
+        feedback="with noise model",
+    ),
+)
+
+NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _ENTRIES}
+
+
+def nonlinear_structure(name: str) -> NonlinearStructure:
+    """Return a nonlinear structure by name.
+
+    `name`: such as ``"narmax"``. Returns from the register.
+    """
+    if name not in NONLINEAR_STRUCTURES:
+        known = ", ".join(NONLINEAR_STRUCTURES)
+        raise EstimationError(
+            f"structure {name!r} is not known; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
+        )
+    return NONLINEAR_STRUCTURES[name]

@@ -1,0 +1,274 @@
+"""Discrete Kalman filter of a linear state, in square-root form, for samples and blocks with gaps.
+
+x⁺ = A x + B u + w, y = C x + v. The covariance is carried as a triangular root (array form), so that it is symmetric
+and positive by construction however long it runs (Kailath, Sayed and Hassibi 2000, ch. 12).
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.recursive.filters.streaming import as_block, check_channels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LinearState:
+    """A sampled linear state and its noises."""
+
+    A: Array  # (n_states, n_states)
+    B: Array  # (n_states, n_inputs), no columns where there is no input
+    C: Array  # (n_outputs, n_states)
+    Q: Array  # (n_states, n_states), covariance of the process noise of one sample, positive semidefinite
+    R: Array  # (n_outputs, n_outputs), covariance of the measurement noise, positive definite; need not be diagonal
+
+
+def linear_state(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, *, B: ArrayLike | None = None) -> LinearState:
+    """Check and keep the matrices of a sampled state.
+
+    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `Q`: (n_states, n_states); `R`: (n_outputs, n_outputs); `B`:
+    (n_states, n_inputs).
+    """
+    a, c, q, r = (np.atleast_2d(np.array(M, dtype=np.float64)) for M in (A, C, Q, R))
+    n, m = a.shape[0], c.shape[0]
+    b = np.zeros((n, 0)) if B is None else np.array(B, dtype=np.float64).reshape(n, -1)
+    shapes = {"A": (a, (n, n)), "C": (c, (m, n)), "Q": (q, (n, n)), "R": (r, (m, m))}
+    for name, (M, shape) in shapes.items():
+        if M.shape != shape or not np.isfinite(M).all():
+            raise EstimationError(f"linear state: {name} has shape {M.shape}; it must be {shape} and finite. Mend it")
+    for name, M, least in (("Q", q, -1e-12), ("R", r, 0.0)):
+        values = np.linalg.eigvalsh((M + M.T) / 2)
+        bad = values[0] < least * max(values[-1], 0.0) or (name == "R" and values[0] <= 0)
+        if bad or not np.allclose(M, M.T, rtol=1e-10, atol=0):
+            raise EstimationError(
+                f"linear state: {name} must be a covariance, {'positive' if name == 'R' else 'semi'}definite; its "
+                f"eigenvalues reach from {values[0]:.3g} to {values[-1]:.3g}. Give another"
+            )
+    return LinearState(A=a, B=b, C=c, Q=(q + q.T) / 2, R=(r + r.T) / 2)
+
+
+def constant_velocity(rate_hz: float, *, q: float, r: float) -> LinearState:
+    """Return position and velocity under white acceleration, position measured; noise discretised exactly.
+
+    Q = q [[T³/3, T²/2], [T²/2, T]] (Bar-Shalom, Li and Kirubarajan 2001, sec. 6.2.2).
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    q : float
+        Intensity of the acceleration, (m/s²)²s; over 0.
+    r : float
+        Variance of a position sample, m².
+
+    Returns
+    -------
+    LinearState
+        States position in m, velocity in m/s.
+
+    Raises
+    ------
+    EstimationError
+        If a number is not positive.
+    """
+    check_channels("constant velocity", rate_hz, 1)
+    if not (0 < q < np.inf and 0 < r < np.inf):
+        raise EstimationError(f"constant velocity: q = {q:g}, r = {r:g}; both must be positive. Give others")
+    T = 1.0 / rate_hz
+    return linear_state(
+        [[1.0, T], [0.0, 1.0]], [[1.0, 0.0]], q * np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]]), [[r]]
+    )
+
+
+class KalmanFilter:
+    """Kalman filter of a `LinearState`.
+
+    Without a start covariance it begins in the stationary one (Riccati equation), and its gain is constant as long as
+    nothing is missing. With one, the gain follows the covariance, which is not computed further once it stands still
+    to rounding. A measurement that is not finite is missing: its outputs are left out, the others are used; where all
+    are missing, the state is predicted only. Splitting a stream in another way does not change any number.
+
+    Parameters
+    ----------
+    model : LinearState
+    start : array_like, shape (n_states,), optional
+        State at the first sample, before it is measured; 0 by default.
+    start_covariance : array_like, shape (n_states, n_states), optional
+        Of its error, positive definite.
+    give : {"filtered", "predicted"}
+        Whether `update` returns the state with or without the sample of the same instant.
+
+    Attributes
+    ----------
+    n_samples : int
+        Taken in.
+
+    Raises
+    ------
+    EstimationError
+        If shapes do not fit, or there is no stationary filter and no start covariance.
+    """
+
+    def __init__(
+        self,
+        model: LinearState,
+        *,
+        start: ArrayLike | None = None,
+        start_covariance: ArrayLike | None = None,
+        give: Literal["filtered", "predicted"] = "filtered",
+    ) -> None:
+        from ambid.recursive.filters._kernels import state_scan, two_state_scan
+
+        if give not in ("filtered", "predicted"):
+            raise EstimationError(f"Kalman filter: give {give!r}; it is 'filtered' or 'predicted'. Choose one of them")
+        self.model = model
+        n, m, n_u = model.A.shape[0], model.C.shape[0], model.B.shape[1]
+        p = max(n, m)
+        self._n, self._m, self._n_u = n, m, n_u
+        self._model = np.zeros((n + m, n + n_u + p))
+        self._model[:n, : n + n_u] = np.hstack([model.A, model.B])
+        self._model[:n, n + n_u : n + n_u + n] = _root(model.Q)
+        self._model[n:, :n] = model.C
+        self._model[n:, n + n_u : n + n_u + m] = np.linalg.cholesky(model.R)
+        self._memory = np.zeros((n + m, n + 1 + m))
+        self._memory[:n, :n] = _start_root(model, start_covariance)
+        self._memory[:n, n] = 0.0 if start is None else _vector(start, n)
+        self._work = np.zeros((n + m, 2 * n + p + m))
+        self._tally = np.array([0.0, float(give == "predicted"), 0.0, 0.0, 0.0])
+        self._scan = two_state_scan if (n, m, n_u) == (2, 1, 0) else state_scan
+        self._none = np.empty((1, 0))
+        self._one = (np.empty((1, m)), np.empty((1, n)), np.empty((1, m)))
+        self.n_samples = 0
+
+    def update(self, measurement: ArrayLike, inputs: ArrayLike | None = None) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        measurement : array_like, shape (n_outputs,), or (n_samples, n_outputs) for a block
+            A number, or (n_samples,), where there is one output. NaN where it is missing.
+        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), optional
+            Held from each sample to the next; wanted where the model has inputs.
+
+        Returns
+        -------
+        ndarray, shape (n_states,), or (n_samples, n_states) for a block
+            State at the instants of the samples.
+
+        Raises
+        ------
+        EstimationError
+            If shapes do not fit, or an input is missing or not finite.
+        """
+        if isinstance(measurement, float) and self._m == 1 and inputs is None and self._n_u == 0:
+            y, out, errors = self._one
+            y[0, 0] = measurement
+            self._scan(y, self._none, out, errors, self._model, self._memory, self._work, self._tally)
+            self.n_samples += 1
+            return out[0].copy()
+        given = np.asarray(measurement, dtype=np.float64)
+        y = as_block(given, self._m, "Kalman filter")
+        u = self._inputs(inputs, y.shape[0])
+        out, errors = np.empty((y.shape[0], self._n)), np.empty(y.shape)
+        self._scan(y, u, out, errors, self._model, self._memory, self._work, self._tally)
+        self.n_samples += y.shape[0]
+        alone = given.ndim == 0 or (given.ndim == 1 and self._m > 1)
+        return out[0] if alone else out
+
+    @property
+    def state(self) -> Array:
+        """Predicted state at the next sample, shape (n_states,)."""
+        return self._memory[: self._n, self._n].copy()
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the error of `state`, shape (n_states, n_states)."""
+        S = np.tril(self._memory[: self._n, : self._n])
+        return np.asarray(S @ S.T)
+
+    @property
+    def filtered_covariance(self) -> Array:
+        """Covariance of the state's error with the last sample used, shape (n_states, n_states).
+
+        Of a sample with all outputs, taken from the present `covariance`.
+        """
+        P, C = self.covariance, self.model.C
+        K = np.linalg.solve(C @ P @ C.T + self.model.R, C @ P).T
+        left = np.eye(self._n) - K @ C
+        return np.asarray(left @ P @ left.T + K @ self.model.R @ K.T)
+
+    @property
+    def n_missing(self) -> int:
+        """Single measured values that were missing."""
+        return int(self._tally[2])
+
+    @property
+    def mean_squared_innovation(self) -> float:
+        """Mean square of the normalised innovations so far: 1 if the model is right; NaN before the first."""
+        return float(self._tally[4] / self._tally[3]) if self._tally[3] else float("nan")
+
+    def copy(self) -> Self:
+        """Return an independent filter in the same state.
+
+        Returns
+        -------
+        KalmanFilter
+        """
+        other = copy(self)
+        other._memory, other._work = self._memory.copy(), self._work.copy()
+        other._tally = self._tally.copy()
+        other._one = (self._one[0].copy(), self._one[1].copy(), self._one[2].copy())
+        return other
+
+    def _inputs(self, inputs: ArrayLike | None, n: int) -> Array:
+        if self._n_u == 0 and inputs is None:
+            return self._none
+        given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
+        if given.size != n * self._n_u or not np.isfinite(given).all():
+            raise EstimationError(
+                f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are wanted. "
+                "Give all of them"
+            )
+        return as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
+
+
+def _root(Q: Array) -> Array:
+    values, vectors = np.linalg.eigh(Q)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _start_root(model: LinearState, covariance: ArrayLike | None) -> Array:
+    if covariance is None:
+        from ambid.estimation.innovations import predictor_gain
+
+        try:
+            P = predictor_gain(model.A, model.C, model.Q, model.R).P
+            return np.asarray(np.linalg.cholesky(P + 0.0))
+        except np.linalg.LinAlgError:
+            raise EstimationError(
+                "Kalman filter: there is no stationary filter with a covariance that is positive definite: a state is "
+                "not seen by the outputs, or not moved by the noise. Give start_covariance, or another model"
+            ) from None
+    n = model.A.shape[0]
+    P = np.array(covariance, dtype=np.float64).reshape(-1)
+    if P.size != n * n:
+        raise EstimationError(f"Kalman filter: start_covariance has {P.size} numbers for {n} states. Give {n} x {n}")
+    try:
+        return np.asarray(np.linalg.cholesky(P.reshape(n, n)))
+    except np.linalg.LinAlgError:
+        raise EstimationError(
+            "Kalman filter: start_covariance is not positive definite. Give every state a variance over 0"
+        ) from None
+
+
+def _vector(start: ArrayLike, n: int) -> Array:
+    x = np.array(start, dtype=np.float64).reshape(-1)
+    if x.size != n or not np.isfinite(x).all():
+        raise EstimationError(f"Kalman filter: start has {x.size} numbers for {n} states; give {n} that are finite")
+    return x

@@ -1,0 +1,300 @@
+"""Compiled recursion of the polynomial predictor, its gradients and the U-D filter of its coefficients.
+
+Every signal is a row of one buffer that is written from column to column; when it is full, its end becomes the history
+of a new beginning, so that a sample costs the same whether it comes alone or in a block. What is filtered by what is
+a table of whole numbers, see `plan`; only the coefficients `coef` = 1, -1, free ones, constant move.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+
+Table = NDArray[np.int64]
+
+# of `meta`: sizes; where filters of inputs, residual, gradients and unknown states end; where the other tables begin
+_N, _NU, _LONGEST, _INPUT, _RESIDUAL, _GRADIENT, _STATES, _TERMS, _COLUMNS, _STABLE, _N_STABLE, _V, _E, _W = range(14)
+_POS, _FILL, _RINGING, _USED, _REJECTED, _WAITED, _PROJECTED, _HELD, _LEARNT, _HOLD = range(10)  # of `count`
+_FORGET, _FINAL, _GROWTH, _SQUARES, _WEIGHT, _NOISE, _LEVELS = range(7)  # of `real`
+_FIRST = 2  # free coefficient
+
+_RADIUS = 0.99999  # roots of C and F stay inside
+_RUNG_OUT = 0.01  # of what was unknown at a new beginning: what is left then counts for nothing
+_LONGEST_RING = 5000  # a root at the border would never let it
+_EVERY = 64  # most samples between looks at the growth of the covariance; not more than half the memory
+
+
+@compiled
+def filter_column(plan: Table, meta: Table, first: int, last: int, coef: Array, s: Array, t: int) -> None:
+    """Run filters `first` to `last` at column t."""
+    for f in range(first, last):
+        row, over, n = plan[f, 0], plan[f, 1], plan[f, 2]
+        x = 0.0
+        for k in range(meta[_TERMS] + plan[f, 3], meta[_TERMS] + plan[f, 4]):
+            source, c, at = plan[k, 0], plan[k, 1], t - plan[k, 3]
+            for j in range(plan[k, 2]):
+                x += coef[c + j] * s[source, at - j]
+        for j in range(n):
+            x -= coef[over + j] * s[row, t - 1 - j]
+        s[row, t] = x
+
+
+@compiled
+def gradient(plan: Table, meta: Table, s: Array, t: int, psi: Array) -> None:
+    """Write the gradient of the prediction at column t."""
+    for j in range(meta[_N]):
+        k = meta[_COLUMNS] + j
+        psi[j] = plan[k, 2] * s[plan[k, 0], t - plan[k, 1]]
+
+
+@compiled
+def _ud(UD: Array, n: int, psi: Array, forget: float, gain: Array) -> float:
+    """Take one row into P = U D U' (Bierman 1977, ch. 5), P/forget before; return 1 + psi' P psi / forget.
+
+    Row j of `UD` holds column j of U above its diagonal, D_j on it.
+    """
+    alpha = forget
+    for j in range(n):
+        f = psi[j]
+        for i in range(j):
+            f += UD[j, i] * psi[i]
+        g = UD[j, j] * f
+        before = alpha
+        alpha = before + f * g
+        UD[j, j] *= before / (alpha * forget)
+        gain[j] = g
+        p = -f / before
+        for i in range(j):
+            x = UD[j, i]
+            UD[j, i] = x + gain[i] * p
+            gain[i] += x * g
+    for j in range(n):
+        gain[j] /= alpha
+    return alpha / forget
+
+
+@compiled
+def _stable(theta: Array, first: int, n: int, work: Array) -> bool:
+    """Whether all roots of 1 + theta[first] q^-1 + ... are inside `_RADIUS` (Schur-Cohn)."""
+    if n == 1:
+        return bool(np.abs(theta[first]) < _RADIUS)
+    if n == 2:
+        p, q = theta[first] / _RADIUS, theta[first + 1] / (_RADIUS * _RADIUS)
+        return bool(np.abs(q) < 1.0 and np.abs(p) < 1.0 + q)
+    scale = 1.0
+    for k in range(n):
+        scale /= _RADIUS
+        work[k] = theta[first + k] * scale
+    for m in range(n, 0, -1):
+        r = work[m - 1]
+        if not np.abs(r) < 1.0:
+            return False
+        rest = 1.0 - r * r
+        for k in range(m // 2):
+            a, b = work[k], work[m - 2 - k]
+            work[k] = (a - r * b) / rest
+            work[m - 2 - k] = (b - r * a) / rest
+    return True
+
+
+@compiled
+def follow(plan: Table, meta: Table, theta: Array, coef: Array, work: Array) -> int:
+    """Let the filters have theta; return 1 if roots of C or F had to be drawn towards zero to keep them stable."""
+    drawn = 0
+    for j in range(theta.size):
+        coef[_FIRST + j] = theta[j]
+    for k in range(meta[_STABLE], meta[_STABLE] + meta[_N_STABLE]):
+        first, n, shrink = plan[k, 0], plan[k, 1], 1.0 - _RADIUS
+        while not _stable(coef, first, n, work):
+            drawn, factor = 1, 1.0
+            for j in range(n):
+                factor *= max(1.0 - shrink, 0.0)
+                coef[first + j] = theta[first - _FIRST + j] * factor
+            shrink *= 2.0
+    return drawn
+
+
+@compiled
+def _grown(UD: Array, limit: Array, variance: float) -> bool:
+    """Whether the variance of any coefficient is beyond its limit."""
+    n = limit.size
+    for i in range(n):
+        p = UD[i, i]
+        for j in range(i + 1, n):
+            p += UD[j, i] * UD[j, i] * UD[j, j]
+        if p * variance > limit[i]:
+            return True
+    return False
+
+
+@compiled
+def _fill(plan: Table, meta: Table, s: Array, t: int, count: Table) -> None:
+    """One more sample of history: the noise is taken as zero, so the first w that has a memory is what is left of A y.
+
+    From then on the error of w is of the size of the noise, not of the signal. When history is long enough, ones stand
+    for the unknown states of F and C: their response shows when those are forgotten.
+    """
+    s[meta[_E], t] = 0.0
+    if meta[_W] >= 0:
+        s[meta[_W], t] += s[meta[_V], t]
+        s[meta[_V], t] = 0.0
+    count[_FILL] += 1
+    if count[_FILL] >= meta[_LONGEST]:
+        for f in range(meta[_GRADIENT], meta[_STATES]):
+            count[_RINGING] = 1
+            for j in range(plan[f, 2]):
+                s[plan[f, 0], t - j] = 1.0
+
+
+@compiled
+def _ring(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table) -> None:
+    """Let the unknown states die away; end the waiting when they have."""
+    filter_column(plan, meta, meta[_GRADIENT], meta[_STATES], coef, s, t)
+    most = 0.0
+    for f in range(meta[_GRADIENT], meta[_STATES]):
+        for j in range(plan[f, 2]):
+            most = max(most, np.abs(s[plan[f, 0], t - j]))
+    count[_RINGING] += 1
+    if most < _RUNG_OUT or count[_RINGING] > _LONGEST_RING:
+        count[_RINGING] = 0
+
+
+@compiled
+def _shift(plan: Table, meta: Table, step: float, s: Array, t: int) -> None:
+    """Let the past of v and e know of a new constant: both are linear in it, and its first steps may be large."""
+    ones = plan[meta[_COLUMNS] + meta[_N] - 1, 0]
+    for k in range(1, meta[_LONGEST] + 1):
+        s[meta[_V], t - k] -= step
+        if meta[_E] != meta[_V]:
+            s[meta[_E], t - k] -= step * s[ones, t - k]
+
+
+@compiled
+def _learn(
+    plan: Table,
+    meta: Table,
+    count: Table,
+    real: Array,
+    theta: Array,
+    coef: Array,
+    UD: Array,
+    S: Array,
+    limit: Array,
+    s: Array,
+    t: int,
+    work: Array,
+) -> None:
+    """One Gauss-Newton step (Ljung & Söderström 1983, sec. 3.4), from where the filters stand to where the data say.
+
+    The two differ only while C or F would be unstable: what the data said is then kept and not lost.
+    """
+    psi, gain = work[0], work[1]
+    gradient(plan, meta, s, t, psi)
+    e = s[meta[_E], t]
+    for j in range(theta.size):
+        e -= psi[j] * (theta[j] - coef[_FIRST + j])
+    forget = keep = real[_FORGET]
+    lost = 1.0 - min(forget, real[_FINAL])
+    every = _EVERY if lost * _EVERY <= 0.5 else max(1, int(0.5 / lost))
+    if count[_LEARNT] % every == 0 and real[_FINAL] < 1.0:
+        # not less than at the start: a signal that stands still has no noise, and its P would grow without end
+        variance = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE])
+        # as large as it may be at the next look
+        count[_HOLD] = int(_grown(UD, limit, variance * (1.0 - lost) ** -every))
+    if count[_HOLD]:
+        forget = 1.0
+        count[_HELD] += 1
+    real[_FORGET] = real[_FINAL] + real[_GROWTH] * (real[_FORGET] - real[_FINAL])
+    size = _ud(UD, theta.size, psi, forget, gain)
+    # forgotten while the coefficients are held, too: after a long calm the noise would be taken for small too long
+    real[_SQUARES] = keep * real[_SQUARES] + e * e / size
+    real[_WEIGHT] = keep * real[_WEIGHT] + 1.0
+    # the noise of the moment goes with what the moment says: a calm later on makes old samples no better
+    variance = real[_SQUARES] / real[_WEIGHT]
+    for i in range(S.shape[0]):
+        for j in range(i + 1):
+            S[i, j] = forget * forget * S[i, j] + variance * psi[i] * psi[j]
+    for j in range(theta.size):
+        theta[j] += gain[j] * e
+    level = coef[_FIRST + theta.size - 1]
+    count[_PROJECTED] += follow(plan, meta, theta, coef, work[2])
+    _shift(plan, meta, coef[_FIRST + theta.size - 1] - level, s, t)
+    filter_column(plan, meta, meta[_INPUT], meta[_RESIDUAL], coef, s, t)
+    count[_LEARNT] += 1
+
+
+@compiled
+def _finite(u: Array, y: Array, k: int) -> bool:
+    x = y[k]
+    for i in range(u.shape[1]):
+        x += u[k, i] * 0.0
+    return bool(np.isfinite(x))
+
+
+@compiled
+def _forget_signals(s: Array, count: Table, longest: int) -> None:
+    for row in range(s.shape[0]):
+        for t in range(s.shape[1]):
+            s[row, t] = 0.0
+    count[_POS] = longest
+    count[_FILL] = 0
+    count[_RINGING] = 0
+
+
+@compiled
+def run(
+    u: Array,
+    y: Array,
+    errors: Array,
+    learn: bool,
+    plan: Table,
+    meta: Table,
+    count: Table,
+    real: Array,
+    theta: Array,
+    coef: Array,
+    UD: Array,
+    S: Array,
+    limit: Array,
+    s: Array,
+    work: Array,
+) -> None:
+    """Take in samples u (m, n_inputs), y (m,); write the errors of prediction; `learn` false leaves coefficients."""
+    longest, width = meta[_LONGEST], s.shape[1]
+    for k in range(y.size):
+        errors[k] = np.nan
+        if not _finite(u, y, k):
+            count[_REJECTED] += 1
+            _forget_signals(s, count, longest)
+            continue
+        t = count[_POS]
+        if t == width:
+            for row in range(s.shape[0]):
+                for j in range(longest):
+                    s[row, j] = s[row, width - longest + j]
+            t = longest
+        s[0, t], s[1, t] = y[k] - real[_LEVELS], 1.0
+        for i in range(meta[_NU]):
+            s[2 + i, t] = u[k, i] - real[_LEVELS + 1 + i]
+        filter_column(plan, meta, 0, meta[_RESIDUAL], coef, s, t)
+        e = s[meta[_E], t]
+        if not np.isfinite(e * e):  # too large to compute with
+            count[_REJECTED] += 1
+            _forget_signals(s, count, longest)
+            continue
+        count[_POS] = t + 1
+        count[_USED] += 1
+        if count[_FILL] < longest:
+            count[_WAITED] += 1
+            _fill(plan, meta, s, t, count)
+        elif count[_RINGING]:
+            count[_WAITED] += 1
+            _ring(plan, meta, coef, s, t, count)
+        else:
+            errors[k] = e
+            if learn:
+                _learn(plan, meta, count, real, theta, coef, UD, S, limit, s, t, work)
+        filter_column(plan, meta, meta[_RESIDUAL], meta[_GRADIENT], coef, s, t)

@@ -1,0 +1,399 @@
+"""Recursive prediction error method for A y = (B/F) u + (C/D) e + constant (Ljung & Söderström 1983, ch. 3).
+
+Every sample makes one Gauss-Newton step theta += P psi e in U-D form, psi the exact gradient of the prediction (thesis
+eq. 3.12 ff.), filtered with the coefficients of the moment. From nothing, a first window is stored and fitted off-line:
+the recursion then begins inside the valley of the criterion, with that fit's covariance as its prior, and every sample
+counts once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.orders import Orders
+from ambid.blackbox.polynomial.orders import layout_of, read_orders
+from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.structures import structure as structure_named
+from ambid.errors import EstimationError
+from ambid.recursive.polynomial.columns import columns
+from ambid.recursive.polynomial.result import fit_of, model_of, offsets_of, warnings_of
+from ambid.recursive.polynomial.start import Identity, identity_of, state_from_fit
+from ambid.recursive.polynomial.state import COUNTED, Forgetting, State, covariance_of, noise_variance_of
+from ambid.recursive.polynomial.window import Window
+
+_USED, _REJECTED, _WAITED, _PROJECTED, _HELD = COUNTED
+_REFITTED = 16  # first windows
+_NUMBERS = (float, np.float64)
+
+
+class RecursivePolynomial:
+    """Recursive prediction error estimator of one output, any structure of thesis table 3.1, any number of inputs.
+
+    The covariance is that of the error of the estimate if the coefficients stand still and the structure holds the
+    noise, whatever is forgotten; how far the estimate lags behind coefficients that move is not in it. `fir` and `oe`
+    have no noise model: they are biased under feedback, and `warnings` says so unless `open_loop` is given. ARMAX, BJ
+    and the others are consistent under feedback as long as their noise model holds the true one. An unstable plant
+    wants A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
+
+    A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
+    learnt until the unknown states of the filters have died away (`n_waited`).
+
+    Where no search of the largest first window converged, `fit` says "stalled" and standard deviations are as large as
+    the coefficients, until one of a later window does.
+
+    Parameters
+    ----------
+    structure : str
+        ``fir arx armax arma ararx ararmax oe bj``.
+    orders : Mapping[str, int or tuple of int]
+        na, nb, nc, nd, nf as the structure takes them, and nk, which has to be given; nb, nf and nk one number, or one
+        for each input.
+    dt : float
+        Sampling interval, s.
+    n_inputs : int or None, optional
+        One, or none for a time series, unless said otherwise.
+    forgetting : Forgetting or float, optional
+        A number is `Forgetting.final`. Below 20 samples for each coefficient `warnings` tells of C, D and F.
+    burn_in : int or None, optional
+        Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
+        the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
+    open_loop : bool, optional
+        Say that no feedback is at work.
+
+    Raises
+    ------
+    EstimationError
+        If the structure is not known, or an order is missing, not known or out of range.
+    """
+
+    _window: Window | None
+    _arrays: tuple[Any, ...]
+
+    def __init__(
+        self,
+        structure: str,
+        orders: Orders,
+        *,
+        dt: float = 1.0,
+        n_inputs: int | None = None,
+        forgetting: Forgetting | float = 1.0,
+        burn_in: int | None = None,
+        open_loop: bool = False,
+    ) -> None:
+        found = structure_named(structure)
+        if not found.home.startswith("ambid.blackbox.polynomial:"):
+            raise EstimationError(f"{structure} is no polynomial structure. Use armax, oe or bj")
+        n_u = int(found.inputs) if n_inputs is None else n_inputs
+        u, y = np.zeros((1, n_u)), np.zeros((1, 1))
+        inputs = tuple(f"u{i}" for i in range(n_u)) if n_u != 1 else ("u",)
+        units = dict.fromkeys((*inputs, "y"), "1")
+        data = IOData(u=u, y=y, dt=dt, inputs=inputs, outputs=("y",), units=units)
+        read = read_orders(structure, data, orders)
+        if "nk" in read and read["nk"] is None:
+            raise EstimationError(f"{structure}: nk is not given; a delay is not looked for on-line. Give nk=1, say")
+        layout = layout_of(read, n_u)
+        who = Identity(structure=structure, layout=layout, dt=dt, inputs=inputs, outputs=("y",), units=units)
+        self._prepare(who, forgetting, open_loop=open_loop)
+        need = 10 * (layout.n_theta + layout.first_row)
+        first = max(500, 100 * layout.free.size) if burn_in is None else burn_in
+        if first < need:
+            raise EstimationError(f"{structure}: burn_in = {first} samples; at least {need} are needed. Raise it")
+        self._window = Window(first=first, last=first * _REFITTED, n_inputs=n_u)
+
+    @classmethod
+    def from_fit(
+        cls,
+        fit: BlackBoxFit,
+        *,
+        forgetting: Forgetting | float = 1.0,
+        samples: int | None = None,
+        open_loop: bool = False,
+    ) -> Self:
+        """Begin with what an off-line fit knows: its coefficients, weighed by its covariance, and its noise.
+
+        Parameters
+        ----------
+        fit : BlackBoxFit
+            Of a polynomial structure, one output. Its record and the samples to come must not overlap.
+        forgetting : Forgetting or float, optional
+        samples : int or None, optional
+            How many samples `fit` saw, where those to come stand at the same operating point: its offsets and noise
+            then count so much. None: both are learnt anew.
+        open_loop : bool, optional
+            Say that no feedback is at work.
+
+        Returns
+        -------
+        RecursivePolynomial
+
+        Raises
+        ------
+        EstimationError
+            If the fit is none of one output, or has no covariance.
+        """
+        made = cls.__new__(cls)
+        made._prepare(identity_of(fit), forgetting, open_loop=open_loop)
+        made._begin(fit, samples)
+        return made
+
+    def _prepare(self, who: Identity, forgetting: Forgetting | float, *, open_loop: bool) -> None:
+        from ambid.recursive.polynomial._kernels import run
+
+        self._who, self._open_loop = who, open_loop
+        self._forgetting = forgetting if isinstance(forgetting, Forgetting) else Forgetting(final=float(forgetting))
+        model = PolynomialModel(outputs=(who.layout.polynomials(who.layout.start()),), dt=who.dt)
+        self._names = tuple(model.names[k] for k in who.layout.free)
+        self._n_u, self._run = who.layout.n_inputs, run
+        self._window = None
+        self._state: State | None = None
+        self._arrays = ()
+        self._one = (np.zeros((1, self._n_u)), np.zeros(1), np.zeros(1))
+        self._start: Array = who.layout.start()
+        self._doubtful = False
+        self._rejected_before = self._used_before = self._failed_starts = 0
+
+    def _begin(self, fit: BlackBoxFit, samples: int | None) -> State:
+        self._start, self._doubtful = fit.model.theta, fit.status != "converged"
+        state = state_from_fit(fit, self._who.layout, self._forgetting, samples=samples)
+        self._state, self._arrays = state, state.arrays()
+        return state
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the estimated coefficients, as `PolynomialModel.names` has them."""
+        return self._names
+
+    @property
+    def estimate(self) -> Array:
+        """Coefficients in the units of the signals, shape (p,); zeros until the first window is full."""
+        n = len(self._names)
+        return np.zeros(n) if self._state is None else self._state.at[:n].copy()
+
+    @property
+    def covariance(self) -> Array:
+        """Of the error of `estimate`, shape (p, p); huge until the first window is full, large where it stalled."""
+        n = len(self._names)
+        state = self._state
+        return 1e12 * np.eye(n) if state is None else covariance_of(state, doubtful=self._doubtful)[:n, :n].copy()
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations of `estimate`, shape (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of the innovations e; NaN until the first window is full."""
+        return float("nan") if self._state is None else noise_variance_of(self._state)
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate."""
+        return self._state is not None
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were taken in, as information or as history."""
+        stored = self._window.filled if self._window is not None and self._state is None else 0
+        return self._used_before + self._count(_USED) + stored
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that held a number that is not finite."""
+        return self._rejected_before + self._count(_REJECTED)
+
+    @property
+    def n_waited(self) -> int:
+        """Samples that were history alone, while the states of the filters were not known."""
+        return self._count(_WAITED)
+
+    @property
+    def n_projected(self) -> int:
+        """Samples at which the filters stopped short of the estimate to keep C and F stable."""
+        return self._count(_PROJECTED)
+
+    @property
+    def n_held(self) -> int:
+        """Samples at which nothing was forgotten because a coefficient would have become as vague as it is large."""
+        return self._count(_HELD)
+
+    @property
+    def n_failed_starts(self) -> int:
+        """Windows from which no first estimate could be had (no excitation, say)."""
+        return self._failed_starts
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader of the estimate has to know."""
+        return warnings_of(self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful)
+
+    def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+            A number, or (n_samples,), where there is one input; ignored for a time series.
+        outputs : array_like, shape () or (n_samples,) or (n_samples, 1)
+
+        Returns
+        -------
+        ndarray, shape of `outputs`
+            Errors of prediction made before each sample was used; NaN while history is gathered.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        if type(outputs) in _NUMBERS and type(inputs) in _NUMBERS and self._window is None and self._n_u == 1:
+            u, y, e = self._one  # the way of a loop that lives: no checks, no new arrays
+            u[0, 0], y[0] = inputs, outputs
+            self._run(u, y, e, True, *self._arrays)
+            return np.array(e[0])
+        return self._take(inputs, outputs, learn=True)
+
+    def prime(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
+        """Let samples that were used before fill the memory of the filters, and learn nothing from them.
+
+        A fit that goes on where its record ended so loses no sample to the start of the filters.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+        outputs : array_like, shape () or (n_samples,) or (n_samples, 1)
+
+        Returns
+        -------
+        ndarray, shape of `outputs`
+            Errors of prediction with the present coefficients.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit, or there is no estimate yet.
+        """
+        if self._state is None:
+            raise EstimationError(f"{self._who.structure}: no estimate yet; only one can be primed. Use from_fit")
+        return self._take(inputs, outputs, learn=False)
+
+    def _take(self, inputs: ArrayLike, outputs: ArrayLike, *, learn: bool) -> Array:
+        u, y, shape = columns(self._who, inputs, outputs)
+        errors, first = np.full(y.size, np.nan), 0
+        if self._window is not None:
+            first = self._with_window(u, y, errors)
+        if first < y.size:
+            self._run(u[first:], y[first:], errors[first:], learn, *self._arrays)
+        return errors.reshape(shape)
+
+    def _with_window(self, u: Array, y: Array, errors: Array) -> int:
+        """Store samples and fit them at fixed counts; return how many of the block were dealt with."""
+        at = 0
+        while self._window is not None and at < y.size:
+            n, gap = self._window.take(u[at:], y[at:])
+            if self._state is not None and n:
+                self._run(u[at : at + n], y[at : at + n], errors[at : at + n], True, *self._arrays)
+            at += n
+            if gap and self._state is not None and not self._doubtful:
+                self._window = None  # the recursion goes on alone
+            elif gap:
+                n = self._window.clear()
+                if self._state is None:
+                    self._used_before, self._rejected_before = self._used_before + n, self._rejected_before + 1
+                else:
+                    self._run(u[at : at + 1], y[at : at + 1], errors[at : at + 1], True, *self._arrays)
+                at += 1
+            elif self._window.filled == self._window.target:
+                self._fit_window(self._window)
+        return at
+
+    def _fit_window(self, window: Window) -> None:
+        lost, none = self._state is None or self._doubtful, self._state is None
+        fit = window.fit(self._who, None if lost else self.model.theta, stalled=none)
+        if fit is not None:
+            self._begin_anew(fit, window)
+        self._failed_starts += fit is None and none
+        grown, none = window.grow(), self._state is None
+        if none or self._doubtful:  # a later window may do better
+            self._used_before += (0 if grown else window.drop_half()) * none
+        elif not (grown and window.target <= self._forgetting.memory):
+            self._window = None  # later samples would count more than these
+
+    def _begin_anew(self, fit: BlackBoxFit, window: Window) -> None:
+        """Go on from an off-line fit of all samples so far."""
+        before, n = self._state, window.filled
+        now = self._begin(fit, n)
+        self._run(window.u[:n], window.y[:n], np.empty(n), False, *self._arrays)
+        now.go_on_counting(before, n)
+
+    def _count(self, k: int) -> int:
+        return 0 if self._state is None else int(self._state.count[k])
+
+    @property
+    def model(self) -> PolynomialModel:
+        """The estimate as a model: poles, frequency response and the rest."""
+        full = self._start.copy()
+        full[self._who.layout.free] = self.estimate
+        return model_of(self._who, full)
+
+    @property
+    def offsets(self) -> Offsets:
+        """Operating point for which the model holds, SI; NaN until the first window is full."""
+        if self._state is None:
+            return Offsets(u=np.full(self._n_u, np.nan), y=np.full(1, np.nan))
+        return offsets_of(self.model, self._state)
+
+    def fit(self) -> BlackBoxFit:
+        """Return the present estimate in the form of an off-line fit.
+
+        Returns
+        -------
+        BlackBoxFit
+            Its `fit`, `criteria` and `checks` are empty: they need data.
+
+        Raises
+        ------
+        EstimationError
+            If there is no estimate yet.
+        """
+        if self._state is None:
+            raise EstimationError(
+                f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
+            )
+        found = fit_of(self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings)
+        return replace(found, status="stalled") if self._doubtful else found
+
+    def __getstate__(self) -> dict[str, object]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_run", "_arrays")}
+
+    def __setstate__(self, kept: dict[str, object]) -> None:
+        from ambid.recursive.polynomial._kernels import run
+
+        self.__dict__.update(kept)
+        self._run = run
+        self._arrays = () if self._state is None else self._state.arrays()
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state.
+
+        Returns
+        -------
+        RecursivePolynomial
+        """
+        twin = type(self).__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        twin._one = tuple(x.copy() for x in self._one)  # type: ignore[assignment]
+        if self._window is not None:
+            twin._window = self._window.copy()
+        if self._state is not None:
+            twin._state = self._state.copy()
+            twin._arrays = twin._state.arrays()
+        return twin

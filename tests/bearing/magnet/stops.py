@@ -1,0 +1,60 @@
+"""A ball under one magnet between stops from which it bounces: equations of its own, f = k/2 (i/x)^2 (thesis 1.9)."""
+
+import math
+
+import numpy as np
+
+from ambid.bearing.magnet.problem import BearingRecord
+
+K, LEAK, MASS, RESISTANCE, RATE, STEPS = 3.9e-6, 3e-3, 0.05, 3.0, 5000.0, 4
+GAP = 0.2e-3  # at position 0
+STOPS = (0.8e-3, 2.8e-3)
+NOISE = [1e-6, 1e-3, 3e-3, 0.01, 0.01]  # position, current, force, voltage, drift: rms of one sample
+TRUTH = {"k": K, "s": GAP, "L_leak": LEAK, "m": MASS, "R": RESISTANCE, "g": 9.81, "c": 0.0, "a": 500.0, "sigma": 0.0,
+         "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0, "x_offset": 0.0, "i_offset": 0.0,
+         "v_offset": 0.0, "v_drop": 0.0, "i_drop": 0.02}  # fmt: skip
+
+
+def _rates(x: float, v: float, i: float, volts: float, force: float) -> tuple[float, float, float]:
+    pull, speed = K * i * i / (2.0 * x * x), -K * i / (x * x) * v
+    return v, 9.81 + (force - pull) / MASS, (volts - RESISTANCE * i - speed) / (K / x + LEAK)
+
+
+def ball_between_stops(
+    setpoint: np.ndarray, seed: int, *, bounce: float = 0.2, volts: float = 2.0, name: str = "ball.csv"
+) -> BearingRecord:
+    """A levitated ball whose set point may lie beyond a stop; voltage held over a sample, no delay."""
+    rng, n, h = np.random.default_rng(seed), setpoint.size, 1.0 / RATE / STEPS
+    kick = np.repeat(rng.choice([-volts, volts], n // 7 + 1), 7)[:n]
+    noise = rng.standard_normal((n, 4)) * NOISE[:4]
+    y, u = np.zeros((n, 2)), np.zeros(n)
+    x, v, before, slow = float(setpoint[0]) + GAP, 0.0, 0.0, 0.0
+    i = x * math.sqrt(2.0 * MASS * 9.81 / K)
+    for k in range(n):
+        y[k] = x - GAP + noise[k, 0], i + noise[k, 1]
+        e = y[k, 0] - setpoint[k]
+        slow += 0.5 * ((e - before) * RATE * (k > 0) - slow)
+        before = e
+        wanted = (setpoint[k] + GAP) * math.sqrt(2.0 * MASS * 9.81 / K) + 2250.0 * e + 16.0 * slow
+        u[k] = RESISTANCE * wanted + 3.0 * (wanted - y[k, 1]) + kick[k]
+        at = u[k] + noise[k, 3], noise[k, 2]
+        for _ in range(STEPS):
+            a = _rates(x, v, i, *at)
+            b = _rates(x + h / 2 * a[0], v + h / 2 * a[1], i + h / 2 * a[2], *at)
+            c = _rates(x + h / 2 * b[0], v + h / 2 * b[1], i + h / 2 * b[2], *at)
+            d = _rates(x + h * c[0], v + h * c[1], i + h * c[2], *at)
+            x, v, i = (s + h / 6 * (p + 2 * q + 2 * r + t) for s, p, q, r, t in zip((x, v, i), a, b, c, d, strict=True))
+            low, high = STOPS[0] + GAP, STOPS[1] + GAP
+            if not low <= x <= high:
+                v = -bounce * v if (v < 0.0) == (x < low) else v
+                x = min(max(x, low), high)
+    return BearingRecord(name=name, rate_hz=RATE, u=u, loose=np.zeros(n), y=y, valid=np.ones((n, 2), dtype=bool))
+
+
+def lying(seed: int, n: int = 3000, name: str = "ball.csv") -> BearingRecord:
+    """It rests on the far stop for about 30 % of the record."""
+    rng = np.random.default_rng(seed)
+    setpoint = np.repeat(rng.uniform(1.3e-3, 2.4e-3, 6), n // 6)
+    setpoint[2 * n // 5 : 7 * n // 10] = 3.0e-3
+    smooth = np.convolve(np.concatenate([np.full(150, setpoint[0]), setpoint]), np.ones(151) / 151, "valid")
+    return ball_between_stops(smooth, seed, name=name)

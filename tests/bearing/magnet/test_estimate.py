@@ -1,0 +1,128 @@
+"""A differential bearing moved over 60 % of its gap: every number, every linearisation, and honest deviations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.bearing.magnet.estimate import estimate_bearing
+from ambid.bearing.magnet.likelihood import criterion, search
+from ambid.bearing.magnet.residual_test import whiteness
+from ambid.bearing.magnet.start import balance
+from ambid.bearing.magnet.uncertainty import uncertainty
+from ambid.errors import EstimationError
+from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.parameters import Parameter
+from tests.bearing.magnet.bearings import Motion, as_seen, problem_of, unstable
+
+KNOWN = {
+    "m": Parameter(name="m", unit="kg"),
+    "R": Parameter(name="R", unit="ohm"),
+    "c": Parameter(name="c", unit="N s/m", role="fixed", value=0.0),
+    "i0": Parameter(name="i0", unit="A", role="fixed", value=1.0),
+}
+STRONG = Motion(swing=0.30, swing_hz=2.0, volts=12.0, hold=3)
+PAIR = MagnetLaw(pair=True)
+
+
+@pytest.fixture(scope="module")
+def bearing():
+    done, truth = unstable(6000, range(2), STRONG)
+    fit = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=False)
+    return done, truth, fit
+
+
+def test_numbers_are_right_within_one_percent_and_within_their_deviations(bearing):
+    done, truth, fit = bearing
+    assert all(d.within_limits or d.first_contact is None for d in done)
+    assert max(np.abs(d.states[:, 0]).max() for d in done) > 0.6 * truth["s"]
+    assert fit.status == "converged"
+    known, values = uncertainty(fit), fit.problem.values(fit.vector)
+    assert known.names == ("k", "s", "L_leak", "m", "R", "x_offset", "v_offset")
+    for name, sd in zip(known.names, np.sqrt(np.diag(known.information)), strict=True):
+        assert abs(values[name] - truth[name]) < 3.7 * sd, name
+    for name in ("k", "s", "m", "R"):
+        assert values[name] == pytest.approx(truth[name], rel=0.01)
+    assert values["L_leak"] == pytest.approx(truth["L_leak"], rel=0.08)  # a thirteenth of the inductance
+    assert fit.problem.delays == {20_000.0: 1.0}
+
+
+def test_linearised_values_are_right_at_every_operating_point(bearing):
+    _, truth, fit = bearing
+    x, i = (a.ravel() for a in np.meshgrid(np.linspace(-0.6, 0.6, 7) * truth["s"], np.linspace(-0.7, 0.7, 5)))
+    found, _ = PAIR.table(x, i, fit.problem.values(fit.vector))
+    exact, _ = PAIR.table(x, i, truth)
+    assert found[:, 1:] == pytest.approx(exact[:, 1:], rel=0.01)
+
+
+def test_nothing_is_left_in_the_innovations(bearing):
+    _, _, fit = bearing
+    assert min(whiteness(fit, r).p for r in range(2)) > 1e-4
+
+
+def test_noise_levels_are_found(bearing):
+    _, _, fit = bearing
+    levels = np.exp(fit.vector[fit.problem.noise_slices[0]])
+    assert levels == pytest.approx([1e-7, 2e-3, 1.0, 0.05], rel=0.2)
+
+
+def test_a_wrong_delay_shows(bearing):
+    _, _, fit = bearing
+    problem = replace(fit.problem, delays={20_000.0: 2.0})
+    wrong = search(problem, fit.vector, iterations=6)
+    assert wrong.criterion > fit.criterion + 100
+    assert whiteness(wrong, 0).p < 1e-3
+
+
+def test_the_bias_current_can_be_found_too():
+    (done,), truth = unstable(6000, range(3, 4), STRONG)
+    wrong = {**truth, "k": 1.1 * truth["k"], "s": 1.05 * truth["s"], "i0": 0.95, "m": 4.3, "L_leak": 3e-3}
+    estimated = {"k", "s", "L_leak", "i0", "m", "R", "x_offset", "v_offset"}
+    problem = problem_of([as_seen(done)], wrong, PAIR, estimated, [1e-7, 2e-3, 2.0, 0.1, 0.02], 1.0)
+    fit = search(problem, problem.start())
+    known, values = uncertainty(fit), fit.problem.values(fit.vector)
+    assert fit.status == "converged"
+    assert values["i0"] == pytest.approx(1.0, rel=0.01)
+    for name, sd in zip(known.names, np.sqrt(np.diag(known.information)), strict=True):
+        assert abs(values[name] - truth[name]) < 4 * sd, name
+
+
+def test_an_interruption_keeps_the_best_so_far(bearing):
+    done, truth, _ = bearing
+    wrong = {**truth, "m": 5.0, "k": 1.2 * truth["k"]}
+    problem = problem_of([as_seen(done[0])], wrong, PAIR, {"k", "m"}, [1e-7, 2e-3, 2.0, 0.1, 0.02], 1.0)
+    calls = []
+
+    def tick(stage, done=None):
+        assert stage == "identify"
+        calls.append(done)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    fit = search(problem, problem.start(), tick=tick)
+    assert fit.status == "stalled"
+    assert 0.0 <= calls[0] <= calls[1] <= calls[2] < 1.0
+    assert fit.at is not None
+    assert fit.criterion < criterion(problem, problem.start()) - 100
+
+
+@pytest.mark.parametrize("gap", ["hyperbolic", "exponential"])
+def test_the_balance_gives_the_gap_law_back(bearing, gap):
+    seen = as_seen(bearing[0][0])
+    law = MagnetLaw(gap=gap)
+    numbers = {"k": 2e-4, "s": 2.5e-3, "L_g": 0.04, "zeta": 6.3e-3}
+    x = np.repeat(np.linspace(8e-3, 12e-3, 20), 2000)[: seen.u.size * 3]
+    pull = -law.table(x, np.ones_like(x), numbers)[0][:, 0]
+    i = np.sqrt(0.6 / pull)
+    record = type(seen)(
+        name="rest", rate_hz=1000.0, u=i, loose=0 * i, y=np.column_stack([x, i]), valid=np.ones((x.size, 2), dtype=bool)
+    )
+    strength, length = balance([record], law, 0.6)
+    first, second = law.names[:2]
+    assert (strength, length) == pytest.approx((numbers[first], numbers[second]), rel=0.02)
+
+
+def test_a_turned_sign_is_refused(bearing):
+    seen = as_seen(bearing[0][0])
+    with pytest.raises(EstimationError, match="sign"):
+        estimate_bearing([seen], KNOWN, laws=[MagnetLaw()], extend=False)

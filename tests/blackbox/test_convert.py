@@ -1,0 +1,91 @@
+"""Conversion to and from scipy.signal and python-control keeps the frequency response, delays included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from ambid.blackbox.convert import from_control, from_scipy, to_control, to_scipy
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.errors import ModelError
+
+control = pytest.importorskip("control", reason="python-control is an optional dependency (ambid[control])")
+
+DT = 0.01
+OMEGA = np.array([0.5, 3.0, 40.0, 250.0])
+
+
+def _oe(*, inputs: int = 1, outputs: int = 1) -> PolynomialModel:
+    p = Polynomials(
+        A=[1, -0.2],
+        B=tuple([0, 0, 0, 0.5 + i, 0.2] for i in range(inputs)),  # more delay than denominator
+        C=[1.0],
+        D=[1.0],
+        F=tuple([1, -1.5, 0.7 + 0.1 * i] for i in range(inputs)),
+    )
+    return PolynomialModel(outputs=(p,) * outputs, dt=DT)
+
+
+MODELS = {
+    "polynomial": _oe(),
+    "polynomial of 2 outputs and 3 inputs": _oe(inputs=3, outputs=2),
+    "continuous transfer function": TransferModel(num=(([2.0, 1.0],),), den=(([1.0, 0.4, 9.0],),), dt=None),
+    "discrete with delay": TransferModel(num=(([1.0],),), den=(([1.0, -0.5],),), dt=DT, delay=(3 * DT,)),
+    "state space": StateSpaceModel(
+        A=[[0.9, 0.1], [0, 0.5]], B=[[0, 1], [1, 0]], C=[[1, 0]], D=[[0, 0.1]], K=[[0.1], [0]], dt=DT
+    ),
+    "continuous state space": StateSpaceModel(
+        A=[[0, 1], [4, 0]], B=[[0], [1]], C=[[1, 0]], D=[[0]], K=[[0], [0]], dt=None
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_scipy_and_back(name: str) -> None:
+    model = MODELS[name]
+    system = to_scipy(model)
+    assert (system.dt or None) == model.dt
+    back = from_scipy(system)
+    np.testing.assert_allclose(back.frequency_response(OMEGA), model.frequency_response(OMEGA), rtol=1e-8, atol=1e-12)
+    if model.n_inputs * model.n_outputs == 1:
+        response = scipy.signal.freqresp if model.dt is None else scipy.signal.dfreqresp
+        w = OMEGA if model.dt is None else OMEGA * DT
+        np.testing.assert_allclose(response(system, w)[1], model.frequency_response(OMEGA)[:, 0, 0], rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_control_and_back(name: str) -> None:
+    model = MODELS[name]
+    system = to_control(model)
+    w = model.frequency_response(OMEGA)
+    point = 1j * OMEGA if model.dt is None else np.exp(1j * OMEGA * DT)
+    there = np.array([np.atleast_2d(system(z, squeeze=False)).reshape(w.shape[1:]) for z in point])
+    np.testing.assert_allclose(there, w, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(from_control(system).frequency_response(OMEGA), w, rtol=1e-8, atol=1e-12)
+
+
+def test_zeros_poles_and_gain_are_read() -> None:
+    system = scipy.signal.ZerosPolesGain([0.3], [0.5, 0.9], 2.0, dt=DT)
+    model = from_scipy(system)
+    np.testing.assert_allclose(np.sort(model.poles().real), [0.5, 0.9])
+
+
+@pytest.mark.parametrize("convert", [to_scipy, to_control])
+def test_what_has_no_place_is_refused(convert) -> None:
+    late = TransferModel(num=(([1.0],),), den=(([1.0, 2.0],),), dt=None, delay=(0.1,))
+    series = PolynomialModel(outputs=(Polynomials(A=[1, 0.5], B=(), C=[1.0], D=[1.0], F=()),), dt=DT)
+    with pytest.raises(ModelError, match="delay"):
+        convert(late)
+    with pytest.raises(ModelError, match="time series"):
+        convert(series)
+
+
+def test_objects_of_other_kinds_are_refused() -> None:
+    for read in (from_scipy, from_control):
+        with pytest.raises(ModelError, match="Give"):
+            read(object())
+    with pytest.raises(ModelError, match="sampling interval"):
+        from_control(control.tf([1], [1, 0.5], True))
