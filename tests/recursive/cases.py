@@ -1,6 +1,6 @@
 """What the suite over all recursive estimators needs to know of one of them.
 
-A module ``tests/track/cases_*.py`` with a list ``CASES`` brings its estimators into `test_conformance.py`.
+A module ``tests/recursive/cases_*.py`` with a list ``CASES`` brings its estimators into `test_conformance.py`.
 """
 
 from __future__ import annotations

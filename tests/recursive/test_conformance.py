@@ -14,7 +14,7 @@ from ambid.recursive.estimator import RecursiveEstimator
 from tests.recursive.cases import Case
 
 MODULES = sorted(path.stem for path in Path(__file__).parent.glob("cases_*.py"))
-ALL: list[Case] = [case for module in MODULES for case in importlib.import_module(f"tests.track.{module}").CASES]
+ALL: list[Case] = [case for module in MODULES for case in importlib.import_module(f"tests.recursive.{module}").CASES]
 
 pytestmark = pytest.mark.parametrize("case", ALL, ids=lambda case: case.name)
 
