@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ambid.bearing.greybox import Signals, carry, greybox
+from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations
-from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from tests.bearing.benches import parameters, problem_of, run

@@ -10,6 +10,7 @@ from scipy.stats import chi2, kstest
 from ambid.bearing.greybox import greybox
 from ambid.bearing.physical import agreement, physical_parameters
 from ambid.bearing.physical_response import physical_response
+from ambid.bearing.uncertainty import uncertainty
 from ambid.blackbox import structures
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
@@ -18,7 +19,6 @@ from ambid.blackbox.response import Offsets
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
-from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter

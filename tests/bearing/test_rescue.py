@@ -14,11 +14,11 @@ from ambid.bearing import greybox as home
 from ambid.bearing import rescue
 from ambid.bearing.global_start import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.greybox import greybox
+from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.estimate_file import estimate_from_json
 from ambid.estimation.likelihood import Fit
-from ambid.estimation.uncertainty import uncertainty
 from ambid.job import identify
 from ambid.record import Channel, Record
 from ambid.rig import load_rig

@@ -7,9 +7,9 @@ import pytest
 
 from ambid.estimation import likelihood
 from ambid.estimation.likelihood import evaluate, prior_rows, score_statistic, search, weight_of
+from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.estimation.uncertainty import inverse_information
 from tests.bearing.benches import problem_of, run, stationary_gain
 from tests.estimation import reference
 from tests.estimation.reference import complex_step
@@ -28,7 +28,7 @@ def fit(request):
 
 
 def posterior(fit):
-    return inverse_information(np.vstack([fit.J, fit.J_prior]))
+    return directions(np.vstack([fit.J, fit.J_prior])).inverse()
 
 
 def criterion_of(problem):

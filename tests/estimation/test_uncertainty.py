@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from ambid.bearing.hints import experiment_hint
+from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import search
-from ambid.estimation.uncertainty import WEAK, inverse_information, uncertainty
+from ambid.estimation.linear import directions
+from ambid.estimation.uncertainty import WEAK
 from tests.bearing.benches import problem_of, run
 from tests.estimation.kalman import cramer_rao_sd
 from tests.validate.wrong import WithoutMotionalVoltage
@@ -146,9 +148,9 @@ def test_delay_has_a_standard_deviation_where_it_is_a_number():
 
 def test_an_unseen_column_has_a_huge_variance_and_not_a_wrong_one():
     a = np.random.default_rng(0).standard_normal((20, 3))
-    np.testing.assert_allclose(inverse_information(a), np.linalg.inv(a.T @ a), rtol=1e-10)
+    np.testing.assert_allclose(directions(a).inverse(), np.linalg.inv(a.T @ a), rtol=1e-10)
     a[:, 1] = 0.0
-    found = inverse_information(a)
+    found = directions(a).inverse()
     assert found[1, 1] > 1e100
     kept = np.linalg.inv(a[:, ::2].T @ a[:, ::2])
     np.testing.assert_allclose(found[::2, ::2], kept, rtol=1e-10)

@@ -6,8 +6,8 @@ from scipy.signal import lfilter
 
 from ambid.bearing.coil import coil_instrumental, coil_least_squares
 from ambid.bearing.greybox import Signals, greybox
+from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
-from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 

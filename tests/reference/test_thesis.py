@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing.greybox import greybox
-from ambid.estimation.uncertainty import uncertainty
+from ambid.bearing.uncertainty import uncertainty
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model
 from ambid.physics.presets import preset

@@ -12,10 +12,10 @@ from unittest import mock
 import numpy as np
 
 from ambid.bearing.greybox import greybox
+from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import weight_of
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.estimation.uncertainty import uncertainty
 from ambid.validate.residuals import residuals_uncorrelated, residuals_white
 from tests.bearing.benches import parameters, problem_of, run
 

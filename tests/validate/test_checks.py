@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import innovations
-from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.models import model
 from ambid.record import Channel, Record
 from ambid.validate.agreement import agreement

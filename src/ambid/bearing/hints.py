@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ambid.estimation.uncertainty import WEAK, Uncertainty
+from ambid.bearing.uncertainty import Uncertainty
+from ambid.estimation.uncertainty import WEAK
 
 _ADVICE = {
     "k_x": "k_x shows where the displacement force counts: excite more at low frequency (from {low:.2g} Hz), or larger",

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.uncertainty import Uncertainty
 from ambid.estimation.estimate import Check, Continuous, Delay, Estimate, EstimatedParameter, NoiseModel, OutputFit
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.predictor import Predictor, assemble
-from ambid.estimation.uncertainty import Uncertainty
 from ambid.physics.parameters import Parameter
 
 _NORMAL_95 = 1.959963984540054

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import BLIND, directions, least_squares
 from ambid.estimation.problem import PredictorProblem
 from ambid.estimation.sensitivity import Workspace, innovations, linearise
 
@@ -107,7 +108,7 @@ def score_statistic(problem: PredictorProblem, vector: Array, covariance: Array)
     if at is None:
         return 0.0
     r, J = prior_rows(problem, vector)
-    return _decrement(np.vstack([at.J, J]), np.concatenate([at.r, r]))
+    return directions(np.vstack([at.J, J])).explain(np.concatenate([at.r, r]))
 
 
 def freed(fit: Fit, name: str) -> tuple[float, float]:
@@ -135,23 +136,10 @@ def freed(fit: Fit, name: str) -> tuple[float, float]:
     if at is None:
         return 0.0, value
     r, rows = prior_rows(problem, vector)
-    J, residual = np.vstack([at.J, rows]), np.concatenate([at.r, r])
-    norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1.0
-    u, s, vt = np.linalg.svd(J / norm, full_matrices=False)
-    if s[-1] < 1e-10 * s[0]:  # the data cannot tell it from the others
+    found, residual = directions(np.vstack([at.J, rows])), np.concatenate([at.r, r])
+    if not found.seen.all():  # the data cannot tell it from the others
         return 0.0, value
-    step = -(vt.T @ ((u.T @ residual) / s)) / norm
-    return _decrement(J, residual), value + float(step[n]) * size
-
-
-def _decrement(J: Array, r: Array) -> float:
-    """Squared length of the residual inside the Jacobian's column space: the fall that a Newton step promises."""
-    norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1.0
-    u, s, _ = np.linalg.svd(J / norm, full_matrices=False)
-    inside = u[:, s > 1e-10 * s[0]].T @ r
-    return float(inside @ inside)
+    return found.explain(residual), value - float(found.solve(residual)[n]) * size
 
 
 def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:
@@ -165,21 +153,15 @@ def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) 
     if at is None:
         return vector.copy()
     out, linear = vector.copy(), slice(problem.slices["offset"].start, problem.size)
-    J = at.J[:, linear]
-    norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1.0
-    out[linear] -= np.linalg.lstsq(J / norm, at.r, rcond=1e-10)[0] / norm
+    out[linear] -= least_squares(at.J[:, linear], at.r)
     return out
 
 
 def _step_left(J: Array, r: Array, n_physical: int) -> float:
     """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
-    norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1.0
-    u, s, vt = np.linalg.svd(J / norm, full_matrices=False)
-    s = np.maximum(s, 1e-12 * s[0])
-    step, half = vt.T @ ((u.T @ r) / s), vt.T / s
-    ratio = np.abs(step) / np.linalg.norm(half, axis=1)
+    found = directions(J)
+    half = found.root(BLIND)
+    ratio = np.abs(half @ (found.U.T @ r)) / np.linalg.norm(half, axis=1)
     return float(np.max(ratio[: n_physical or None]))
 
 

@@ -1,222 +1,172 @@
-"""Covariance of the estimated physical parameters, and what the data do not show.
+"""Covariance of estimates from the scores of a fit (slope of each sample's error times the error), where errors are not
+taken as white: the sandwich in closed form, and a bootstrap in blocks of time.
 
-The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound;
-Ljung 1999, sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores
-of stretches of the record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
+Both keep the correlation of the scores over about n^0.6 samples (Kuensch 1989; Newey and West 1987). The inputs are
+what was measured and are never made anew, so that a controller's reaction to the noise stays in: no residual bootstrap
+that holds the inputs fixed would be right under feedback.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.innovations import stable
-from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of
-from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
+from ambid.estimation.linear import BLIND, directions, information_inverse, least_squares, triangle_of
+from ambid.estimation.progress import Tick
 
 WEAK = 0.25  # relative standard deviation from which a parameter counts as not identifiable
-_SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
-_LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask
-_FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
-_BATCHES = 30  # stretches of the record for the robust covariance
+REPEATS = 200
+_MANY = 20  # records from which on whole records are drawn
+_FEWEST = 8  # blocks of a record
+_BEGINS = 4  # of blocks, that are averaged over
+_SHOWN_ALONE = 0.1  # share of a direction's information that all other blocks count as having at least
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Uncertainty:
-    """What a fit knows of its physical parameters.
+def block_length(n: int) -> int:
+    """Return the samples over which scores are taken to hang together.
 
-    `memories`: length of the record in memories of the predictor; infinite where the gain is not estimated.
+    `n`: of a record.
     """
-
-    names: tuple[str, ...]  # estimated physical parameters
-    # (n, n), SI, covariance from the information matrix, priors included, and from what a short record leaves open of
-    # the noise levels
-    information: Array
-    robust: Array  # (n, n), SI, covariance from the scores of stretches of the record
-    # (n,), SI, standard deviations that the data alone would give; very large where they show nothing
-    data_only_sd: Array
-    # (n,), SI, size against which a standard deviation is judged: the value, or the natural scale of a parameter that
-    # may be zero
-    scale: Array
-    # (n,), of the information matrix of the physical parameters scaled by their values, largest first, as 1 / relative
-    # standard deviation along each direction
-    singular_values: Array
-    # direction with the smallest singular value: share of each parameter, largest in magnitude 1
-    weakest: dict[str, float]
-    delay_sd: float | None  # standard deviation of an estimated delay in samples
-    # (n, n), SI, covariance with the noise levels taken as known well: what `information` is for a long record
-    fisher: Array
-    # (n,), SI, how far the parameters move when the data are used differently, where that is more than chance allows;
-    # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
-    disagreement: Array
-
-    @property
-    def widening(self) -> float:
-        """Largest ratio of standard deviations with noise levels known roughly to those with them known well."""
-        return float(np.max(np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.fisher), 1e-300))))
-
-    @property
-    def inflation(self) -> float:
-        """Largest ratio of robust to information standard deviation."""
-        return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.fisher), 1e-300))))
-
-    def covariance(self, *, robust: bool) -> Array:
-        """Return the covariance that goes with `standard_deviations`.
-
-        `robust`: whether a check said that the model is only near the truth. Returns (n, n), SI, if robust:
-        correlations from the scores, the larger of both standard deviations, plus the disagreement.
-        """
-        if not robust:
-            return self.information
-        plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
-        larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
-        return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
-
-    def standard_deviations(self, *, robust: bool) -> Array:
-        """Return standard deviations: from the information matrix, or robust ones, which are never smaller.
-
-        `robust`: whether a check said that the model is only near the truth. Returns (n,), SI.
-        """
-        return np.asarray(np.sqrt(np.diag(self.covariance(robust=robust))))
-
-    def relative_sd(self, *, robust: bool) -> Array:
-        """Return standard deviations over `scale`.
-
-        `robust`: as for `standard_deviations`. Returns (n,).
-        """
-        return np.asarray(self.standard_deviations(robust=robust) / self.scale)
-
-    def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
-        """Return which parameters have a relative standard deviation below 25 %.
-
-        `robust`: as for `standard_deviations`.
-        """
-        return tuple(bool(r < WEAK) for r in self.relative_sd(robust=robust))
+    length: int = max(min(round(float(n) ** 0.6), n // _FEWEST), 1)
+    return length
 
 
-def uncertainty(fit: Fit) -> Uncertainty:
-    """Compute covariances and the identifiability verdict of a fit.
+def score_covariance(scores: Sequence[Array], part: float = 0.0, slopes: Sequence[Array] | None = None) -> Array:
+    """Return the covariance of the sum of all scores, from blocks of time that begin at several places.
 
-    `fit`: not failed.
+    With `slopes`, each block's sum is that which the estimate moves by when the block is left out (jackknife; Cameron,
+    Gelbach and Miller 2008, CV3): errors at samples that pull the fit towards themselves are too small.
+
+    `scores`: (n_samples, n_theta), of each record; `slopes`: (n_samples, n_outputs, n_theta). Returns (n_theta,
+    n_theta).
     """
-    problem, sl = fit.problem, fit.problem.slices
-    n, size = problem.n_physical, problem.magnitude
-    whole = inverse_information(np.vstack([fit.J, fit.J_prior]))
-    unit = np.outer(size, size)
-    information = (whole[:n, :n] + _left_open(fit)) * unit
-    noise_only = fit.J_prior.copy()
-    noise_only[:, :n] = 0.0
-    data_only = np.sqrt(np.diag(inverse_information(np.vstack([fit.J, noise_only])))[:n]) * size
-    values = fit.vector[sl["physical"]] * size
-    theta = problem.parameters(fit.vector)
-    reference = problem.model.references(theta)
-    scale = np.array([max(abs(v), reference.get(k, 0.0)) for k, v in zip(problem.estimated, values, strict=True)])
-    scale = np.maximum(scale, 1e-300)
-    eigenvalues, directions = np.linalg.eigh(information / np.outer(scale, scale))
-    weak = directions[:, -1] / directions[np.argmax(np.abs(directions[:, -1])), -1]
-    delay_sd = float(np.sqrt(whole[sl["fraction"], sl["fraction"]][0, 0])) if problem.fractional else None
-    return Uncertainty(
-        names=problem.estimated,
-        information=information,
-        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
-        data_only_sd=data_only,
-        scale=scale,
-        singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
-        weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
-        delay_sd=delay_sd,
-        fisher=whole[:n, :n] * unit,
-        disagreement=np.zeros(n),
-    )
+    by_record = len(scores) >= _MANY
+    lengths = _lengths(scores, part)
+    begins = [0] if by_record else [(k * max(lengths)) // _BEGINS for k in range(min(_BEGINS, max(lengths)))]
+    out = np.zeros((scores[0].shape[1],) * 2)
+    for begin in begins:
+        found = []
+        for k, (own, length) in enumerate(zip(scores, lengths, strict=True)):
+            n = own.shape[0]
+            edges = [0, *range(begin % length or length, n - length // 2, length), n]
+            for a, b in pairwise(edges):
+                block = own[a:b].sum(axis=0)
+                found.append(block if slopes is None else _left_out(slopes[k][a:b], block))
+        sums = np.array(found)
+        sums -= sums.mean(axis=0)
+        out += sums.T @ sums * (len(found) / max(len(found) - 1.0, 1.0))
+    mean: Array = out / len(begins)
+    return mean
 
 
-def inverse_information(J: Array) -> Array:
-    """Invert J^T J through the singular values of the column-scaled Jacobian.
+def _lengths(scores: Sequence[Array], part: float) -> list[int]:
+    """Samples of a block, by record; whole records where there are many."""
+    sizes = [s.shape[0] for s in scores]
+    return sizes if len(sizes) >= _MANY else [max(block_length(n), round(part * n)) for n in sizes]
 
-    A direction without any information gets a huge variance, not an infinite one.
 
-    `J`: (n_rows, p), n_rows >= p. Returns (p, p).
+def _left_out(slopes: Array, score: Array) -> Array:
+    """(I - Q'Q)^-1 Q'e of a block; along what the block alone shows (its record's first state) nothing is blown up."""
+    Q = slopes.reshape(-1, slopes.shape[-1])
+    held, V = np.linalg.eigh(Q.T @ Q)
+    out: Array = V @ ((V.T @ score) / np.maximum(1.0 - held, _SHOWN_ALONE))
+    return out
+
+
+def widening(scores: Sequence[Array], part: float = 0.0) -> float:
+    """Return what a covariance from few blocks is to be multiplied by, so that 1.96 deviations still hold 95 %.
+
+    `scores`: (n_samples, n_theta); `part`: as for `score_covariance`. Returns square of Student's quantile over the
+    normal one.
     """
-    norm = np.linalg.norm(J, axis=0)
-    norm = np.maximum(norm, 1e-100)
-    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
-    s = np.maximum(s, 1e-15 * s[0])
-    half = vt.T / s / norm[:, None]
-    return np.asarray(half @ half.T)
+    from scipy.special import stdtrit
+
+    blocks = sum(max(round(s.shape[0] / k), 1) for s, k in zip(scores, _lengths(scores, part), strict=True))
+    return float((stdtrit(max(blocks - 1, 2), 0.975) / 1.959964) ** 2)
 
 
-def _left_open(fit: Fit) -> Array:
-    """Covariance that a short record adds by leaving the noise levels open, (n, n), over the magnitudes.
+def sandwich(
+    R: Array, scores: Sequence[Array], prior: Array | None = None, slopes: Sequence[Array] | None = None
+) -> tuple[Array | None, float]:
+    """Return the covariance of the estimate, inverse information times score covariance times inverse information.
 
-    For each disturbance, at the upper end of what the likelihood allows for its level: by how much the information
-    shrinks, and how far the parameters move. Nothing for a long record, or where noise levels do not matter.
+    `R`: (n_rows, n_theta), triangle of the slopes, priors included; `scores`: (n_samples, n_theta), of each record,
+    without those of priors; `prior`: (n_theta, n_theta), information of the priors, which counts as that much data;
+    `slopes`: (n_samples, n_outputs, n_theta). Returns `covariance`: (n_theta, n_theta), or None, none where a direction
+    is not seen.
     """
-    problem, predictor = fit.problem, assemble(fit.problem, fit.vector, with_derivatives=False)
-    n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
-    if problem.noise != "levels" or predictor is None or stable(predictor.A):
-        return extra
-    slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
-    memories = problem.n_used * (1.0 - slowest)
-    if memories > _LONG:
-        return extra
-    work, here = Workspace(problem), inverse_information(np.vstack([fit.J, fit.J_prior]))[:n, :n]
-    for j in range(len(problem.model.disturbances)):
-        upper = _upper_level(fit, j, work)
-        _, covariance = evaluate(problem, upper, work)
-        at = None if covariance is None else linearise(problem, upper, weight_of(covariance), work)
-        if at is not None:
-            r, rows = prior_rows(problem, upper)
-            J, free = np.vstack([at.J, rows]), np.ones(problem.size, dtype=bool)
-            free[problem.slices["noise"].start + j] = False  # this level stays where it was put
-            there = inverse_information(J[:, free])
-            step = -(there @ (J[:, free].T @ np.concatenate([at.r, r])))[:n]
-            wider = max(0.0, float(np.max(np.diag(there)[:n] / np.diag(here))) - 1.0)
-            extra += wider * here + np.outer(step, step)
-    extra += max(0.0, _SHORT / max(memories, 1e-3) - 1.0) * (here + extra)
-    felt = np.sqrt(np.max(1.0 + np.diag(extra) / np.diag(here))) > _FELT
-    return extra if felt else np.zeros_like(extra)
+    P, condition = information_inverse(R)
+    if P is None:
+        return None, condition
+    scale = np.sqrt(np.diag(P))
+    root = np.linalg.cholesky(P / scale[:, None] / scale) * scale[:, None]  # root root' = P
+    if slopes is None:
+        n = sum(s.shape[0] for s in scores)
+        middle = score_covariance([s @ root for s in scores]) * (n / max(n - R.shape[1], 1.0))
+    else:
+        middle = score_covariance([s @ root for s in scores], 0.0, [s @ root for s in slopes])
+    middle *= widening(scores)
+    if prior is not None:
+        middle += root.T @ prior @ root
+    out: Array = root @ middle @ root.T
+    return (out + out.T) / 2.0, condition
 
 
-def _upper_level(fit: Fit, j: int, work: Workspace) -> Array:
-    """The fit with one log disturbance level raised to the end of its 95 % interval: the criterion has risen by 4."""
-    place, inside, outside = fit.problem.slices["noise"].start + j, 0.0, 0.1
+def bootstrapped(
+    rows: Sequence[Array], priors: Array, seed: int, tick: Tick | None = None, *, repeats: int = REPEATS
+) -> Array:
+    """Return the covariance of weights after a Gauss-Newton step on blocks of time drawn with replacement.
 
-    def rise(step: float) -> float:
-        moved = fit.vector.copy()
-        moved[place] += step
-        return evaluate(fit.problem, moved, work)[0] - fit.criterion
+    One step from the optimum stays where the network is linear in its weights: whole trainings end in weights that
+    differ while the function does not, and their covariance says nothing of the function. Errors of a block are those
+    of a fit without it, and few blocks widen, as in the sandwich. The first block of a record is always there: it alone
+    shows the first state. Whole records are drawn where there are 20 or more.
 
-    while outside < 20.0 and rise(outside) < 4.0:
-        inside, outside = outside, 2 * outside
-    for _ in range(4):
-        middle = 0.5 * (inside + outside)
-        inside, outside = (middle, outside) if rise(middle) < 4.0 else (inside, middle)
-    upper = fit.vector.copy()
-    upper[place] += inside
-    return upper
+    `rows`: (n_samples, n_outputs, n_theta + 1), slopes and errors of each record, of unit variance; `priors`:
+    (n_priors, n_theta + 1), rows that stay as they are. Returns (n_theta, n_theta).
+    """
+    whole = len(rows) >= _MANY
+    blocks = [_triangles(r, r.shape[0] if whole else block_length(r.shape[0])) for r in rows]
+    _lift(blocks, priors)
+    rng = np.random.default_rng([seed, 1])
+    found = []
+    for k in range(repeats):
+        if tick is not None:
+            tick("bootstrap", k / repeats)
+        if whole:
+            drawn = [blocks[j][0] for j in rng.integers(0, len(blocks), size=len(blocks))]
+        else:
+            drawn = []
+            for own in blocks:
+                times = np.bincount(rng.integers(1, len(own), size=len(own) - 1), minlength=len(own))
+                times[0] = 1
+                drawn += [np.sqrt(t) * b for t, b in zip(times, own, strict=True) if t]
+        R = triangle_of([np.concatenate([*drawn, priors])])
+        found.append(least_squares(R[:, :-1], R[:, -1]))
+    return np.atleast_2d(np.cov(np.array(found), rowvar=False)) * widening([r[:, 0] for r in rows])
 
 
-def _gram(a: Array) -> Array:
-    """Positive semidefinite product a a^T."""
-    return np.asarray(a @ a.T)
+def _lift(blocks: list[list[Array]], priors: Array) -> None:
+    """Raise each block's errors to those that the fit without it has: its own are too small by what it pulled."""
+    R = triangle_of([np.concatenate([*(b for own in blocks for b in own), priors])])[:, :-1]
+    root = directions(R).root(BLIND)
+    for own in blocks:
+        for k, block in enumerate(own):
+            U, held, _ = np.linalg.svd(block[:, :-1] @ root, full_matrices=False)
+            along = U.T @ block[:, -1]
+            own[k] = block.copy()
+            own[k][:, -1] += U @ (along / np.maximum(1.0 - held**2, _SHOWN_ALONE) - along)
 
 
-def _scores(fit: Fit) -> Array:
-    """Scores of the stretches of the record, (n_stretches, size); their scatter is the middle of the sandwich."""
-    problem, work = fit.problem, Workspace(fit.problem)
-    p, n_used = problem.size, problem.n_used
-    length = max(1, n_used // _BATCHES)
-    scores = np.zeros((-(-n_used // length), p))
-    first = 0
-    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
-        m = rows.shape[0]
-        stretch = np.arange(first, first + m) // length
-        for b in range(stretch[0], stretch[-1] + 1):
-            part = rows[stretch == b].reshape(-1, p + 1)
-            scores[b] += part[:, :p].T @ part[:, p]
-        first += m
-    scores -= scores.mean(axis=0)
-    count = scores.shape[0]
-    return np.asarray(scores * np.sqrt(count / max(count - 1, 1)))
+def _triangles(rows: Array, length: int) -> list[Array]:
+    """Each block of time reduced to a triangle; the last one takes what is left over."""
+    n, width = rows.shape[0], rows.shape[2]
+    edges = [*range(0, n - length + 1, length), n]
+    if len(edges) > 2 and edges[-2] + length > n:
+        edges.pop(-2)
+    if len(edges) < 3 and length < n:
+        edges = [0, n // 2, n]
+    return [triangle_of([rows[a:b].reshape(-1, width)]) for a, b in pairwise(edges)]

@@ -21,8 +21,8 @@ from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
 from ambid.signals.samples import cut
 
 if TYPE_CHECKING:
+    from ambid.bearing.uncertainty import Uncertainty
     from ambid.estimation.likelihood import Fit
-    from ambid.estimation.uncertainty import Uncertainty
 
 
 def identify(
@@ -68,8 +68,8 @@ def identify(
         If nothing can be identified from the record.
     """
     from ambid.bearing.greybox import greybox
+    from ambid.bearing.uncertainty import uncertainty
     from ambid.estimation.threads import one_thread
-    from ambid.estimation.uncertainty import uncertainty
 
     say = tick or silent
     clock = _Clock()

@@ -16,8 +16,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.greybox import carry
 from ambid.estimation.likelihood import Fit, search
+from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
-from ambid.estimation.uncertainty import inverse_information
 
 STRIDES = (2, 4)
 MOST = 4.0  # shift in its standard deviations that chance allows
@@ -62,14 +62,14 @@ def agreement(fit: Fit) -> Agreement:
     problem = fit.problem
     size, n = problem.magnitude, problem.n_physical
     shifts, spreads, strides = [], [], []
-    own = inverse_information(np.vstack([fit.J, fit.J_prior]))[:n, :n]
+    own = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
     for stride in STRIDES:
         sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
         start = carry(fit, sparse)
         again = search(sparse, start, rounds=6, evaluations=10)
         if again.status != "converged":
             continue
-        spread = inverse_information(np.vstack([again.J, again.J_prior]))[:n, :n]
+        spread = directions(np.vstack([again.J, again.J_prior])).inverse()[:n, :n]
         shifts.append((again.vector[:n] - fit.vector[:n]) * size)
         # at least a quarter of its variance: the difference of two nearly equal variances is not known better
         spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.25 * np.diag(spread))) * size)

@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 
 from ambid.bearing.multistart import MAX_DELAY
+from ambid.bearing.uncertainty import Uncertainty
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, freed
-from ambid.estimation.uncertainty import Uncertainty, inverse_information
+from ambid.estimation.linear import directions
 
 _P_LEAST = 1e-3
 _FAR = 3.3  # standard deviations between a prior and the record
@@ -56,7 +57,7 @@ def _priors_agree(fit: Fit) -> Check:
             continue
         others = fit.J_prior[fit.J_prior[:, j] == 0.0]
         # at the optimum the pull of the prior is what the data and the other priors hold against
-        without = inverse_information(np.vstack([fit.J, others]))
+        without = directions(np.vstack([fit.J, others])).inverse()
         step, variance = float(without[j] @ row) * float(r), float(without[j, j])
         size = problem.magnitude[j]
         # r = (value - mean) / sd, so that the data alone would be at mean + r sd + step

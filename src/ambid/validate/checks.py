@@ -8,9 +8,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.hints import experiment_hint
+from ambid.bearing.uncertainty import Uncertainty
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit
-from ambid.estimation.uncertainty import Uncertainty
 from ambid.record import Record
 from ambid.signals.dropouts import find_dropouts
 from ambid.signals.outliers import find_outliers

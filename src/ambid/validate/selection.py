@@ -21,8 +21,8 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.orders import UsedOrders
 from ambid.blackbox.structures import Structure, structure
 from ambid.errors import EstimationError, nearest
+from ambid.estimation.criteria import criteria, skipped
 from ambid.validate._order_search import first_size, searched_orders
-from ambid.validate.blackbox.criteria import criteria, skipped
 from ambid.validate.blackbox.predictor import errors
 from ambid.validate.blackbox.score import autoregression
 from ambid.validate.holdout import Fold, folds, held_out_error, hold_out

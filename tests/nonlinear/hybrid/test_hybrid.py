@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.hybrid import HybridNarmax, hybrid
 from ambid.nonlinear.hybrid.choice import chosen_noise
@@ -17,7 +18,6 @@ from ambid.nonlinear.hybrid.train import HybridProblem, problem_at
 from ambid.nonlinear.narmax import Factor, narmax
 from ambid.nonlinear.networks.narx import narx
 from ambid.nonlinear.networks.narx_function import NarxShape
-from ambid.nonlinear.search import search
 from tests.nonlinear.narmax.systems import coefficients, polynomial, record
 
 TRUTH = {"y(t-1)": 0.5, "y(t-2)": -0.2, "u(t-1)*y(t-1)": 0.3, "u(t-2)": 0.4, "e(t-1)": 0.7}

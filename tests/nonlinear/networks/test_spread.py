@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
+from ambid.estimation.uncertainty import bootstrapped, sandwich, score_covariance
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.networks.narx import narx
 from ambid.nonlinear.networks.nn import nn
 from ambid.nonlinear.networks.nn_spread import disagreement
 from ambid.nonlinear.networks.nn_train import State
-from ambid.nonlinear.spread import bootstrapped, sandwich, score_covariance
 from tests.nonlinear.networks.test_narx_network import data
 from tests.nonlinear.networks.test_state_network import one_axis, sampled
 

@@ -9,13 +9,13 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.networks.narx import narx
 from ambid.nonlinear.rbf.estimate import rbf
 from ambid.nonlinear.rbf.model import RbfNetwork
 from ambid.nonlinear.rbf.problem import problem_at
 from ambid.nonlinear.rbf.result import laplace
-from ambid.nonlinear.search import search
 from tests.nonlinear.rbf.systems import CENTRES, WEIGHTS, WIDTHS, bumpy, data, shape
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.rbf._kernels import descent_pass, recursive_pass
 from ambid.nonlinear.rbf.estimate import rbf
 from ambid.nonlinear.rbf.problem import RbfProblem, problem_at
 from ambid.nonlinear.rbf.recursive import GAUSS_NEWTON, Recursion, left_to_gain
-from ambid.nonlinear.search import search
 from tests.nonlinear.rbf.systems import CENTRES, WIDTHS, bumpy, data, shape
 
 GIVEN: dict[str, Any] = {"ny": 1, "nu": 1, "seen": "all", "neurons": 6, "width": 0.7}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import criteria
 from ambid.nonlinear.narmax.estimate import narmax
-from ambid.validate.blackbox.criteria import criteria
 from ambid.validate.nonlinear import judged, validation
 from ambid.validate.nonlinear.runs import beyond
 from tests.validate.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.magnet.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
+from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
 
 Status = Literal["converged", "stalled", "failed"]
@@ -221,16 +222,11 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
             part, score = local[first : first + 4 * stretch], np.zeros(problem.size)
             score[found.columns[used]] = part[:, :-1].T @ part[:, -1]
             scores.append(score)
-        triangle, short = np.zeros((local.shape[1], problem.size + 1)), _triangle(local)
+        triangle, short = np.zeros((local.shape[1], problem.size + 1)), triangle_of([local])
         triangle[: short.shape[0], np.append(found.columns[used], problem.size)] = short
         parts.append(triangle)
-    whole = _triangle(np.vstack(parts))
+    whole = triangle_of([np.vstack(parts)])
     return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
-
-
-def _triangle(rows: Array) -> Array:
-    """R of a QR decomposition."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
@@ -239,11 +235,7 @@ def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
     `loose`: (size,), bool, which numbers may move; None: all.
     """
     J = at.J if loose is None else at.J[:, loose]
-    norm = np.linalg.norm(J, axis=0)
-    norm[norm == 0] = 1.0
-    u, s, _ = np.linalg.svd(J / norm, full_matrices=False)
-    inside = u[:, s > 1e-10 * s[0]].T @ at.r
-    return float(inside @ inside)
+    return directions(J).explain(at.r)
 
 
 def search(

@@ -18,10 +18,10 @@ from ambid.bearing.magnet.likelihood import criterion
 from ambid.bearing.magnet.problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.multistart import Signals
 from ambid.bearing.rescue import EVALUATIONS
+from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.scaling import noise_floor
-from ambid.estimation.uncertainty import uncertainty
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.one_axis import OneAxis
 from ambid.physics.parameters import Parameter

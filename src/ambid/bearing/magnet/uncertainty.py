@@ -8,7 +8,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.magnet.likelihood import BearingFit
-from ambid.estimation.uncertainty import inverse_information
+from ambid.estimation.linear import directions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
     assert fit.at is not None
     problem, at = fit.problem, fit.at
     n, chain = len(problem.estimated), problem.chain(fit.vector)
-    whole = inverse_information(at.J)
+    whole = directions(at.J).inverse()
     centred = at.scores - at.scores.mean(axis=0)
     middle = centred * np.sqrt(len(centred) / max(len(centred) - 1, 1))
     half = whole @ middle.T

@@ -13,7 +13,8 @@ from ambid.arrays import Array
 from ambid.blackbox.frequency.lines import Lines
 from ambid.blackbox.frequency.physical_problem import PhysicalProblem
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, parameter_named
-from ambid.estimation.uncertainty import WEAK, inverse_information
+from ambid.estimation.linear import directions
+from ambid.estimation.uncertainty import WEAK
 from ambid.physics.parameters import Parameter
 from ambid.signals.frf import FrequencyResponse
 
@@ -72,7 +73,7 @@ def frequency_estimate(
     r, J = problem.residual(v), problem.slope(v, by_parameters=True)
     n_priors = J.shape[0] - 2 * ln.n_lines * ln.entries
     data = J[: J.shape[0] - n_priors] / np.sqrt(ln.widening)
-    whole = inverse_information(np.vstack([data, J[J.shape[0] - n_priors :]]))
+    whole = directions(np.vstack([data, J[J.shape[0] - n_priors :]])).inverse()
     check = ln.verdict(cost, v.size, n_priors)
     theta = problem.theta(v)
     covariance = whole[:n, :n]
@@ -81,11 +82,11 @@ def frequency_estimate(
     names = tuple(p.name for p in problem.estimated)
     reference = problem.model.references(theta)
     scale = np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
-    sizes, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
-    weakest = directions[:, -1] / directions[np.argmax(np.abs(directions[:, -1])), -1]
+    sizes, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    weakest = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
     sd = np.sqrt(np.diag(covariance))
     seen = {k: converged and bool(s < WEAK) for k, s in zip(names, sd / scale, strict=True)}
-    alone = np.sqrt(np.diag(inverse_information(data))[:n])
+    alone = np.sqrt(np.diag(directions(data).inverse())[:n])
     spread, own = (dict(zip(names, x.tolist(), strict=True)) for x in (sd, alone))
     unseen = [k for k in names if not seen[k]]
     checks = {

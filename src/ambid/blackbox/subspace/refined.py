@@ -23,8 +23,8 @@ from ambid.blackbox.subspace.prediction_error import Found, Point, searched, sta
 from ambid.blackbox.subspace.realisation import Realisation, kalman_gain
 from ambid.blackbox.subspace.units import embedded, operating_point, with_units
 from ambid.errors import EstimationError
+from ambid.estimation.linear import directions
 from ambid.estimation.threads import one_thread
-from ambid.estimation.uncertainty import inverse_information
 
 Tick = Callable[[], None] | None
 
@@ -131,7 +131,7 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
     core, scale = with_units(scaled, given, data.dt)
     model, places = embedded(core, plan.nk)
     half = found.tangent * scale[:, None]
-    own = half @ inverse_information(found.information) @ half.T * widened
+    own = half @ directions(found.information).inverse() @ half.T * widened
     covariance = np.zeros((model.theta.size, model.theta.size))
     covariance[np.ix_(places, places)] = 0.5 * (own + own.T)
     condition = _condition(found.information)

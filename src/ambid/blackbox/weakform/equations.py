@@ -19,7 +19,7 @@ from ambid.blackbox.weakform._rows import Rows
 from ambid.blackbox.weakform.bumps import Bump
 from ambid.blackbox.weakform.system import System
 from ambid.errors import EstimationError
-from ambid.estimation.uncertainty import inverse_information
+from ambid.estimation.linear import directions
 
 _ROUNDS = 40
 _SETTLED = 1e-7  # step in standard deviations
@@ -74,7 +74,7 @@ def solve(system: System, bump: Bump, start: Mapping[str, float] | None = None) 
     s = np.linalg.svd(state.Z / size, compute_uv=False)
     return Solution(
         theta=dict(zip(system.names, theta.tolist(), strict=True)),
-        covariance=scale2 * inverse_information(state.Z),
+        covariance=scale2 * directions(state.Z).inverse(),
         scale=float(np.sqrt(scale2)),
         half=bump.half,
         rows=rows,

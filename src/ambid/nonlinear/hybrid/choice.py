@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.estimation.criteria import penalty
 from ambid.estimation.progress import Tick, part_of, portions
+from ambid.estimation.search import Found, search
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.hybrid.function import HybridShape
 from ambid.nonlinear.hybrid.settings import MOST_NOISE
 from ambid.nonlinear.hybrid.train import HybridProblem, Parts, problem_at, random_start
-from ambid.nonlinear.narmax.selection import penalty
-from ambid.nonlinear.search import Found, search
 
 Counted = tuple[NDArray[np.bool_], ...]
 

@@ -18,6 +18,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
+from ambid.estimation.search import search
 from ambid.nonlinear.failed import failed_fit
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.nonlinear.hybrid.choice import Tried, chosen_neurons, chosen_noise, inverted, learning, moved, trained
@@ -30,7 +31,6 @@ from ambid.nonlinear.narmax import PolynomialNarmax, narmax
 from ambid.nonlinear.narmax.scaled import Scaled, scaled_records
 from ambid.nonlinear.narmax.terms import Term, lagged, products
 from ambid.nonlinear.networks.narx_function import NarxShape
-from ambid.nonlinear.search import search
 
 _ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
+from ambid.estimation.linear import information_inverse
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.failed import failed_fit, provenance
 from ambid.nonlinear.fit import NonlinearFit
@@ -20,7 +21,6 @@ from ambid.nonlinear.hybrid.settings import HybridSettings
 from ambid.nonlinear.hybrid.train import HybridProblem, problem_at, whitening
 from ambid.nonlinear.narmax.scaled import Scaled
 from ambid.nonlinear.narmax.terms import term_name
-from ambid.nonlinear.search import information_inverse
 
 if TYPE_CHECKING:
     from ambid.nonlinear.hybrid.estimate import Work

@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.criteria import penalty
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, guessed
+from ambid.estimation.search import search
 from ambid.nonlinear.hybrid.choice import ROUGH, moved
 from ambid.nonlinear.hybrid.function import HybridShape
 from ambid.nonlinear.hybrid.train import HybridProblem, problem_at
-from ambid.nonlinear.narmax.selection import penalty
 from ambid.nonlinear.narmax.terms import Term
-from ambid.nonlinear.search import information_inverse, search
 
 Keep = Callable[[HybridShape, Array], None]
 

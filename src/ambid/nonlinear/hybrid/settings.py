@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from ambid.errors import EstimationError
-from ambid.nonlinear.narmax.selection import CRITERIA
+from ambid.estimation.criteria import CRITERIA
 from ambid.nonlinear.settings import checked
 
 MOST_NOISE = 4  # largest order of C that is tried where it is left open

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.hybrid.function import HybridShape, Rows
-from ambid.nonlinear.search import triangle_of
 
 Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""

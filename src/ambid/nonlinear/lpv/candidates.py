@@ -11,6 +11,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.estimation.progress import Tick, guessed, portions
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.lpv.beginning import looks_back
 from ambid.nonlinear.lpv.choice import error_orders, information, slowest_mode, slowest_that_does, time_constants
@@ -20,7 +21,6 @@ from ambid.nonlinear.lpv.settings import LpvSettings
 from ambid.nonlinear.lpv.shape import LpvShape, Part, part_of, stable_process
 from ambid.nonlinear.lpv.start import by_long_regression, from_earlier, least_squares, padded, without_error_model
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import search
 
 _DEGREES = (0, 1, 2, 3)
 _USUAL = 8.0  # iterations, half of what a search takes

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.lpv.shape import LpvShape, Part, errors, sound
-from ambid.nonlinear.search import triangle_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,11 +9,11 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
+from ambid.estimation.linear import information_inverse
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.failed import provenance
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.lpv.model import LpvModel, regressors
-from ambid.nonlinear.search import information_inverse
 
 if TYPE_CHECKING:
     from ambid.nonlinear.lpv.candidates import Work

@@ -13,9 +13,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.roots import reflected
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.lpv.schedule import basis_values
 from ambid.nonlinear.lpv.shape import LpvShape, Part, errors
-from ambid.nonlinear.search import triangle_of
 
 _BLIND = 1e-10
 _LONG, _ROWS = 4, 20  # lags of the long regression, times the order of C; samples for each of its numbers

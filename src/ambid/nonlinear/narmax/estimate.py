@@ -17,6 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import information
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.nonlinear.narmax.choose import Draft, process_terms, sampled_fast
@@ -27,7 +28,6 @@ from ambid.nonlinear.narmax.rational import rational_terms
 from ambid.nonlinear.narmax.result import failed_fit, finished_fit
 from ambid.nonlinear.narmax.scaled import Scaled, scaled_records
 from ambid.nonlinear.narmax.search import Fitted, evaluated, search
-from ambid.nonlinear.narmax.selection import information
 from ambid.nonlinear.narmax.settings import NarmaxSettings, narmax_settings
 from ambid.nonlinear.narmax.simulated_choice import terms_by_simulation
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.estimation.criteria import information, penalty
 from ambid.estimation.progress import Tick, guessed
 from ambid.nonlinear.narmax.choose import Draft
 from ambid.nonlinear.narmax.search import evaluated, triangle
-from ambid.nonlinear.narmax.selection import information, penalty
 
 Parts = Sequence[tuple[Array, Array]]
 

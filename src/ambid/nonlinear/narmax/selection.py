@@ -10,20 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import lgamma, log
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.estimation.criteria import EXACT, information, penalty
 from ambid.nonlinear.narmax.candidates import Candidates, MatrixCandidates
 
-CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
 _SHORT = 1e-6  # squared length left of a candidate below which its Gram matrix has too few digits to choose it
 _SPENT = 1e-10  # the same for the output
 _DEPENDENT = 1e-20  # squared length left, by QR, of a candidate that the chosen ones hold already
 _ROUNDING = 1e-14  # of an entry of the Gram matrix
-_EXACT = 1e-26  # part of the output's energy below which nothing is left to explain
 _MOST_PASSES = 8
 
 
@@ -103,37 +100,6 @@ def select_terms(
     )
 
 
-def information(criterion: str, left: float, k: int, n: int, m: int) -> float:
-    """Return an information criterion of a least-squares fit, up to a constant.
-
-    `criterion`: one of `CRITERIA`; `left`: mean square error, in any unit; `k`, `n`, `m`: terms, samples, candidates.
-    """
-    return n * log(max(left, _EXACT)) + penalty(criterion, k, n, m)
-
-
-def penalty(criterion: str, k: int, n: int, m: int) -> float:
-    """Return what k of m candidates cost on n samples.
-
-    Returns infinite where there are too few samples.
-    """
-    if criterion in ("bic", "mdl"):
-        return k * log(n)
-    if criterion == "ebic":
-        j = min(k, m // 2)  # beyond, fewer and fewer choices would make terms cheap: none of all could go again
-        return k * log(n) + 2.0 * (lgamma(m + 1) - lgamma(j + 1) - lgamma(m - j + 1))
-    if criterion == "aic":
-        return 2.0 * k
-    if criterion == "aicc":
-        return 2.0 * k * n / (n - k - 1) if n > k + 1 else float("inf")
-    if criterion == "fpe":
-        return n * log((n + k) / (n - k)) if n > k else float("inf")
-    if criterion == "lilc":
-        return 2.0 * k * log(max(log(n), 1.0))
-    raise EstimationError(
-        f"criterion {criterion!r} is not known; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
-    )
-
-
 class _Gram:
     """Scalar products of what is left of candidates and output, orthogonal to those chosen so far."""
 
@@ -155,7 +121,7 @@ class _Gram:
         """Whether something is left to explain, looked at closely where digits have run short."""
         if self.since and self.left <= _SPENT * self.base and self.passes < _MOST_PASSES:
             self._measure()
-        return self.left > _EXACT
+        return self.left > EXACT
 
     def winner(self, wanted: int | None) -> int | None:
         """Return the candidate with the largest error reduction ratio; None where none explains anything."""

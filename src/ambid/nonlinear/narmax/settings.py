@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from ambid.errors import EstimationError, nearest
-from ambid.nonlinear.narmax.selection import CRITERIA
+from ambid.estimation.criteria import CRITERIA
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "criterion": CRITERIA,

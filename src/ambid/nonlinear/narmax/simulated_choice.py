@@ -15,12 +15,12 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import information
 from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.nonlinear.narmax.choose import Draft, process_terms
 from ambid.nonlinear.narmax.folded import linear_folded
 from ambid.nonlinear.narmax.recursion import predicted, sensitivities, tables
 from ambid.nonlinear.narmax.search import evaluated, search, triangle
-from ambid.nonlinear.narmax.selection import information
 from ambid.nonlinear.narmax.settings import NarmaxSettings
 from ambid.nonlinear.narmax.terms import Term, lagged, products
 

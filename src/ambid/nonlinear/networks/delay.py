@@ -10,11 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, guessed
+from ambid.estimation.search import search
 from ambid.nonlinear.networks.nn_train import State
 from ambid.nonlinear.networks.segments import largest_pole
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import search, triangle_of
 
 LARGEST = 20  # samples that are looked for
 _HISTORY = 12  # past outputs

@@ -17,7 +17,9 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
+from ambid.estimation.search import Found, search
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.failed import failed_fit, provenance
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit
@@ -25,7 +27,6 @@ from ambid.nonlinear.networks.magnitude_model import MagnitudeNetwork
 from ambid.nonlinear.networks.magnitude_problem import FoldedLayout, FoldedProblem, Parts, states
 from ambid.nonlinear.networks.magnitude_start import MOST_STATES, folded_starts
 from ambid.nonlinear.records import scaled_records
-from ambid.nonlinear.search import Found, information_inverse, search
 
 USED = ("output", "states", "neurons", "prior", "starts", "iterations")
 _REFINED = 8  # linear starts that are searched from

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.nonlinear.search import triangle_of
+from ambid.estimation.linear import triangle_of
 
 Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples,) and inputs (n_samples, n_inputs) of each record, scaled."""

@@ -17,6 +17,8 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions
+from ambid.estimation.search import Found, search
+from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.failed import failed_fit
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.nonlinear.networks.narx_choice import Tried, chosen_sizes, held_out_error, problem_at, split
@@ -24,9 +26,7 @@ from ambid.nonlinear.networks.narx_function import NarxShape
 from ambid.nonlinear.networks.narx_result import finished
 from ambid.nonlinear.networks.narx_train import linear_start, random_start
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.search import Found, search
 from ambid.nonlinear.settings import checked
-from ambid.nonlinear.spread import bootstrapped
 
 _RANGES: Mapping[str, tuple[float, float]] = {
     "ny": (0, 50),

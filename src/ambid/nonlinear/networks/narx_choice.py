@@ -10,10 +10,10 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick
+from ambid.estimation.search import search
 from ambid.nonlinear.networks.narx_function import NarxShape
 from ambid.nonlinear.networks.narx_train import NarxProblem, linear_start, random_start
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.search import search
 
 _LAGS = (1, 2, 3, 4, 6)
 _NEURONS = (2, 4, 8, 12)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import information_inverse
+from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.networks.narx_train import NarxProblem
-from ambid.nonlinear.search import information_inverse
-from ambid.nonlinear.spread import sandwich
 
 
 def laplace(problem: NarxProblem, theta: Array) -> tuple[Array | None, Array, float]:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.networks.narx_function import NarxShape
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.search import triangle_of
 
 _BLOCK = 4096
 _LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none

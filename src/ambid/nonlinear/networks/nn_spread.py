@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick
+from ambid.estimation.uncertainty import bootstrapped, sandwich, score_covariance, widening
 from ambid.nonlinear.networks.nn_train import State, white
 from ambid.nonlinear.networks.residual import Orthogonal, Ridge, units
 from ambid.nonlinear.networks.segments import StateProblem
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import information_inverse
-from ambid.nonlinear.spread import bootstrapped, sandwich, score_covariance, widening
 
 _AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
 _LONG = 1.0 / 16.0  # of a record, as a block: where it goes hangs together for as long as its slowest motion lasts

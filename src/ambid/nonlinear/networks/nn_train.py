@@ -8,6 +8,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick, part_of
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.networks.layout import Layout
 from ambid.nonlinear.networks.residual import Orthogonal, Ridge
@@ -15,7 +16,6 @@ from ambid.nonlinear.networks.segments import Penalty, StateProblem, largest_pol
 from ambid.nonlinear.networks.start import carried_to_continuous, widened
 from ambid.nonlinear.networks.thesis_training import trained_one_step
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import search
 
 Trained = tuple["State", LearningCurve, bool] | None
 

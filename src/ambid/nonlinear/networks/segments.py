@@ -14,9 +14,9 @@ from typing import Protocol
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.networks.layout import Layout, Matrices
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.search import triangle_of
 
 _ROWS = 2048  # that are joined and reduced at once: they stay in the cache
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick, part_of
+from ambid.estimation.search import search
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.networks.nn_train import State, Trained, added_gain, relative_error
 from ambid.nonlinear.networks.segments import StateProblem
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import search
 
 _ROUNDS = 4  # of weighting: sizes of errors and jumps are known only afterwards
 

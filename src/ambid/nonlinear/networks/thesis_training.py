@@ -11,8 +11,8 @@ from time import perf_counter
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.fit import LearningCurve
-from ambid.nonlinear.search import triangle_of
 
 
 def trained_one_step(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.nonlinear.search import triangle_of
+from ambid.estimation.linear import triangle_of
 
 _DEPENDENT = 1e-10  # squared length left of a candidate that the chosen ones hold already
 _LLOYD = 50  # iterations at most

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.criteria import penalty
 from ambid.estimation.progress import Tick
-from ambid.nonlinear.narmax.selection import penalty
 from ambid.nonlinear.rbf.placing import MIDDLE, NEURONS, Placing, Told, shape_of
 from ambid.nonlinear.rbf.shape import RbfShape
 from ambid.nonlinear.rbf.weights import Weights

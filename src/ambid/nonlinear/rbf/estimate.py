@@ -17,6 +17,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
+from ambid.estimation.search import Found, search
 from ambid.nonlinear.failed import failed_fit
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
 from ambid.nonlinear.rbf.choice import Tried, chosen, error, split
@@ -28,7 +29,6 @@ from ambid.nonlinear.rbf.shape import RbfShape
 from ambid.nonlinear.rbf.units import UNITS
 from ambid.nonlinear.rbf.weights import fitted_weights
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.search import Found, search
 from ambid.nonlinear.settings import checked
 
 _RANGES: Mapping[str, tuple[float, float]] = {

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.rbf.shape import RbfShape
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.search import triangle_of
 
 _BLOCK = 4096
 _OPEN = 1e-4  # one over the standard deviation of the linear part and the constant before the data: next to no prior

@@ -11,6 +11,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
+from ambid.estimation.linear import information_inverse
+from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.failed import NO_WEIGHTS, failed_fit, provenance
 from ambid.nonlinear.fit import NonlinearFit
@@ -18,8 +20,6 @@ from ambid.nonlinear.rbf.choice import error
 from ambid.nonlinear.rbf.model import RbfNetwork
 from ambid.nonlinear.rbf.problem import RbfProblem, problem_at
 from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.search import information_inverse
-from ambid.nonlinear.spread import sandwich
 
 if TYPE_CHECKING:
     from ambid.nonlinear.rbf.estimate import Work

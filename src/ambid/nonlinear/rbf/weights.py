@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.rbf.shape import RbfShape
-from ambid.nonlinear.search import triangle_of
 
 _BLOCK = 4096
 _GRID = 10.0 ** np.arange(-15.0, 4.0, 0.25)  # of sigma^2 / alpha^2, in squared singular values

@@ -10,8 +10,8 @@ import numpy as np
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import skipped
 from ambid.validate.ahead import covariance_ahead, errors_ahead
-from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.predictor import errors_elsewhere
 from ambid.validate.prediction import fit_of
 

@@ -11,10 +11,10 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import criteria
 from ambid.estimation.estimate import OutputFit
 from ambid.validate.blackbox.checks import coloured_warning, feedback_warning, residual_verdicts, stable_predictor
 from ambid.validate.blackbox.colour import coloured_covariance
-from ambid.validate.blackbox.criteria import criteria
 from ambid.validate.blackbox.gradient import gradient
 from ambid.validate.blackbox.order_support import orders_supported
 from ambid.validate.blackbox.predictor import Errors, errors, errors_elsewhere

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.validate.blackbox.criteria import skipped
+from ambid.estimation.criteria import skipped
 from ambid.validate.blackbox.gradient import Gradient
 from ambid.validate.blackbox.predictor import Errors
 from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score

@@ -10,9 +10,9 @@ import numpy as np
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import criteria, skipped
 from ambid.estimation.estimate import OutputFit
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.validate.blackbox.criteria import criteria, skipped
 from ambid.validate.nonlinear.checks import (
     extrapolation_warnings,
     feedback_warnings,

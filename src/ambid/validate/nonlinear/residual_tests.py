@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
+from ambid.estimation.criteria import skipped
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.validate.blackbox.criteria import skipped
 from ambid.validate.blackbox.residual_tests import WHITE_LAGS, input_lags
 from ambid.validate.blackbox.score import Score, autoregression, instrumental_score, score
 from ambid.validate.nonlinear.runs import Run, looks_back, model_of

@@ -1,4 +1,4 @@
-"""Information criteria of one-step errors, so defined that all structures on the same data compare.
+"""Information criteria, so defined that all structures on the same data compare.
 
 With N samples, n_y outputs, S = (1/N) sum e e' of the one-step errors and d estimated numbers (offsets and initial
 states, which every structure has, not counted), the Gaussian log likelihood at its maximum is
@@ -18,11 +18,15 @@ multiplied.
 
 from __future__ import annotations
 
+from math import lgamma, log
+
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.errors import EstimationError, nearest
 
-NAMES = ("aic", "aicc", "bic", "mdl", "fpe")
+CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
+EXACT = 1e-26  # part of the output's energy below which nothing is left to explain
 _SKIP = 100  # samples left out at the start, at most a tenth of the record
 _FLOOR = 1e-13  # least error over the size of the output: below is rounding
 
@@ -63,3 +67,34 @@ def log_determinant(e: Array, y: Array) -> float:
     size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
     s = np.linalg.svd(e / size, compute_uv=False) / np.sqrt(e.shape[0])
     return float(2 * np.sum(np.log(np.maximum(s, _FLOOR))) + 2 * np.sum(np.log(size)))
+
+
+def information(criterion: str, left: float, k: int, n: int, m: int) -> float:
+    """Return an information criterion of a least-squares fit, up to a constant.
+
+    `criterion`: one of `CRITERIA`; `left`: mean square error, in any unit; `k`, `n`, `m`: terms, samples, candidates.
+    """
+    return n * log(max(left, EXACT)) + penalty(criterion, k, n, m)
+
+
+def penalty(criterion: str, k: int, n: int, m: int) -> float:
+    """Return what k of m candidates cost on n samples.
+
+    Returns infinite where there are too few samples.
+    """
+    if criterion in ("bic", "mdl"):
+        return k * log(n)
+    if criterion == "ebic":
+        j = min(k, m // 2)  # beyond, fewer and fewer choices would make terms cheap: none of all could go again
+        return k * log(n) + 2.0 * (lgamma(m + 1) - lgamma(j + 1) - lgamma(m - j + 1))
+    if criterion == "aic":
+        return 2.0 * k
+    if criterion == "aicc":
+        return 2.0 * k * n / (n - k - 1) if n > k + 1 else float("inf")
+    if criterion == "fpe":
+        return n * log((n + k) / (n - k)) if n > k else float("inf")
+    if criterion == "lilc":
+        return 2.0 * k * log(max(log(n), 1.0))
+    raise EstimationError(
+        f"criterion {criterion!r} is not known; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
+    )

@@ -1,0 +1,208 @@
+"""Covariance of the estimated physical parameters, and what the data do not show.
+
+The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound;
+Ljung 1999, sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores
+of stretches of the record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.innovations import stable
+from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of
+from ambid.estimation.linear import directions
+from ambid.estimation.predictor import assemble
+from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
+from ambid.estimation.uncertainty import WEAK
+
+_SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
+_LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask
+_FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
+_BATCHES = 30  # stretches of the record for the robust covariance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Uncertainty:
+    """What a fit knows of its physical parameters.
+
+    `memories`: length of the record in memories of the predictor; infinite where the gain is not estimated.
+    """
+
+    names: tuple[str, ...]  # estimated physical parameters
+    # (n, n), SI, covariance from the information matrix, priors included, and from what a short record leaves open of
+    # the noise levels
+    information: Array
+    robust: Array  # (n, n), SI, covariance from the scores of stretches of the record
+    # (n,), SI, standard deviations that the data alone would give; very large where they show nothing
+    data_only_sd: Array
+    # (n,), SI, size against which a standard deviation is judged: the value, or the natural scale of a parameter that
+    # may be zero
+    scale: Array
+    # (n,), of the information matrix of the physical parameters scaled by their values, largest first, as 1 / relative
+    # standard deviation along each direction
+    singular_values: Array
+    # direction with the smallest singular value: share of each parameter, largest in magnitude 1
+    weakest: dict[str, float]
+    delay_sd: float | None  # standard deviation of an estimated delay in samples
+    # (n, n), SI, covariance with the noise levels taken as known well: what `information` is for a long record
+    fisher: Array
+    # (n,), SI, how far the parameters move when the data are used differently, where that is more than chance allows;
+    # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
+    disagreement: Array
+
+    @property
+    def widening(self) -> float:
+        """Largest ratio of standard deviations with noise levels known roughly to those with them known well."""
+        return float(np.max(np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.fisher), 1e-300))))
+
+    @property
+    def inflation(self) -> float:
+        """Largest ratio of robust to information standard deviation."""
+        return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.fisher), 1e-300))))
+
+    def covariance(self, *, robust: bool) -> Array:
+        """Return the covariance that goes with `standard_deviations`.
+
+        `robust`: whether a check said that the model is only near the truth. Returns (n, n), SI, if robust:
+        correlations from the scores, the larger of both standard deviations, plus the disagreement.
+        """
+        if not robust:
+            return self.information
+        plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
+        larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
+        return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
+
+    def standard_deviations(self, *, robust: bool) -> Array:
+        """Return standard deviations: from the information matrix, or robust ones, which are never smaller.
+
+        `robust`: whether a check said that the model is only near the truth. Returns (n,), SI.
+        """
+        return np.asarray(np.sqrt(np.diag(self.covariance(robust=robust))))
+
+    def relative_sd(self, *, robust: bool) -> Array:
+        """Return standard deviations over `scale`.
+
+        `robust`: as for `standard_deviations`. Returns (n,).
+        """
+        return np.asarray(self.standard_deviations(robust=robust) / self.scale)
+
+    def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
+        """Return which parameters have a relative standard deviation below 25 %.
+
+        `robust`: as for `standard_deviations`.
+        """
+        return tuple(bool(r < WEAK) for r in self.relative_sd(robust=robust))
+
+
+def uncertainty(fit: Fit) -> Uncertainty:
+    """Compute covariances and the identifiability verdict of a fit.
+
+    `fit`: not failed.
+    """
+    problem, sl = fit.problem, fit.problem.slices
+    n, size = problem.n_physical, problem.magnitude
+    whole = directions(np.vstack([fit.J, fit.J_prior])).inverse()
+    unit = np.outer(size, size)
+    information = (whole[:n, :n] + _left_open(fit)) * unit
+    noise_only = fit.J_prior.copy()
+    noise_only[:, :n] = 0.0
+    data_only = np.sqrt(np.diag(directions(np.vstack([fit.J, noise_only])).inverse())[:n]) * size
+    values = fit.vector[sl["physical"]] * size
+    theta = problem.parameters(fit.vector)
+    reference = problem.model.references(theta)
+    scale = np.array([max(abs(v), reference.get(k, 0.0)) for k, v in zip(problem.estimated, values, strict=True)])
+    scale = np.maximum(scale, 1e-300)
+    eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
+    weak = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
+    delay_sd = float(np.sqrt(whole[sl["fraction"], sl["fraction"]][0, 0])) if problem.fractional else None
+    return Uncertainty(
+        names=problem.estimated,
+        information=information,
+        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
+        data_only_sd=data_only,
+        scale=scale,
+        singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
+        weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
+        delay_sd=delay_sd,
+        fisher=whole[:n, :n] * unit,
+        disagreement=np.zeros(n),
+    )
+
+
+def _left_open(fit: Fit) -> Array:
+    """Covariance that a short record adds by leaving the noise levels open, (n, n), over the magnitudes.
+
+    For each disturbance, at the upper end of what the likelihood allows for its level: by how much the information
+    shrinks, and how far the parameters move. Nothing for a long record, or where noise levels do not matter.
+    """
+    problem, predictor = fit.problem, assemble(fit.problem, fit.vector, with_derivatives=False)
+    n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
+    if problem.noise != "levels" or predictor is None or stable(predictor.A):
+        return extra
+    slowest = np.max(np.abs(np.linalg.eigvals(predictor.M[:, : predictor.x0.size])))
+    memories = problem.n_used * (1.0 - slowest)
+    if memories > _LONG:
+        return extra
+    work, here = Workspace(problem), directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
+    for j in range(len(problem.model.disturbances)):
+        upper = _upper_level(fit, j, work)
+        _, covariance = evaluate(problem, upper, work)
+        at = None if covariance is None else linearise(problem, upper, weight_of(covariance), work)
+        if at is not None:
+            r, rows = prior_rows(problem, upper)
+            J, free = np.vstack([at.J, rows]), np.ones(problem.size, dtype=bool)
+            free[problem.slices["noise"].start + j] = False  # this level stays where it was put
+            there = directions(J[:, free]).inverse()
+            step = -(there @ (J[:, free].T @ np.concatenate([at.r, r])))[:n]
+            wider = max(0.0, float(np.max(np.diag(there)[:n] / np.diag(here))) - 1.0)
+            extra += wider * here + np.outer(step, step)
+    extra += max(0.0, _SHORT / max(memories, 1e-3) - 1.0) * (here + extra)
+    felt = np.sqrt(np.max(1.0 + np.diag(extra) / np.diag(here))) > _FELT
+    return extra if felt else np.zeros_like(extra)
+
+
+def _upper_level(fit: Fit, j: int, work: Workspace) -> Array:
+    """The fit with one log disturbance level raised to the end of its 95 % interval: the criterion has risen by 4."""
+    place, inside, outside = fit.problem.slices["noise"].start + j, 0.0, 0.1
+
+    def rise(step: float) -> float:
+        moved = fit.vector.copy()
+        moved[place] += step
+        return evaluate(fit.problem, moved, work)[0] - fit.criterion
+
+    while outside < 20.0 and rise(outside) < 4.0:
+        inside, outside = outside, 2 * outside
+    for _ in range(4):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if rise(middle) < 4.0 else (inside, middle)
+    upper = fit.vector.copy()
+    upper[place] += inside
+    return upper
+
+
+def _gram(a: Array) -> Array:
+    """Positive semidefinite product a a^T."""
+    return np.asarray(a @ a.T)
+
+
+def _scores(fit: Fit) -> Array:
+    """Scores of the stretches of the record, (n_stretches, size); their scatter is the middle of the sandwich."""
+    problem, work = fit.problem, Workspace(fit.problem)
+    p, n_used = problem.size, problem.n_used
+    length = max(1, n_used // _BATCHES)
+    scores = np.zeros((-(-n_used // length), p))
+    first = 0
+    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
+        m = rows.shape[0]
+        stretch = np.arange(first, first + m) // length
+        for b in range(stretch[0], stretch[-1] + 1):
+            part = rows[stretch == b].reshape(-1, p + 1)
+            scores[b] += part[:, :p].T @ part[:, p]
+        first += m
+    scores -= scores.mean(axis=0)
+    count = scores.shape[0]
+    return np.asarray(scores * np.sqrt(count / max(count - 1, 1)))

@@ -1,0 +1,122 @@
+"""Linear least squares by QR and singular values of scaled columns, with one tolerance for what the data do not see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+
+BLIND = 1e-11  # singular values of the scaled matrix below this part of the largest are directions nobody sees
+_ROUNDING = 1e-15  # least singular value, over the largest, that a variance is taken from
+_TINY = 1e-150  # length of a column from which it is divided by
+_NOTHING = 1e-100  # length that an empty column counts as having where a variance is taken from it
+_BLOCK = 4096  # rows that are reduced at once: they stay in the cache
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Singular directions of A with its columns scaled to unit length: A = U diag(s) Vt diag(size)."""
+
+    U: Array  # (n_rows, rank)
+    s: Array  # (rank,), largest first
+    Vt: Array  # (rank, n_columns)
+    size: Array  # (n_columns,), lengths of the columns; 1 for a column of zeros
+    empty: NDArray[np.bool_]  # (n_columns,), which columns hold nothing but zeros
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which directions the data see."""
+        return np.asarray(self.s > BLIND * max(self.s[0] if self.s.size else 0.0, 1e-300))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled matrix."""
+        return float(self.s[0] / max(self.s[-1], 1e-300)) if self.s.size else 1.0
+
+    def solve(self, b: Array, damping: float = 0.0) -> Array:
+        """Return x of the smallest |A x - b|² + damping |size x|², zero along directions that nobody sees.
+
+        `b`: (n_rows,) or (n_rows, n_columns).
+        """
+        gain = np.where(self.seen, self.s / (self.s**2 + damping), 0.0) if damping else self._inverse_values()
+        return np.asarray(((self.Vt.T * gain) @ (self.U.T @ b)).T / self.size).T
+
+    def explain(self, b: Array) -> float:
+        """Return the squared length of b inside the columns' space: by how much a full step lowers |A x - b|²."""
+        along = self.U[:, self.seen].T @ b
+        return float(np.sum(along**2))
+
+    def root(self, least: float = _ROUNDING) -> Array:
+        """Return H with H Hᵀ = (AᵀA)⁻¹; a direction without information gets a huge length, not an infinite one.
+
+        `least`: smallest singular value that counts, over the largest.
+        """
+        s = np.maximum(self.s, max(least * (self.s[0] if self.s.size else 1.0), 1e-300))
+        size = np.where(self.empty, _NOTHING, self.size)
+        return np.asarray(self.Vt.T / s / size[:, None])
+
+    def inverse(self, least: float = _ROUNDING) -> Array:
+        """Return (AᵀA)⁻¹, see `root`."""
+        half = self.root(least)
+        return np.asarray(half @ half.T)
+
+    def _inverse_values(self) -> Array:
+        seen = self.seen
+        return np.where(seen, 1.0 / np.where(seen, self.s, 1.0), 0.0)
+
+
+def directions(A: Array) -> Directions:
+    """Return the singular directions of a matrix with its columns scaled to unit length."""
+    size = column_sizes(A)
+    U, s, Vt = np.linalg.svd(A / size, full_matrices=False)
+    return Directions(U, s, Vt, size, np.linalg.norm(A, axis=0) <= _TINY)
+
+
+def column_sizes(A: Array) -> Array:
+    """Return the lengths of the columns, 1 where there is nothing to scale."""
+    size = np.linalg.norm(A, axis=0)
+    return np.asarray(np.where(size > _TINY, size, 1.0))
+
+
+def least_squares(A: Array, b: Array) -> Array:
+    """Solve A x = b in least squares, the smallest scaled x where the data do not tell.
+
+    `A`: (n_rows, n), `b`: (n_rows,) or (n_rows, n_right). Tall matrices are reduced by QR before.
+    """
+    n, right = A.shape[1], b.reshape(b.shape[0], -1)
+    if A.shape[0] > n + right.shape[1]:
+        R = triangle_of([np.hstack([A, right])])
+        A, right = R[:, :n], R[:, n:]
+    found = directions(A).solve(right)
+    return found if b.ndim > 1 else found[:, 0]
+
+
+def triangle_of(rows: Sequence[Array]) -> Array:
+    """Return the triangle of stacked rows.
+
+    `rows`: (n_rows, n_columns). Returns (at most n_columns, n_columns).
+    """
+    small = [
+        part if part.shape[0] <= part.shape[1] else np.asarray(np.linalg.qr(part, mode="r"))
+        for block in rows
+        for part in (block[k : k + _BLOCK] for k in range(0, block.shape[0], _BLOCK))
+    ]
+    return small[0] if len(small) == 1 else np.asarray(np.linalg.qr(np.concatenate(small), mode="r"))
+
+
+def information_inverse(R: Array) -> tuple[Array | None, float]:
+    """Return the inverse of RᵀR, None where a direction is not seen at all, and the condition number of the scaled R.
+
+    `R`: (n_rows, n), a triangle without its last column.
+    """
+    if R.shape[0] < R.shape[1] or not np.all(np.isfinite(R)) or not np.all(np.linalg.norm(R, axis=0) > _TINY):
+        return None, np.inf
+    found = directions(R)
+    if found.condition > 1.0 / BLIND:
+        return None, found.condition
+    inverse = found.inverse()
+    return (inverse + inverse.T) / 2.0, found.condition
