@@ -1,0 +1,175 @@
+"""The square-root core of all recursions: a covariance P = U D Uᵀ, changed by rank-one steps and carried over time.
+
+U is a unit upper triangle. `F` (n, n) holds it so that a column lies together in memory: row j has column j of U before
+its diagonal, and D_j on it; what stands behind is never read. D stays positive whatever is rounded, and nothing takes a
+root (Bierman 1977, ch. III, V and VI). Functions that take fewer than n numbers work on the leading states.
+"""
+
+from __future__ import annotations
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+
+_SINGULAR = 1e-8  # what a covariance may lose by a subtraction, relative
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def project(F: Array, h: Array, f: Array) -> None:
+    """Fill f with Uᵀ h."""
+    for j in range(f.size):
+        x = h[j]
+        for i in range(j):
+            x += F[j, i] * h[i]
+        f[j] = x
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def size(F: Array, f: Array) -> float:
+    """Return hᵀ P h for f = Uᵀ h."""
+    total = 0.0
+    for j in range(f.size):
+        total += F[j, j] * f[j] * f[j]
+    return total
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def variance(F: Array, i: int) -> float:
+    """Return the variance of state i."""
+    total = F[i, i]
+    for j in range(i + 1, F.shape[0]):
+        total += F[j, j] * F[j, i] * F[j, i]
+    return float(total)
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def solve(F: Array, a: Array) -> None:
+    """Replace a by U⁻¹ a."""
+    for j in range(a.size - 1, 0, -1):
+        for i in range(j):
+            a[i] -= a[j] * F[j, i]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def shrink(F: Array, f: Array, r: float, k: Array) -> float:
+    """Take in a measurement of noise variance r > 0 that sees f = Uᵀ h (Bierman 1977, sec. V.3).
+
+    P becomes P - P h hᵀ P / α. Leaves P h in k and returns α = r + hᵀ P h.
+    """
+    alpha, inverse = r, 1.0 / r
+    for j in range(f.size):
+        before, part = alpha, -f[j] * inverse
+        g = F[j, j] * f[j]
+        alpha += g * f[j]
+        inverse = 1.0 / alpha
+        F[j, j] *= before * inverse
+        for i in range(j):
+            x = F[j, i]
+            F[j, i] = x + part * k[i]
+            k[i] += x * g
+        k[j] = g
+    return alpha
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def widen(F: Array, a: Array, q: float) -> None:
+    """Replace P by P + q a aᵀ, q > 0 (Agee and Turner; Bierman 1977, sec. III.3); `a` is used up."""
+    for j in range(a.size - 1, -1, -1):
+        x, d = a[j], F[j, j]
+        new = d + q * x * x
+        if new > 0.0:
+            part = q * x / new
+            q *= d / new
+            F[j, j] = new
+            for i in range(j):
+                a[i] -= x * F[j, i]
+                F[j, i] += part * a[i]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def narrow(F: Array, a: Array, k: Array) -> bool:
+    """Replace P by P - a aᵀ; leave it and return False where that is not positive. `a` is used up, `k` is scratch.
+
+    With U p = a the difference is U (D - p pᵀ) Uᵀ, which is a measurement whose noise is what p leaves of one: nothing
+    cancels.
+    """
+    solve(F, a)
+    rest = 1.0
+    for j in range(a.size):
+        p = a[j]
+        a[j] /= F[j, j]
+        rest -= p * a[j]
+    if not rest > _SINGULAR:
+        return False
+    shrink(F, a, rest, k)
+    return True
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def orthogonalise(W: Array, w: Array, F: Array) -> None:
+    """Make the leading block of F the factors of W diag(w) Wᵀ; W is used up.
+
+    Modified weighted Gram-Schmidt (Bierman 1977, sec. VI.4): as stable as reflections, and without roots.
+    """
+    rows, columns = W.shape
+    for j in range(rows - 1, -1, -1):
+        square = 0.0
+        for c in range(columns):
+            square += W[j, c] * W[j, c] * w[c]
+        F[j, j] = square
+        inverse = 1.0 / square if square > 0.0 else 0.0
+        for i in range(j):
+            along = 0.0
+            for c in range(columns):
+                along += W[i, c] * W[j, c] * w[c]
+            along *= inverse
+            F[j, i] = along
+            for c in range(columns):
+                W[i, c] -= along * W[j, c]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def follow(F: Array, A: Array, J: Array, v: Array) -> None:
+    """Move what the leading states x⁺ = A x + J z have in common with the states z behind them, which stay.
+
+    `J` may have fewer columns than there are z; `v` is scratch. The block of x itself is left to `orthogonalise`.
+    """
+    n, known = A.shape[0], A.shape[0] + J.shape[1]
+    for j in range(n, F.shape[0]):
+        for i in range(n):
+            x = J[i, j - n] if j < known else 0.0
+            for c in range(n):
+                x += A[i, c] * F[j, c]
+            for c in range(n, min(j, known)):
+                x += J[i, c - n] * F[j, c]
+            v[i] = x
+        for i in range(n):
+            F[j, i] = v[i]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def spread(F: Array, A: Array, W: Array, w: Array) -> None:
+    """Fill the first columns of W with A U and of w with D, of the leading states: what `orthogonalise` takes."""
+    n = A.shape[0]
+    for j in range(n):
+        for i in range(n):
+            x = A[i, j]
+            for c in range(j):
+                x += A[i, c] * F[j, c]
+            W[i, j] = x
+        w[j] = F[j, j]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def propagate(F: Array, A: Array, J: Array, G: Array, W: Array, w: Array) -> None:
+    """Move P over one step of x⁺ = A x + J z + G noise, x the leading states and z those behind them, which stay.
+
+    The noise has covariance one. `W` (n_x, n_x + n_noise) and `w` (n_x + n_noise,) are scratch.
+    """
+    follow(F, A, J, w)
+    spread(F, A, W, w)
+    n = A.shape[0]
+    for j in range(G.shape[1]):
+        for i in range(n):
+            W[i, n + j] = G[i, j]
+        w[n + j] = 1.0
+    orthogonalise(W, w, F)
