@@ -16,7 +16,7 @@ import pytest
 from ambid.cli.keys import Keys
 from ambid.errors import AmbidError
 from ambid.recursive.lines import Event
-from ambid.track.lines_read import read_track
+from ambid.track.lines_file import read_track
 from tests.conventions.sources import ROOT
 from tests.track.tracks import track_of
 

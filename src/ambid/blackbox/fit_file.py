@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,9 +16,17 @@ from ambid.blackbox.spread import pole_covariance
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.structures import RESPONSE_STRUCTURES, any_structure
 from ambid.blackbox.transfer_model import TransferModel
-from ambid.errors import EstimationError, ModelError
-from ambid.estimation.estimate import OutputFit
-from ambid.estimation.json_values import check_from_json, check_json, plain_json
+from ambid.errors import ModelError
+from ambid.estimation.documents import (
+    by_output,
+    check_schema,
+    fields_json,
+    json_text,
+    only_outputs,
+    plain_json,
+    read_as,
+    read_whole,
+)
 
 SCHEMA = "ambid.fit/1"
 _LARGEST = 1e100  # what a number in a file may be: beyond, its square is not finite any more
@@ -30,7 +37,7 @@ NO_INNOVATIONS = (
 
 def fit_text(fit: BlackBoxFit) -> str:
     """Return the JSON text of a fit."""
-    return json.dumps(fit_to_json(fit), indent=1, allow_nan=False) + "\n"
+    return json_text(fit_to_json(fit))
 
 
 def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
@@ -40,56 +47,28 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
     ``polynomials`` and ``sd`` have one entry for each output. ``fit`` and ``validation`` have an entry for each output,
     and with one output ``one_step`` and ``simulation`` beside it. A fit to a frequency response has no innovations:
     ``noise_variance`` and ``noise_covariance`` are null, and ``noise`` says why.
-
-    Returns SI values; numbers that are not finite are null.
     """
     kind, values = _model_json(fit.model, fit.model.theta, fit.outputs)
-    sd = None if fit.sd is None else _model_json(fit.model, fit.sd, fit.outputs)[1]
     of_response = fit.structure in RESPONSE_STRUCTURES
     noise = None if of_response else fit.noise_covariance
-    document = {
-        "schema": SCHEMA,
-        "structure": fit.structure,
-        "status": fit.status,
-        "orders": {k: list(v) if isinstance(v, tuple) else v for k, v in fit.orders.items()},
+    more = {
         kind: values,
-        "sd": sd,
+        "sd": None if fit.sd is None else _model_json(fit.model, fit.sd, fit.outputs)[1],
         "noise_variance": noise if noise is None or len(fit.outputs) > 1 else noise[0, 0],
-        "fit": _by_output({o: _fit_json(f) for o, f in fit.fit.items()}),
-        "criteria": fit.criteria,
-        "rate_hz": 1.0 / fit.dt,
-        "checks": {name: check_json(c) for name, c in fit.checks.items()},
-        "validation": None if fit.validation is None else _by_output(fit.validation),
-        "warnings": list(fit.warnings),
-        "poles": _poles_json(fit),
-        "inputs": list(fit.inputs),
-        "outputs": list(fit.outputs),
-        "units": fit.units,
-        "offsets": {
-            "inputs": dict(zip(fit.inputs, fit.offsets.u.tolist(), strict=True)),
-            "outputs": dict(zip(fit.outputs, fit.offsets.y.tolist(), strict=True)),
-        },
         "noise_covariance": noise,
+        "rate_hz": 1.0 / fit.dt,
+        "poles": _poles_json(fit),
+        "offsets": {
+            "inputs": dict(zip(fit.inputs, fit.offsets.u, strict=True)),
+            "outputs": dict(zip(fit.outputs, fit.offsets.y, strict=True)),
+        },
         **({"noise": NO_INNOVATIONS} if of_response else {}),
         "covariance": None if fit.covariance is None else {"names": fit.model.names, "matrix": fit.covariance},
-        "n_estimated": fit.n_estimated,
         "continuous_time": fit.model.dt is None,
-        "delay_s": list(fit.model.delay) if isinstance(fit.model, TransferModel) else None,
-        "record": fit.record,
-        "details": fit.details,
-        "timing_s": fit.timing_s,
+        "delay_s": fit.model.delay if isinstance(fit.model, TransferModel) else None,
     }
-    return {name: plain_json(value) for name, value in document.items()}
-
-
-def _by_output(found: Mapping[str, Any]) -> dict[str, Any]:
-    """With one output its results stand at the top as well."""
-    first = dict(next(iter(found.values()))) if len(found) == 1 else {}
-    return {**first, **{o: v for o, v in found.items() if o not in first}}
-
-
-def _fit_json(f: OutputFit) -> dict[str, Any]:
-    return {"one_step": f.one_step, "simulation": f.simulation, "innovation_sd": f.innovation_sd}
+    document = fields_json(fit, without=("model", "offsets", "dt", "covariance", "noise_covariance"))
+    return by_output({"schema": SCHEMA, **document, **plain_json(more)})
 
 
 def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) -> tuple[str, Any]:
@@ -139,86 +118,56 @@ def _poles_json(fit: BlackBoxFit) -> list[dict[str, Any]]:
 
 
 def fit_from_json(document: Mapping[str, Any], where: str) -> BlackBoxFit:
-    """Read a fit back.
-
-    `document`: parsed JSON of schema ``ambid.fit/1``; `where`: name of the file, for messages.
-    """
-    if not isinstance(document, Mapping) or document.get("schema") != SCHEMA:
-        found = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
-        raise EstimationError(
-            f"{where} has schema {found!r}; a fit has {SCHEMA!r}. Give a file that 'ambid fit --json' wrote"
-        )
-    try:
-        return _from_json(document)
-    except (ModelError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise EstimationError(
-            f"{where} is not a whole fit ({type(error).__name__}: {error}). Write it again with 'ambid fit --json'"
-        ) from error
+    """Read a fit back; `where` is the name of its file, for messages."""
+    check_schema(document, SCHEMA, where, "a fit", "fit")
+    return read_whole(lambda: _from_json(document), where, "fit", "fit")
 
 
 def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
-    inputs, outputs = _names(d, "inputs"), _names(d, "outputs")
-    model = _model_from_json(d, inputs, outputs)
+    inputs, outputs = (read_as(tuple[str, ...], d[which], which) for which in ("inputs", "outputs"))
     any_structure(d["structure"])
-    covariance = None if d["covariance"] is None else _array(d["covariance"]["matrix"], "covariance")
     silent = d["noise_covariance"] is None and d["structure"] in RESPONSE_STRUCTURES
-    noise = np.zeros((len(outputs),) * 2) if silent else _array(d["noise_covariance"], "noise_covariance")
-    if (model.n_inputs, model.n_outputs) != (len(inputs), len(outputs)) or noise.shape != (len(outputs),) * 2:
-        raise ValueError("inputs, outputs, noise and model are not of the same size")
-    if covariance is not None and covariance.shape != (model.theta.size,) * 2:
-        raise ValueError("the covariance is not of the model's coefficients")
-    if np.any(np.diag(noise) < 0):
-        raise ValueError("a noise variance is negative")
-    if not isinstance(d["units"], dict) or not all(isinstance(x, str) for x in d["units"].values()):
-        raise ValueError("units are not text")
     offsets = Offsets(
-        u=_array([d["offsets"]["inputs"][x] for x in inputs], "offsets"),
-        y=_array([d["offsets"]["outputs"][x] for x in outputs], "offsets"),
+        u=_finite([d["offsets"]["inputs"][x] for x in inputs], "offsets"),
+        y=_finite([d["offsets"]["outputs"][x] for x in outputs], "offsets"),
     )
-    return BlackBoxFit(
-        structure=d["structure"],
-        orders={k: tuple(v) if isinstance(v, list) else int(v) for k, v in d["orders"].items()},
-        model=model,
-        covariance=covariance,
-        n_estimated=int(d["n_estimated"]),
-        offsets=offsets,
-        noise_covariance=noise,
-        inputs=inputs,
-        outputs=outputs,
-        units=d["units"],
-        dt=1.0 / _rate(d),
-        record=d["record"],
-        status=d["status"],
-        fit={o: OutputFit(**_numbers(d["fit"][o])) for o in outputs if o in d["fit"]},
-        criteria=d["criteria"],
-        checks={name: check_from_json(c) for name, c in d["checks"].items()},
-        validation=None if d["validation"] is None else {o: d["validation"][o] for o in outputs},
-        warnings=tuple(d["warnings"]),
-        timing_s=d["timing_s"],
-        details=d["details"],
+    fit = read_as(
+        BlackBoxFit,
+        {
+            **only_outputs(d, outputs),
+            "model": _model_from_json(d, inputs, outputs),
+            "covariance": None if d["covariance"] is None else d["covariance"]["matrix"],
+            "offsets": offsets,
+            "noise_covariance": np.zeros((len(outputs),) * 2) if silent else d["noise_covariance"],
+            "dt": 1.0 / _rate(d),
+        },
     )
+    _check_consistent(fit)
+    return fit
 
 
-def _numbers(f: Mapping[str, Any]) -> dict[str, Any]:
-    """Read null as "not a number", but for the simulation, which may be missing."""
-    return {k: float("nan") if v is None and k != "simulation" else v for k, v in f.items()}
+def _check_consistent(fit: BlackBoxFit) -> None:
+    """Raise ValueError where the parts do not belong together."""
+    noise, size = fit.noise_covariance, fit.model.theta.size
+    if (fit.model.n_inputs, fit.model.n_outputs) != (len(fit.inputs), len(fit.outputs)) or noise.shape != (
+        len(fit.outputs),
+        len(fit.outputs),
+    ):
+        raise ValueError("inputs, outputs, noise and model are not of the same size")
+    if fit.covariance is not None and fit.covariance.shape != (size, size):
+        raise ValueError("the covariance is not of the model's coefficients")
+    if np.any(np.diag(_finite(noise, "noise_covariance")) < 0):
+        raise ValueError("a noise variance is negative")
+    if fit.covariance is not None:
+        _finite(fit.covariance, "covariance")
 
 
-def _names(d: Mapping[str, Any], which: str) -> tuple[str, ...]:
-    names = d[which]
-    if not isinstance(names, list) or not all(isinstance(x, str) for x in names):
-        raise ValueError(f"{which} is not a list of names")
-    return tuple(names)
-
-
-def _array(value: Any, what: str) -> Array:
-    """Numbers as an array; text, truth values and what could not be computed with are no numbers."""
-    found = np.array(value)
-    if found.size and found.dtype.kind not in "iuf":
-        raise ValueError(f"{what} does not consist of numbers")
-    if not np.all(np.abs(found.astype(np.float64)) <= _LARGEST):
+def _finite(value: Any, what: str) -> Array:
+    """Return an array of numbers that can be computed with."""
+    found = read_as(Array, value, what)
+    if not np.all(np.abs(found) <= _LARGEST):
         raise ValueError(f"{what} is not finite, or too large")
-    return found.astype(np.float64)
+    return found
 
 
 def _rate(d: Mapping[str, Any]) -> float:
@@ -236,7 +185,7 @@ def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tup
         n = len(d["state_space"]["A"])
         shapes = {"A": (n, n), "B": (n, len(inputs)), "C": (len(outputs), n), "D": (len(outputs), len(inputs))}
         shapes["K"] = (n, len(outputs))
-        parts = {k: _array(d["state_space"][k], k) for k in shapes}
+        parts = {k: _finite(d["state_space"][k], k) for k in shapes}
         for k, shape in shapes.items():
             if parts[k].shape != shape and (parts[k].size or 0 not in shape):
                 raise ValueError(f"{k} has shape {parts[k].shape}; {shape} belongs to states, inputs and outputs")
@@ -244,20 +193,20 @@ def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tup
         return StateSpaceModel(dt=dt, **parts)
     if "transfer_function" in d:
         tf, delay = d["transfer_function"], d["delay_s"]
-        if not isinstance(delay, list) or len(delay) != len(inputs) or np.any(_array(delay, "delay_s") < 0):
+        if not isinstance(delay, list) or len(delay) != len(inputs) or np.any(_finite(delay, "delay_s") < 0):
             raise ValueError("delay_s is not a time for each input")
-        num, den = (tuple(tuple(_array(x, k) for x in row) for row in tf[k]) for k in ("num", "den"))
+        num, den = (tuple(tuple(_finite(x, k) for x in row) for row in tf[k]) for k in ("num", "den"))
         names = () if d["covariance"] is None else d["covariance"]["names"]
         return TransferModel(num=num, den=den, dt=dt, delay=tuple(delay), delay_estimated="delay[0]" in names)
     found = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
     one = len(inputs) == 1
     sets = tuple(
         Polynomials(
-            A=_array(p["A"], "A"),
-            B=tuple(_array(x, "B") for x in ([p["B"]] if one else p["B"])),
-            C=_array(p["C"], "C"),
-            D=_array(p["D"], "D"),
-            F=tuple(_array(x, "F") for x in ([p["F"]] if one else p["F"])),
+            A=_finite(p["A"], "A"),
+            B=tuple(_finite(x, "B") for x in ([p["B"]] if one else p["B"])),
+            C=_finite(p["C"], "C"),
+            D=_finite(p["D"], "D"),
+            F=tuple(_finite(x, "F") for x in ([p["F"]] if one else p["F"])),
         )
         for p in found
     )

@@ -35,7 +35,7 @@ def followed(
     from ambid.cli.track import finish
     from ambid.job.acquire import recording
     from ambid.job.track_live import track_live
-    from ambid.track.lines_json import TrackWriter
+    from ambid.track.lines_file import TrackWriter
 
     path = json_path(json)
     writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None

@@ -42,7 +42,7 @@ def command(
 
     Without --validate, the last part of the record is held back. Best first.
     """
-    from ambid.estimation.json_values import plain_json
+    from ambid.estimation.documents import plain_json
     from ambid.job import compare
     from ambid.report.comparison import text
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_format
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -246,15 +245,13 @@ def _draw(
 
 def _json_text(found: BlackBoxFit, physical: PhysicalFit | None, matter: SensitivityAnalysis | None) -> str:
     """Put the fit into ``ambid.fit/1``, with ``physical`` of a rig and ``sensitivity`` where they were asked for."""
-    from dataclasses import asdict
-
-    from ambid.bearing.physical_file import physical_to_json
     from ambid.blackbox.fit_file import fit_to_json
-    from ambid.estimation.json_values import plain_json
+    from ambid.estimation.documents import covariance_together, fields_json, json_text, plain_json
 
     document = fit_to_json(found)
     if physical is not None:
-        document["physical"] = physical_to_json(physical)
+        unsaid = ("structure", "singular_values", "weakest")
+        document["physical"] = covariance_together(fields_json(physical, without=unsaid))
     if matter is not None:
-        document["sensitivity"] = plain_json(asdict(matter))
-    return json_format.dumps(document, indent=1, allow_nan=False) + "\n"
+        document["sensitivity"] = plain_json(matter)
+    return json_text(document)

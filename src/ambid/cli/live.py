@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_history import TrackHistory
     from ambid.report.track_view import TrackView
-    from ambid.track.lines_json import TrackWriter
+    from ambid.track.lines_file import TrackWriter
     from ambid.track.tally import Tally
 
 T = TypeVar("T")

@@ -103,7 +103,7 @@ def command(
     from ambid.cli.live import Follower
     from ambid.job.track import track
     from ambid.rig import load_rig
-    from ambid.track.lines_json import TrackWriter
+    from ambid.track.lines_file import TrackWriter
 
     _check(every, limit, start, start_seconds)
     remembered, flags = memory_of(memory), flags_of(flag)

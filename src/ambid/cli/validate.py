@@ -109,7 +109,7 @@ def _judged_fit(
     known: BlackBoxFit | NonlinearFit, record: Path, part: Part, rate: float | None, gaps: str | None
 ) -> tuple[dict[str, Any], list[str]]:
     from ambid.blackbox.fit import BlackBoxFit
-    from ambid.estimation.json_values import plain_json
+    from ambid.estimation.documents import plain_json
     from ambid.job import read_data
     from ambid.job.blackbox import same_bench
     from ambid.report.fit_text import validation_lines

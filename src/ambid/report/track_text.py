@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import WIDTH, Paint, columns, plain, warning_lines
-from ambid.track.lines_json import NORMAL_95
+from ambid.track.lines_file import NORMAL_95
 
 _MOST = 20  # events that are listed one by one
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from ambid.recursive.lines import Event, TrackHeader, TrackLine
 from ambid.report.numbers import sized
 from ambid.report.track_text import change_words, speed_words, value_words
-from ambid.track.lines_json import NORMAL_95
+from ambid.track.lines_file import NORMAL_95
 
 if TYPE_CHECKING:
     from rich.console import Group

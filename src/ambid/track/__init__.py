@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.track.lines_read import read_track as read_track
+    from ambid.track.lines_file import read_track as read_track
     from ambid.track.physical.rpem import PhysicalRpem as PhysicalRpem
     from ambid.track.physical.window import MovingWindow as MovingWindow
 

@@ -6,9 +6,8 @@ records) is written for other programs, and not read again.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,16 @@ import numpy as np
 from ambid.bearing.magnet.linearised import linearised
 from ambid.bearing.magnet.problem import BODY, LEVELS, UNITS
 from ambid.bearing.magnet.result import Curve, NonlinearBearingEstimate
-from ambid.errors import EstimationError, ModelError
-from ambid.estimation.estimate import Delay, EstimatedParameter, OutputFit
-from ambid.estimation.estimate_file import SCHEMA, parameter_json
-from ambid.estimation.json_values import check_from_json, check_json, delay_json, plain_json
-from ambid.physics.coenergy_law import MagnetLaw
+from ambid.estimation.documents import (
+    covariance_apart,
+    covariance_together,
+    fields_json,
+    json_text,
+    plain_json,
+    read_as,
+    read_whole,
+)
+from ambid.estimation.estimate_file import SCHEMA
 
 _POSITIONS, _CURRENTS = 9, 5  # of the grid of the curves
 _ROLES = ("position", "current")
@@ -28,61 +32,25 @@ _ROLES = ("position", "current")
 
 def bearing_text(estimate: NonlinearBearingEstimate) -> str:
     """Return the JSON text of an estimate."""
-    return json.dumps(bearing_to_json(estimate), indent=1, allow_nan=False) + "\n"
+    return json_text(bearing_to_json(estimate))
 
 
 def bearing_to_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
     """Return an estimate in the form of schema ``ambid.estimate/1``: SI values, JSON numbers only."""
-    plant, law = linearised(estimate), estimate.law
-    by_rate = {rate: delay_json(d) for rate, d in estimate.delay.items()}
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "status": estimate.status,
-        "record": dict(estimate.records[0]),
-        "records": [dict(r) for r in estimate.records],
+    document = covariance_together(fields_json(estimate, without=("eddy", "drift", "delay", "fit")))
+    by_rate = plain_json(estimate.delay)
+    more = {
+        "record": estimate.records[0],
         "model": estimate.model,
-        "law": {
-            "gap": law.gap,
-            "pair": law.pair,
-            "asymmetric": law.asymmetric,
-            "saturation": law.saturation,
-            "rise": law.rise,
-            "eddy": estimate.eddy,
-            "drift": estimate.drift,
-        },
-        "parameters": {p.name: parameter_json(p) for p in estimate.parameters},
-        "covariance": {
-            "names": list(estimate.covariance_names),
-            "matrix": estimate.covariance.tolist(),
-            "method": estimate.covariance_method,
-        },
+        "law": {**document["law"], "eddy": estimate.eddy, "drift": estimate.drift},
         "delay": {"voltage": {**next(iter(by_rate.values())), "by_rate": by_rate}},
-        "operating_point": dict(estimate.operating_point),
         "at_operating_point": _at_operating_point(estimate),
-        "continuous": {
-            "states": list(plant.states),
-            "A": plant.A.tolist(),
-            "B": plant.B.tolist(),
-            "C": plant.C.tolist(),
-            "poles": [[float(p.real), float(p.imag)] for p in plant.poles],
-        },
+        "continuous": linearised(estimate),
         "curves": curves_json(estimate),
-        "range": {role: list(x) for role, x in estimate.range.items()},
-        "usual": {role: list(x) for role, x in estimate.usual.items()},
-        "hull": estimate.hull.tolist(),
-        "coil_hull": estimate.coil_hull.tolist(),
-        "noise": {name: dict(levels) for name, levels in estimate.noise.items()},
         "fit": fit_over_all(estimate),
-        "fit_by_record": {name: {role: _fit_json(f) for role, f in of.items()} for name, of in estimate.fit.items()},
-        "criterion": estimate.criterion,
-        "bic": estimate.bic,
-        "checks": {name: check_json(c) for name, c in estimate.checks.items()},
-        "validation": None if estimate.validation is None else dict(estimate.validation),
-        "warnings": list(estimate.warnings),
-        "timing_s": dict(estimate.timing_s),
-        "rig": dict(estimate.rig),
+        "fit_by_record": estimate.fit,
     }
-    return {name: plain_json(value) for name, value in document.items()}
+    return {"schema": SCHEMA, **document, **plain_json(more)}
 
 
 def _at_operating_point(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
@@ -137,78 +105,26 @@ def fit_over_all(estimate: NonlinearBearingEstimate) -> dict[str, dict[str, floa
     return found
 
 
-def _fit_json(f: OutputFit) -> dict[str, float | None]:
-    return {"one_step": f.one_step, "simulation": f.simulation, "innovation_sd": f.innovation_sd}
-
-
 def bearing_from_json(document: Mapping[str, Any], where: str) -> NonlinearBearingEstimate:
-    """Read an estimate back.
+    """Read an estimate back, bit by bit; `where` is the name of its file, for messages."""
 
-    `document`: parsed JSON of schema ``ambid.estimate/1`` with a ``law``; `where`: name of the file, for messages.
-    Returns the same numbers, bit by bit.
-    """
-    try:
-        estimate = _from_json(document)
-        _consistent(estimate)
+    def read() -> NonlinearBearingEstimate:
+        law = document["law"]
+        entries = {
+            **covariance_apart(document),
+            "eddy": law["eddy"],
+            "drift": law["drift"],
+            "delay": document["delay"]["voltage"]["by_rate"],
+            "fit": document["fit_by_record"],
+        }
+        estimate = read_as(NonlinearBearingEstimate, entries)
+        _check_consistent(estimate)
         return estimate
-    except (ModelError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise EstimationError(
-            f"{where} is not a whole estimate ({type(error).__name__}: {error}). "
-            "Write it again with 'ambid identify --nonlinear --json'"
-        ) from error
+
+    return read_whole(read, where, "estimate", "identify --nonlinear")
 
 
-def _from_json(d: Mapping[str, Any]) -> NonlinearBearingEstimate:
-    law, cov = d["law"], d["covariance"]
-    return NonlinearBearingEstimate(
-        status=d["status"],
-        law=MagnetLaw(**{name: law[name] for name in ("gap", "pair", "asymmetric", "saturation", "rise")}),
-        eddy=bool(law["eddy"]),
-        drift=bool(law["drift"]),
-        records=tuple(d["records"]),
-        parameters=tuple(
-            EstimatedParameter(
-                name=name,
-                unit=p["unit"],
-                value=float(p["value"]),
-                sd=float(p["sd"]),
-                ci95=(p["ci95"][0], p["ci95"][1]),
-                role=p["role"],
-                identifiable=bool(p["identifiable"]),
-                data_share=p.get("data_share"),
-            )
-            for name, p in d["parameters"].items()
-        ),
-        covariance_names=tuple(cov["names"]),
-        covariance=np.array(cov["matrix"], dtype=np.float64),
-        covariance_method=cov["method"],
-        delay={
-            rate: Delay(samples=int(x["samples"]), fraction=float(x["fraction"]), sd=x["sd"], how=x["how"])
-            for rate, x in d["delay"]["voltage"]["by_rate"].items()
-        },
-        noise=d["noise"],
-        fit={name: {role: OutputFit(**f) for role, f in of.items()} for name, of in d["fit_by_record"].items()},
-        range={role: _interval(x) for role, x in d["range"].items()},
-        usual={role: _interval(x) for role, x in d["usual"].items()},
-        operating_point=d["operating_point"],
-        hull=np.array(d["hull"], dtype=np.float64),
-        coil_hull=np.array(d["coil_hull"], dtype=np.float64),
-        criterion=float(d["criterion"]),
-        bic=float(d["bic"]),
-        checks={name: check_from_json(c) for name, c in d["checks"].items()},
-        validation=d["validation"],
-        warnings=tuple(d["warnings"]),
-        timing_s=d["timing_s"],
-        rig=d["rig"],
-    )
-
-
-def _interval(x: Sequence[float]) -> tuple[float, float]:
-    low, high = x
-    return low, high
-
-
-def _consistent(e: NonlinearBearingEstimate) -> None:
+def _check_consistent(e: NonlinearBearingEstimate) -> None:
     """Raise ValueError where the parts do not belong together: an edited file, or one of another program."""
     if e.law.gap not in ("hyperbolic", "exponential"):
         raise ValueError(f"{e.law.gap!r} is no gap law")

@@ -26,7 +26,7 @@ from ambid.job.physical import identify, load, signals_of
 from ambid.job.track_live import track_live
 from ambid.physics.models import model
 from ambid.rig import Rig, rig_text
-from ambid.track.lines_json import TrackWriter
+from ambid.track.lines_file import TrackWriter
 
 SCHEMA = "ambid.commission/1"
 _LIMIT = 1.5  # acceptable model error of tracking

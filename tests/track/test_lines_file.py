@@ -11,8 +11,7 @@ import pytest
 
 from ambid.errors import AmbidError, RecordError
 from ambid.recursive.lines import Event, TrackedValue, TrackLine
-from ambid.track.lines_json import TrackWriter, event_json, header_json, line_json, summary_json
-from ambid.track.lines_read import read_track
+from ambid.track.lines_file import TrackWriter, event_json, header_json, line_json, read_track, summary_json
 from ambid.track.tally import Tally, most_important
 from tests.track.tracks import header, track_of
 
@@ -144,12 +143,18 @@ DAMAGE = {
     "another schema": (lambda x: changed(x, 0, "track/1", "fit/1"), "line 1: the schema is 'ambid.fit/1'"),
     "half a line in the middle": (lambda x: changed(x, 3, '"error"', '"err'), "line 4: it is no JSON"),
     "a missing key": (lambda x: changed(x, 3, '"error"', '"mistake"'), "line 4: 'error' is missing"),
-    "a word for a number": (lambda x: changed(x, 2, '"sd": ', '"sd": "x", "y": '), "line 3: 'x' stands where a number"),
+    "a word for a number": (
+        lambda x: changed(x, 2, '"sd": ', '"sd": "x", "y": '),
+        "parameters.m.sd is 'x' instead of a number",
+    ),
     "no number of JSON": (lambda x: changed(x, 2, '"sd": ', '"sd": NaN, "y": '), "line 3: it is no JSON"),
-    "a word for a count": (lambda x: x.replace('"samples": 14', '"samples": "14"'), "where a count belongs"),
+    "a word for a count": (lambda x: x.replace('"samples": 14', '"samples": "14"'), "instead of a whole number"),
     "nested without end": (lambda x: x.replace(x.split("\n")[3], "[" * 100_000), "line 4: it is no JSON"),
-    "an unknown state": (lambda x: changed(x, 2, '"tracking"', '"asleep"'), "state 'asleep' is unknown"),
-    "an unknown event": (lambda x: x.replace('"kind": "change"', '"kind": "miracle"'), "event 'miracle' is unknown"),
+    "an unknown state": (lambda x: changed(x, 2, '"tracking"', '"asleep"'), "state is 'asleep' instead of 'tracking'"),
+    "an unknown event": (
+        lambda x: x.replace('"kind": "change"', '"kind": "miracle"'),
+        "kind is 'miracle' instead of 'change'",
+    ),
     "another parameter": (
         lambda x: changed(x, 2, '"k_x"', '"k_y"'),
         "parameter 'k_x' stands here or in the lines before",

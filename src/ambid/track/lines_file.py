@@ -1,0 +1,253 @@
+"""A track as JSON lines, schema ``ambid.track/1`` (contracts.md), written as the numbers come, and read back.
+
+First the header, then one line per reporting interval, last the summary. A track is a stream that other programs may
+follow, so it is written in place, each line flushed; a run that was killed leaves a file that can still be read. Only
+the end of a file may be missing; anything else that does not fit is refused on one line.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO, TypeVar
+
+from ambid.errors import AmbidError, RecordError
+from ambid.estimation.documents import fields_json, plain_json, read_as
+from ambid.record.files import file_bytes
+from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.track.tally import Tally, most_important
+
+T = TypeVar("T")
+
+SCHEMA = "ambid.track/1"
+NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
+
+_dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, check_circular=False).encode
+
+
+def header_json(header: TrackHeader) -> dict[str, Any]:
+    """Return the first line of a track; a number that is not finite is None."""
+    start = {name: _value(v) for name, v in header.start.items()}
+    return {"schema": SCHEMA, **fields_json(header, without=("start",)), "start": start}
+
+
+def line_json(line: TrackLine) -> dict[str, Any]:
+    """Return the line of one reporting interval.
+
+    ``event`` is the most important of ``events``, None without any; ``ci95`` is value ± 1.96 sd; a number that is not
+    known is None.
+    """
+    found: dict[str, Any] = {
+        "t": plain_json(line.t),
+        "parameters": {name: _value(v) for name, v in line.parameters.items()},
+        "error": plain_json(line.error),
+        "state": line.state,
+        "event": None if not line.events else event_json(most_important(line.events)),
+    }
+    if line.events:
+        found["events"] = [event_json(e) for e in line.events]
+    if line.extra:
+        found["extra"] = {name: _value(v) for name, v in line.extra.items()}
+    return found
+
+
+def event_json(event: Event) -> dict[str, Any]:
+    """Return one event: ``kind``, ``t`` and ``why``; ``parameter``, ``samples`` and ``values`` where there are any."""
+    entries = fields_json(event).items()
+    return {name: x for name, x in entries if name in ("kind", "t", "why") or x not in (None, {})}
+
+
+def summary_json(summary: TrackSummary) -> dict[str, Any]:
+    """Return the last line of a track, with the one key ``summary``."""
+    more = {
+        "changes": [event_json(e) for e in summary.changes],
+        "latency_s": None if summary.latency is None else fields_json(summary.latency),
+    }
+    return {"summary": {**fields_json(summary, without=("changes", "latency")), **more}}
+
+
+def _value(v: TrackedValue) -> dict[str, Any]:
+    value, sd = float(v.value), float(v.sd)
+    low, high = value - NORMAL_95 * sd, value + NORMAL_95 * sd
+    known = math.isfinite(low) and math.isfinite(high)
+    return {
+        "value": value if math.isfinite(value) else None,
+        "sd": sd if math.isfinite(sd) else None,
+        "ci95": [low, high] if known else None,
+        "stale": bool(v.stale),
+    }
+
+
+class TrackWriter:
+    """A file or stream to which a track is written line by line, each flushed, so that it can be followed.
+
+    The file is opened with the header, not before: a run that is refused leaves an older file as it was.
+
+    `target`: a stream is not closed.
+    """
+
+    def __init__(self, target: str | Path | TextIO) -> None:
+        """Take note of the `target`."""
+        self._path = Path(target) if isinstance(target, (str, Path)) else None
+        self._stream: TextIO | None = None if isinstance(target, (str, Path)) else target
+        self._begun = False
+
+    @property
+    def begun(self) -> bool:
+        """Whether the header has been written."""
+        return self._begun
+
+    def header(self, header: TrackHeader) -> None:
+        """Open the file and write the first line."""
+        if self._stream is None and self._path is not None:
+            try:
+                self._stream = self._path.open("w", encoding="utf-8", newline="\n")
+            except OSError as failure:
+                raise _unwritable(self._path, failure) from None
+        self._begun = True
+        self._put(header_json(header))
+
+    def line(self, line: TrackLine) -> None:
+        """Write the line of one reporting interval."""
+        self._put(line_json(line))
+
+    def summary(self, summary: TrackSummary) -> None:
+        """Write the last line."""
+        self._put(summary_json(summary))
+
+    def close(self) -> None:
+        """Close the file; a stream that was handed in stays open."""
+        if self._path is not None and self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, document: Mapping[str, Any]) -> None:
+        text = _dumps(document) + "\n"
+        if self._stream is None:
+            raise RecordError("a line of a track came before its header. Write the header first")
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as failure:
+            raise _unwritable(self._path, failure) from None
+
+
+def _unwritable(path: Path | None, failure: OSError) -> AmbidError:
+    where = "the track" if path is None else f"the track {path}"
+    return AmbidError(f"{where} cannot be written: {failure.strerror or failure}. Check folder and disk")
+
+
+def read_track(path: str | Path) -> Track:
+    """Read a track back.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Track
+        Of a file that ends before its summary (the run was killed, or still goes on) all whole lines, and a summary
+        made from them whose `complete` is False. None in the file is NaN here.
+
+    Raises
+    ------
+    RecordError
+        If the file cannot be read, is no track, or is damaged elsewhere than at its end.
+    """
+    path = Path(path)
+    data = file_bytes(path, what="track")
+    rows = data.split(b"\n")
+    if rows[-1] and not _whole(rows[-1]):  # cut off in the middle of a line
+        del rows[-1]
+    numbered = [(k, row) for k, row in enumerate(rows, start=1) if row.strip()]
+    if not numbered:
+        raise RecordError(f"track {path} ends within its first line; nothing can be read from it. Run it again")
+    header = _parsed(path, *numbered[0], _header)
+    tally, lines, summary = Tally(header), list[TrackLine](), None
+    for k, row in numbered[1:]:
+        if summary is not None:
+            raise RecordError(f"track {path}, line {k}: it stands behind the summary, which is the last. Remove it")
+        line = _parsed(path, k, row, _line_or_summary)
+        if isinstance(line, TrackSummary):
+            summary = line
+            continue
+        others = line.parameters.keys() ^ (lines[0].parameters if lines else header.start or line.parameters).keys()
+        if others:
+            raise RecordError(
+                f"track {path}, line {k}: parameter {min(others)!r} stands here or in the lines before, not in both."
+                " Restore the file"
+            )
+        if lines and not line.t > lines[-1].t:
+            raise RecordError(
+                f"track {path}, line {k}: time {line.t:g} s does not come after {lines[-1].t:g} s. Restore the file"
+            )
+        lines.append(line)
+        tally.add(line)
+    return Track(header=header, lines=tuple(lines), summary=summary or tally.summary(complete=False))
+
+
+def _whole(row: bytes) -> bool:
+    try:
+        return isinstance(_loaded(row), dict)
+    except ValueError:
+        return False
+
+
+def _loaded(row: bytes) -> Any:
+    """Read JSON in the strict sense: without NaN and Infinity, and not nested without end."""
+    try:
+        return json.loads(row, parse_constant=_no_number)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _parsed(path: Path, number: int, row: bytes, read: Callable[[Mapping[str, Any]], T]) -> T:
+    try:
+        document = _loaded(row)
+    except ValueError:
+        raise RecordError(f"track {path}, line {number}: it is no JSON. Restore the file") from None
+    try:
+        return read(document)
+    except KeyError as missing:
+        raise RecordError(f"track {path}, line {number}: {missing} is missing. Restore the file") from None
+    except (TypeError, ValueError, AttributeError, IndexError) as wrong:
+        raise RecordError(f"track {path}, line {number}: {wrong}. Restore the file") from None
+
+
+def _header(document: Mapping[str, Any]) -> TrackHeader:
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema != SCHEMA:
+        raise ValueError(f"the schema is {schema!r}; a track begins with {SCHEMA!r}")
+    return read_as(TrackHeader, {"model": "", "start": {}, **document})
+
+
+def _line_or_summary(document: Mapping[str, Any]) -> TrackLine | TrackSummary:
+    if "summary" in document:
+        s = document["summary"]
+        changes = [{"kind": "change", **_event(e)} for e in s["changes"]]
+        return read_as(TrackSummary, {"counts": {}, **s, "changes": changes, "latency": s.get("latency_s")})
+    one = document.get("event")
+    events = document.get("events", [] if one is None else [one])
+    return read_as(TrackLine, {**document, "events": [_event(e) for e in events]})
+
+
+def _event(e: Mapping[str, Any]) -> dict[str, Any]:
+    return {"t": None, "why": "", **e}
