@@ -20,7 +20,7 @@ from ambid.job.physical import identify
 from ambid.job.track_live import track_live
 from ambid.recursive.lines import TrackLine
 from ambid.rig import load_rig
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 from table import Table
 from tests.bars.identified import BAND_HZ, BENCHES
 from timing import quantity

@@ -22,7 +22,7 @@ import numpy as np  # noqa: E402
 
 from ambid.acquire.device import Column  # noqa: E402
 from ambid.acquire.recorder import JournalHeader, Recorder, journal_path  # noqa: E402
-from ambid.track.stream.block import Block  # noqa: E402
+from ambid.track.blocks import Block  # noqa: E402
 from table import Table  # noqa: E402
 from timing import quantity  # noqa: E402
 

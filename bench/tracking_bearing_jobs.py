@@ -15,9 +15,9 @@ from ambid.recursive.fusion.fusion import SensorFusion
 from ambid.recursive.fusion.motion import free_motion
 from ambid.recursive.fusion.sensor import FusedSensor
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.physical.signals import Samples
-from ambid.track.physical.window import MovingWindow
+from ambid.track.evidence import Samples
+from ambid.track.rpem import PhysicalRpem
+from ambid.track.window import MovingWindow
 from peers import Array, Bench
 from tracking_benches import PHYSICAL, RATE, preset_bench, start_of
 from tracking_job import Job, Same

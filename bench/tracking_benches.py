@@ -18,14 +18,14 @@ from ambid.physics.presets import Preset, preset
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Event
 from ambid.signals import multisine
+from ambid.simulate.bench import VaryingLoop
 from ambid.simulate.plant import LinearPlant
 from ambid.simulate.scenario_run import scenario_blocks
 from ambid.simulate.variation import Variation
-from ambid.simulate.varying import VaryingLoop
-from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.physical.signals import Samples
-from ambid.track.supervise.supervisor import Supervisor
+from ambid.track.evidence import Samples
+from ambid.track.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.rpem import PhysicalRpem
+from ambid.track.supervisor import Supervisor
 
 Array = NDArray[np.float64]
 Streams = Callable[[str, int, float, float], Iterator[tuple[int, Samples]]]
@@ -69,7 +69,7 @@ def preset_bench() -> TrackBench:
 @cache
 def _amplitude() -> float:
     """What `ambid scenario` chooses, once for all seeds."""
-    from ambid.simulate._scenario_bench import Bench
+    from ambid.simulate.scenarios import Bench
 
     b = Bench.of(preset("unstable-bearing"), None, None)
     return b.largest(b.persistent(1), 1)
@@ -110,7 +110,7 @@ def second_bench() -> TrackBench:
 
 
 def _variation(scenario: str, bench: Preset, at_s: float, seconds: float) -> Variation:
-    from ambid.simulate._scenario_bench import Bench
+    from ambid.simulate.scenarios import Bench
     from ambid.simulate.scenarios import scenario as named
 
     found, b = named(scenario), Bench.of(bench, None, None)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ambid.acquire.device import Column, Counters, DeviceEvent, DeviceInfo, SelfTest
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block, Frame
+from ambid.track.blocks import Block, Frame
 
 RATE_HZ = 1000.0
 COLUMNS = (Column(name="n", role="extra", unit="1"), Column(name="excited", role="excitation", unit="1"))

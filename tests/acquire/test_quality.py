@@ -8,7 +8,7 @@ import pytest
 from ambid.acquire.device import Column, DeviceInfo, Program
 from ambid.acquire.program import expected, program
 from ambid.acquire.quality import Quality, QualityReport
-from ambid.track.stream.block import Block, Frame
+from ambid.track.blocks import Block, Frame
 
 RATE = 2000.0
 COLUMNS = (

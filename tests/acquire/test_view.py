@@ -10,7 +10,7 @@ from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.acquire.view import BenchView, as_record
 from ambid.errors import AmbidError
 from ambid.rig import rig_from_text
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.job.benches import PLAIN, prototype
 
 

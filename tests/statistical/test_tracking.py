@@ -9,9 +9,9 @@ from ambid.job.physical import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate import scenario_blocks, simulate_preset
-from ambid.track.physical.numbers import tracked_numbers
-from ambid.track.physical.rpem import PhysicalRpem
-from tests.track.physical.starts import BEARING, bearing, bearing_start, columns
+from ambid.track.numbers import tracked_numbers
+from ambid.track.rpem import PhysicalRpem
+from tests.track.starts import BEARING, bearing, bearing_start, columns
 
 
 def ball(n, seed):

@@ -11,8 +11,16 @@ import pytest
 
 from ambid.errors import AmbidError, RecordError
 from ambid.recursive.lines import Event, TrackedValue, TrackLine
-from ambid.track.lines_file import TrackWriter, event_json, header_json, line_json, read_track, summary_json
-from ambid.track.tally import Tally, most_important
+from ambid.track.lines_file import (
+    Tally,
+    TrackWriter,
+    event_json,
+    header_json,
+    line_json,
+    most_important,
+    read_track,
+    summary_json,
+)
 from tests.track.tracks import header, track_of
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ambid.recursive.lines import TrackLine
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.physical.signals import Samples
+from ambid.track.blocks import Rejection
+from ambid.track.evidence import Samples
 from ambid.track.reporter import Reporter, header
-from ambid.track.stream.outcome import Rejection
-from ambid.track.supervise.supervisor import Supervisor
-from tests.track.supervise.runs import RATE, arrays, simulated, start
+from ambid.track.rpem import PhysicalRpem
+from ambid.track.supervisor import Supervisor
+from tests.track.runs import RATE, arrays, simulated, start
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ambid.recursive.lines import Event, Latency, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
-from ambid.track.tally import Tally
+from ambid.track.lines_file import Tally
 
 UNITS = {"m": "kg", "k_x": "N/m", "k_i": "N/A", "R": "ohm", "L": "H"}
 VALUES = {"m": 4.0, "k_x": -129.01e3, "k_i": 55.734, "R": 1.6, "L": 26.0769e-3}

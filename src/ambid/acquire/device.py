@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType, TracebackType
 from typing import Literal, Protocol, Self
 
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 Mode = Literal["sample", "drive", "levitate"]
 State = Literal["idle", "sampling", "driving", "levitating", "fault"]

@@ -18,7 +18,7 @@ from ambid.acquire._verdict import verdict
 from ambid.acquire.device import DeviceInfo, Program
 from ambid.acquire.playing import period_ticks
 from ambid.arrays import Array
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 _LONGEST_PERIOD = 1 << 17  # ticks that are folded: 1 MB a column
 _FREEDOM = 30  # degrees of freedom under which the periods do not tell the noise,

@@ -16,7 +16,7 @@ import numpy as np
 from ambid.acquire.device import Device, DeviceEvent, Mode, Program
 from ambid.acquire.playing import period_ticks
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block, Frame
+from ambid.track.blocks import Block, Frame
 
 _LOOK_S = 0.1  # how often a wait looks whether the run should end
 _SILENT_LOOKS = 50  # without a sample: the line is dead. Looks, not seconds: a host that slept has not listened

@@ -11,7 +11,7 @@ from ambid.acquire.device import Column, DeviceInfo
 from ambid.arrays import Array
 from ambid.record import Channel, Record
 from ambid.rig import Rig, bench_record
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 
 
 def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start_s: float = 0.0) -> Record:

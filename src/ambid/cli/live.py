@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_history import TrackHistory
     from ambid.report.track_view import TrackView
-    from ambid.track.lines_file import TrackWriter
-    from ambid.track.tally import Tally
+    from ambid.track.lines_file import Tally, TrackWriter
 
 T = TypeVar("T")
 Flag = Literal["track", "hold", "accept", "revert"]
@@ -160,7 +159,7 @@ class Follower:
         """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
         one.
         """
-        from ambid.track.tally import Tally
+        from ambid.track.lines_file import Tally
 
         self._before_header.close()
         self._tally = Tally(header)

@@ -13,7 +13,7 @@ from ambid.acquire.recorder import Event, JournalHeader, Recorded, Recorder
 from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.errors import DeviceError
 from ambid.rig import Rig
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

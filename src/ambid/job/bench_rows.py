@@ -16,8 +16,8 @@ from ambid.record import Channel, Record, read_rows
 from ambid.rig import Rig, bench_record, default_rig
 from ambid.rig.load import OPTIONAL_ROLES
 from ambid.rig.rig import RigChannel
-from ambid.track.physical.synchronous import Forcing, forcing_of
-from ambid.track.stream.replay import Replay, blocks_of
+from ambid.track.numbers import Forcing, forcing_of
+from ambid.track.replay import Replay, blocks_of
 
 _BLOCK_S = 0.01  # of the stream
 _ROWS = (".csv", ".csv.gz", ".h5", ".hdf5")  # formats whose rows are read with their damage

@@ -14,18 +14,15 @@ from ambid.job.track_start import Start, check_settling, credible_limits
 from ambid.physics.models import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.physical.signals import Samples
-from ambid.track.physical.synchronous import Forcing
+from ambid.track.blocks import Block, Stretch
+from ambid.track.engine import run
+from ambid.track.evidence import Samples
+from ambid.track.guard import ABSURD, StreamGuard
+from ambid.track.numbers import Forcing
 from ambid.track.reporter import Reporter, header
-from ambid.track.stream.block import Block
-from ambid.track.stream.engine import run
-from ambid.track.stream.guard import StreamGuard
-from ambid.track.stream.outcome import Stretch
-from ambid.track.stream.ring import BlockRing
-from ambid.track.stream.rows import ABSURD
-from ambid.track.supervise.supervisor import Supervisor
-from ambid.track.supervise.warm_up import warm_up
+from ambid.track.ring import BlockRing
+from ambid.track.rpem import PhysicalRpem
+from ambid.track.supervisor import Supervisor, warm_up
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Pace = Literal["fastest", "real-time"]

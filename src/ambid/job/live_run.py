@@ -14,8 +14,8 @@ from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.acquire.view import BenchView
 from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.track.stream.block import Block, Frame
-from ambid.track.stream.ring import BlockRing
+from ambid.track.blocks import Block, Frame
+from ambid.track.ring import BlockRing
 
 LOOK_S = 0.1
 """How long a wait may last before it is looked whether it is still wanted, s."""

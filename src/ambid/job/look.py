@@ -18,7 +18,7 @@ from ambid.acquire.view import BenchView
 from ambid.arrays import Array
 from ambid.physics.models import model
 from ambid.rig import Rig
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

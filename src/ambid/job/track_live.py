@@ -29,9 +29,9 @@ from ambid.physics.models import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig
-from ambid.track.stream.block import Block
-from ambid.track.stream.replay import Replay
-from ambid.track.stream.ring import BlockRing
+from ambid.track.blocks import Block
+from ambid.track.replay import Replay
+from ambid.track.ring import BlockRing
 
 _BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
 _QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy

@@ -17,9 +17,9 @@ from ambid.job.physical import identify
 from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from ambid.rig import Rig
-from ambid.track.physical.numbers import TrackedNumbers, tracked_numbers
-from ambid.track.physical.rpem import PhysicalRpem
-from ambid.track.stream.rows import ABSURD
+from ambid.track.guard import ABSURD
+from ambid.track.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.rpem import PhysicalRpem
 
 _START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
 _SETTLED_S, _SETTLED_PART = 5.0, 1 / 3  # longest time, and part of the record, until a predictor has settled

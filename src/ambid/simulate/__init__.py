@@ -1,43 +1,37 @@
 """Simulation: open and closed loop, linear and nonlinear, with noise, quantisation, delay and limits."""
 
-from ambid.simulate.bench import Simulation, simulate, simulate_preset
-from ambid.simulate.damage import Loss, damage, losses
-from ambid.simulate.levels import largest_amplitude, noise_at_snr
-from ambid.simulate.plant import LinearPlant
-from ambid.simulate.poles import closed_loop_matrix, closed_loop_poles
-from ambid.simulate.rig_bench import simulate_rig
-from ambid.simulate.rig_magnet import plant_of_rig
-from ambid.simulate.scenario_run import ScenarioBlock, scenario_blocks, simulate_scenario, truth_columns
-from ambid.simulate.scenarios import Scenario, scenario, scenario_names
-from ambid.simulate.schedule import Schedule
-from ambid.simulate.variation import Unbalance, Variation
-from ambid.simulate.varying import Stretch, VaryingLoop, simulate_varying
+from __future__ import annotations
 
-__all__ = [
-    "LinearPlant",
-    "Loss",
-    "Scenario",
-    "ScenarioBlock",
-    "Schedule",
-    "Simulation",
-    "Stretch",
-    "Unbalance",
-    "Variation",
-    "VaryingLoop",
-    "closed_loop_matrix",
-    "closed_loop_poles",
-    "damage",
-    "largest_amplitude",
-    "losses",
-    "noise_at_snr",
-    "plant_of_rig",
-    "scenario",
-    "scenario_blocks",
-    "scenario_names",
-    "simulate",
-    "simulate_preset",
-    "simulate_rig",
-    "simulate_scenario",
-    "simulate_varying",
-    "truth_columns",
-]
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.simulate.bench import Simulation as Simulation
+    from ambid.simulate.bench import Stretch as Stretch
+    from ambid.simulate.bench import VaryingLoop as VaryingLoop
+    from ambid.simulate.bench import simulate as simulate
+    from ambid.simulate.bench import simulate_preset as simulate_preset
+    from ambid.simulate.bench import simulate_varying as simulate_varying
+    from ambid.simulate.levels import largest_amplitude as largest_amplitude
+    from ambid.simulate.levels import noise_at_snr as noise_at_snr
+    from ambid.simulate.lost_samples import Loss as Loss
+    from ambid.simulate.lost_samples import damage as damage
+    from ambid.simulate.lost_samples import losses as losses
+    from ambid.simulate.plant import LinearPlant as LinearPlant
+    from ambid.simulate.plant import closed_loop_matrix as closed_loop_matrix
+    from ambid.simulate.plant import closed_loop_poles as closed_loop_poles
+    from ambid.simulate.rig_bench import plant_of_rig as plant_of_rig
+    from ambid.simulate.rig_bench import simulate_rig as simulate_rig
+    from ambid.simulate.scenario_run import ScenarioBlock as ScenarioBlock
+    from ambid.simulate.scenario_run import scenario_blocks as scenario_blocks
+    from ambid.simulate.scenario_run import simulate_scenario as simulate_scenario
+    from ambid.simulate.scenario_run import truth_columns as truth_columns
+    from ambid.simulate.scenarios import Scenario as Scenario
+    from ambid.simulate.scenarios import scenario as scenario
+    from ambid.simulate.scenarios import scenario_names as scenario_names
+    from ambid.simulate.variation import Schedule as Schedule
+    from ambid.simulate.variation import Unbalance as Unbalance
+    from ambid.simulate.variation import Variation as Variation
+
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -1,4 +1,4 @@
-"""Plants as the simulation loop takes them."""
+"""Plants as the simulation loop takes them, and the poles of the sampled loop around them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError
+from ambid.physics.bearing_numbers import BEARING_NUMBERS
+from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.discretise import discretise
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import LinearModel
+from ambid.physics.loop import Loop
 from ambid.physics.magnet import CoEnergy
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
@@ -124,3 +128,107 @@ class Standing:
         stage = p.stage
         body = [p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits, stage.offset]
         return magnet, np.array(body)
+
+
+def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
+    """Return the numbers of a nonlinear plant by the names of ``[magnet.parameters]``.
+
+    Returns SI: those of the law and g, of the others those that are not zero; and R, without what a drop adds to it.
+    """
+    magnet, stage, w = plant.magnet, plant.stage, plant.magnet.coenergy
+    if isinstance(magnet, LawMagnet):
+        found = {"L_leak": 0.0, **magnet.values, "x_offset": magnet.x_offset}
+        kept = {*magnet.law.names[:2], "L_leak", "g"}
+    elif isinstance(w, CoEnergy) and (w.k_a == 0.0 or w.s_a == w.s_b):
+        found = law_numbers(w)
+        kept = {"k", "s", "L_leak", "g"}
+    else:
+        return {}
+    found |= {"a": plant.eddy_pole if math.isfinite(plant.eddy_pole) else 0.0, "v_offset": stage.offset}
+    found |= {"v_drop": stage.v_drop, "i_drop": stage.i_drop if stage.v_drop else 0.0}
+    found["g"] = plant.gravity
+    names = [spec.name for spec in BEARING_NUMBERS if spec.name in found]
+    return {"R": plant.R, **{n: found[n] for n in names if found[n] != 0.0 or n in kept}}
+
+
+def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> Array:
+    """Return the matrix that carries [plant states, u[k-1], u[k-2], ..., I, D, x[k-1]] over one sample.
+
+    Parameters
+    ----------
+    parameters : Mapping[str, float]
+        Parameters of the model in SI units.
+    loop : Loop
+        Controller and delay.
+    rate_hz : float
+        Sampling rate in Hz.
+    of : str
+        Name of the linear model.
+
+    Returns
+    -------
+    ndarray, shape (n_states + n_delayed + 3, ...)
+        The loop's matrix; limits and quantisation are left out.
+    """
+    plant, period = model(of), 1.0 / rate_hz
+    whole = math.floor(loop.delay)
+    d, _ = discretise(plant.matrices(parameters), period, fraction=loop.delay - whole)
+    n, line = d.A.shape[0], whole + (loop.delay > whole)
+    total = n + line + 3
+    i, dd, last = n + line, n + line + 1, n + line + 2
+    unit = np.eye(total)
+    position = unit[plant.states.index("position")] if "position" in plant.outputs else np.zeros(total)
+    current = unit[plant.states.index("current")] if "current" in plant.outputs else np.zeros(total)
+    derivative = (loop.filter_s * unit[dd] - loop.kd * (position - unit[last])) / (loop.filter_s + period)
+    command = -loop.kp * position + unit[i] + derivative - loop.kc * current
+    history = [command, *unit[n : n + line]]  # rows that give u[k], u[k-1], ...
+    z = np.zeros((total, total))
+    z[:n, :n] = d.A
+    z[:n] += np.outer(d.B[:, 0], history[whole])
+    if line > whole:
+        z[:n] += np.outer(d.B_late[:, 0], history[whole + 1])
+    for j in range(line):
+        z[n + j] = history[j]
+    z[i] = unit[i] - loop.ki * period * position
+    z[dd], z[last] = derivative, position
+    return z
+
+
+def closed_loop_poles(
+    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis"
+) -> NDArray[np.complex128]:
+    """Return the poles of the sampled loop in the z plane; stable where all lie inside the unit circle.
+
+    An integral without gain (ki = 0) is left out.
+
+    Parameters
+    ----------
+    parameters : Mapping[str, float]
+        Parameters of the model in SI units.
+    loop : Loop
+        Controller and delay.
+    rate_hz : float
+        Sampling rate in Hz.
+    of : str
+        Name of the linear model.
+
+    Returns
+    -------
+    ndarray, shape (n_poles,), complex
+        Sorted by falling modulus.
+
+    Raises
+    ------
+    ModelError
+        If the parameters carry the loop beyond the finite numbers.
+    """
+    with np.errstate(all="ignore"):
+        z = closed_loop_matrix(parameters, loop, rate_hz, of=of)
+    if not np.isfinite(z).all():
+        given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
+        raise ModelError(f"the loop at {rate_hz:g} Hz is beyond all numbers ({given}). Correct the parameters")
+    if loop.ki == 0.0:
+        keep = np.arange(z.shape[0]) != z.shape[0] - 3
+        z = z[np.ix_(keep, keep)]
+    poles = np.linalg.eigvals(z).astype(np.complex128)
+    return poles[np.argsort(-np.abs(poles))]

@@ -15,12 +15,10 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
-from ambid.simulate._scenario_bench import Bench
-from ambid.simulate.bench import Simulation
-from ambid.simulate.damage import losses
+from ambid.simulate.bench import TRUE, Simulation, Stretch, VaryingLoop, gathered
+from ambid.simulate.lost_samples import losses
 from ambid.simulate.rig_bench import as_columns
-from ambid.simulate.scenarios import Scenario, scenario
-from ambid.simulate.varying import TRUE, Stretch, VaryingLoop, gathered
+from ambid.simulate.scenarios import Bench, Scenario, scenario
 
 if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
     from ambid.rig.rig import Rig

@@ -8,7 +8,7 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.track.lines_file import read_track as read_track
-    from ambid.track.physical.rpem import PhysicalRpem as PhysicalRpem
-    from ambid.track.physical.window import MovingWindow as MovingWindow
+    from ambid.track.rpem import PhysicalRpem as PhysicalRpem
+    from ambid.track.window import MovingWindow as MovingWindow
 
 __getattr__, __dir__, __all__ = exports(__name__)

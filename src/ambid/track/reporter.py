@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
-from ambid.track.physical.signals import Samples
-from ambid.track.supervise.supervisor import Supervisor
+from ambid.track.evidence import Samples
+from ambid.track.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from ambid.recursive.lines import Latency
-    from ambid.track.stream.outcome import Rejection
+    from ambid.track.blocks import Rejection
 
 
 _LONGEST_GAP_S = 60.0  # a longer gap has no lines

@@ -9,7 +9,7 @@ import numpy as np
 from ambid.acquire.device import Column
 from ambid.acquire.recorder import Event, JournalHeader, JournalReader
 from ambid.acquire.recorder.disk import JournalFile
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 
 RATE = 2000.0
 ROWS = 20

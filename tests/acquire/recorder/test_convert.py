@@ -7,7 +7,7 @@ from ambid.acquire.recorder import JournalReader, Recorder, convert, recorded_fr
 from ambid.errors import DeviceError, RecordError
 from ambid.record import read_record
 from ambid.record.hdf5_format import read_hdf5
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import COLUMNS, RATE, ROWS, bits, block, header, same_bits, values_at
 
 

@@ -15,7 +15,7 @@ from ambid.acquire.recorder.frames import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE
 from ambid.acquire.recorder.header import json_bytes
 from ambid.errors import DeviceError
 from ambid.record import read_record
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import (
     COLUMNS,
     ROWS,

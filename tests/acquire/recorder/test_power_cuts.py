@@ -6,7 +6,7 @@ import pytest
 from ambid.acquire.recorder import JournalReader, Recorder, journal_path, recorded_from
 from ambid.acquire.recorder.disk import JournalFile
 from ambid.record.hdf5_format import read_hdf5
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import ROWS, block, contents, header, same_bits, values_at
 
 CASES = 200

@@ -10,7 +10,7 @@ from ambid.acquire.recorder import Event, JournalReader, Recorder, _writer, fram
 from ambid.acquire.recorder.frames import HEADER, Head, frame_bytes, preamble
 from ambid.acquire.recorder.header import json_bytes
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import ROWS, block, contents, header, same_bits, values_at
 
 BLOCKS = 40

@@ -21,7 +21,7 @@ from ambid.acquire.recorder import (
 from ambid.acquire.recorder import recorder as recorder_module
 from ambid.errors import DeviceError
 from ambid.record import read_record
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import COLUMNS, RATE, ROWS, block, contents, header, same_bits, values_at
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.simulate.steps import advance_plant
+from ambid.simulate.kernels import advance_plant
 
 Integers = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 ROOM = 4_000_000
 """Samples that wait at most: half an hour at 2 kHz."""

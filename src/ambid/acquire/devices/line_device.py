@@ -20,7 +20,7 @@ from ambid.acquire.settings import controller_settings
 from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.rig.rig import Rig
-from ambid.track.stream.block import Frame
+from ambid.track.blocks import Frame
 
 _MODES: dict[Mode, State] = {"sample": "sampling", "drive": "driving", "levitate": "levitating"}
 _NONE: Mapping[str, int] = MappingProxyType({})

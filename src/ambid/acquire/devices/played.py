@@ -17,7 +17,7 @@ from typing import Literal, NoReturn, Self
 from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State
 from ambid.acquire.devices.frames import ROOM
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block, Frame
+from ambid.track.blocks import Block, Frame
 
 Pace = Literal["real", "fastest"]
 

@@ -18,8 +18,8 @@ from ambid.physics.models import model
 from ambid.record import Record, read_rows
 from ambid.rig.load import role_units
 from ambid.rig.rig import Rig
-from ambid.track.stream.block import Block
-from ambid.track.stream.replay import Replay, blocks_of
+from ambid.track.blocks import Block
+from ambid.track.replay import Replay, blocks_of
 from ambid.units import UNKNOWN
 
 

@@ -26,7 +26,7 @@ from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 from ambid.simulate.plant import Standing
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 
 Integers = NDArray[np.int64]
 

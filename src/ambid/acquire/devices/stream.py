@@ -14,7 +14,7 @@ from ambid.acquire.protocol.samples import SampleCounters, SampleDecoder, Sample
 from ambid.acquire.protocol.table import table
 from ambid.arrays import Array
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block, Frame
+from ambid.track.blocks import Block, Frame
 
 _FLOWING: tuple[State, ...] = ("sampling", "driving", "levitating")
 _STATES: tuple[State, ...] = ("idle", "sampling", "driving", "levitating", "fault")

@@ -2,7 +2,7 @@
 
 Sample n arrives at t_0 + n T / (1 + d) + latency, and a latency is never negative: the earliest arrival in a window of
 time lies close above the line. A straight line through these minima, without those that a stall made late, gives d.
-`ambid.track.stream.clock` does not fit: it takes stamps with a jitter to both sides.
+`ambid.track.order` does not fit: it takes stamps with a jitter to both sides.
 """
 
 from __future__ import annotations

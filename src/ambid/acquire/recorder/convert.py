@@ -25,7 +25,7 @@ from ambid.errors import DeviceError, RecordError
 from ambid.record.chunks import check_chunks, write_chunks
 from ambid.record.csv_format import head_lines
 from ambid.record.record import Channel, Record, Step
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 from ambid.units import UNKNOWN, parse_unit
 
 FORMATS = (".h5", ".hdf5", ".csv", ".csv.gz")

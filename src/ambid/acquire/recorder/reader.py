@@ -19,7 +19,7 @@ from ambid.acquire.recorder.disk import lock
 from ambid.acquire.recorder.frames import HEAD_SIZE, SYNC, Head, head_of, is_whole, unpacked_values, version_of
 from ambid.acquire.recorder.header import Event, JournalHeader, event_of
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 
 _WINDOW = 1 << 20  # bytes that are read at once
 _SECTOR = 4096

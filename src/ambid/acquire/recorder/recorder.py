@@ -23,7 +23,7 @@ from ambid.acquire.recorder.frames import BLOCK, EVENT, LARGEST, NO_SAMPLE, pack
 from ambid.acquire.recorder.header import Event, JournalHeader, event_json, journal_path
 from ambid.acquire.recorder.reader import JournalReader
 from ambid.errors import DeviceError
-from ambid.track.stream.block import Block
+from ambid.track.blocks import Block
 
 _LEAST_FREE = 16 << 20  # bytes that are to be left on the disk
 _AHEAD_S = 10.0  # a disk that would be full in this time is told

@@ -35,7 +35,7 @@ class JointEkf(JointFilter):
     with excitation far above the noise a factor of ten does not move it. Where the start is wrong by more than the
     plant is linear (20 % on that bearing, 5 % on a lightly damped resonance), it settles beside the truth and claims a
     standard deviation that is far too small; `warnings` says so where it must be feared. `JointUkf` keeps the second
-    order. The recursive prediction error method of `ambid.track.physical`, whose noise is estimated off-line with the
+    order. The recursive prediction error method of `ambid.track.rpem`, whose noise is estimated off-line with the
     parameters and whose gain knows of them, is the one to prefer.
 
     Parameters

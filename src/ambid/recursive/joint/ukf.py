@@ -33,7 +33,7 @@ class JointUkf(JointFilter):
     along the others (states, offsets) the points of the full transform are known in closed form, and the result is that
     of all 2 n + 1 points. Measurements are linear and are taken in exactly. It converges from farther than `JointEkf`
     (5 % on a lightly damped resonance) at about a quarter of its speed; near the truth they agree to a hundredth of a
-    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.track.physical`.
+    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.track.rpem`.
 
     Parameters
     ----------

@@ -1,0 +1,381 @@
+"""The sequential loop of the simulator: controller, delay line, plant, stops.
+
+Import it only from a module that is itself imported inside a function: it loads the compiler.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+from ambid.physics.coenergy_law import coenergy_derivatives
+
+Integers = NDArray[np.int64]
+
+_energy: Callable[..., None] = compiled(coenergy_derivatives)
+
+
+@compiled
+def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
+    """Return force, k_i and L of a `CoEnergy` (7 numbers) or a `LawMagnet` (12), as `Standing.nonlinear` has them."""
+    if magnet.size > 7:
+        w, dw = np.empty(12), np.empty((7, 9))
+        _energy(x - magnet[11], i, magnet, magnet[9] != 0.0, magnet[10] != 0.0, w, dw)
+        return w[0], w[2], w[3]
+    j = magnet[6] + i
+    gap_a, gap_b = 1.0 / (magnet[1] - x), 1.0 / (magnet[3] + x)
+    flux_a, flux_b = (magnet[4] + j) * gap_a, (magnet[4] - j) * gap_b
+    pull = 0.5 * (magnet[0] * flux_a * flux_a - magnet[2] * flux_b * flux_b)
+    motional = magnet[0] * flux_a * gap_a + magnet[2] * flux_b * gap_b
+    return pull, motional, magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
+
+
+@compiled
+def rate_of_change(
+    x: float, v: float, i: float, p: float, voltage: float, force: float, magnet: Array, body: Array
+) -> tuple[float, float, float]:
+    """Return x'', i' and p' of the nonlinear plant; p lags the force."""
+    pull, motional, inductance = magnet_at(x, i, magnet)
+    lag = 0.0
+    if body[4] < math.inf:
+        lag = body[4] * (pull - p)
+        pull = p
+    acceleration = (pull - body[1] * v + force) / body[0] + body[3]
+    if body[5] != 0.0:
+        voltage -= body[5] * math.tanh(i / body[6])
+    return acceleration, (voltage - body[2] * i - motional * v) / inductance, lag
+
+
+@compiled
+def runge_kutta(
+    x: float, v: float, i: float, p: float, voltage: float, force: float, h: float, magnet: Array, body: Array
+) -> tuple[float, float, float, float]:
+    """Return position, velocity, current and lagging force one classical fourth-order step of `h` s later."""
+    v1 = v
+    a1, c1, p1 = rate_of_change(x, v, i, p, voltage, force, magnet, body)
+    v2 = v + 0.5 * h * a1
+    a2, c2, p2 = rate_of_change(x + 0.5 * h * v1, v2, i + 0.5 * h * c1, p + 0.5 * h * p1, voltage, force, magnet, body)
+    v3 = v + 0.5 * h * a2
+    a3, c3, p3 = rate_of_change(x + 0.5 * h * v2, v3, i + 0.5 * h * c2, p + 0.5 * h * p2, voltage, force, magnet, body)
+    v4 = v + h * a3
+    a4, c4, p4 = rate_of_change(x + h * v3, v4, i + h * c3, p + h * p3, voltage, force, magnet, body)
+    sixth = h / 6.0
+    return (
+        x + sixth * (v1 + 2.0 * (v2 + v3) + v4),
+        v + sixth * (a1 + 2.0 * (a2 + a3) + a4),
+        i + sixth * (c1 + 2.0 * (c2 + c3) + c4),
+        p + sixth * (p1 + 2.0 * (p2 + p3) + p4),
+    )
+
+
+@compiled
+def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, body: Array) -> tuple[float, float]:
+    """Return current and lagging force a step later of a rotor that lies on a stop: without speed no voltage by it."""
+    _, c1, p1 = rate_of_change(x, 0.0, i, p, voltage, 0.0, magnet, body)
+    _, c2, p2 = rate_of_change(x, 0.0, i + 0.5 * h * c1, p + 0.5 * h * p1, voltage, 0.0, magnet, body)
+    _, c3, p3 = rate_of_change(x, 0.0, i + 0.5 * h * c2, p + 0.5 * h * p2, voltage, 0.0, magnet, body)
+    _, c4, p4 = rate_of_change(x, 0.0, i + h * c3, p + h * p3, voltage, 0.0, magnet, body)
+    return i + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), p + h / 6.0 * (p1 + 2.0 * (p2 + p3) + p4)
+
+
+@compiled
+def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, bool]:
+    """Stop the rotor at the ends of its range, without rebound; the flag says that it touched."""
+    if x >= high:
+        return high, min(v, 0.0), True
+    if x <= low:
+        return low, max(v, 0.0), True
+    return x, v, False
+
+
+@compiled
+def quantise(value: float, step: float) -> float:
+    """Return `value` on the grid of `step`; a step of zero leaves it."""
+    return math.floor(value / step + 0.5) * step if step > 0.0 else value
+
+
+@compiled
+def advance_nonlinear(
+    x: Array,
+    late: float,
+    now: float,
+    fraction: float,
+    disturbance: Array,
+    period: float,
+    substeps: int,
+    magnet: Array,
+    body: Array,
+    low: float,
+    high: float,
+) -> bool:
+    """Carry the state over one sample in place: first under the voltage `late`, then under `now`."""
+    touched = False
+    p, v, i = x[0], x[1], x[2]
+    lagging = x[3] if x.size > 3 else 0.0
+    for part in range(2):
+        length = period * (fraction if part == 0 else 1.0 - fraction)
+        if length == 0.0:
+            continue
+        voltage = min(max(late if part == 0 else now, body[7]), body[8]) + body[9] + disturbance[1]
+        h = length / substeps
+        for _ in range(substeps):
+            if v == 0.0 and (p >= high or p <= low):
+                push, _, _ = rate_of_change(p, v, i, lagging, voltage, disturbance[0], magnet, body)
+                if (p >= high and push >= 0.0) or (p <= low and push <= 0.0):
+                    i, lagging = lie(p, i, lagging, voltage, h, magnet, body)
+                    touched = True
+                    continue
+            p, v, i, lagging = runge_kutta(p, v, i, lagging, voltage, disturbance[0], h, magnet, body)
+            p, v, hit = stop(p, v, low, high)
+            touched = touched or hit
+    x[0], x[1], x[2] = p, v, i
+    if x.size > 3:
+        x[3] = lagging
+    return touched
+
+
+@compiled
+def advance_linear(
+    x: Array,
+    centre: Array,
+    late: float,
+    now: float,
+    disturbance: Array,
+    a: Array,
+    b: Array,
+    b_late: Array,
+    e: Array,
+    deviation: Array,
+) -> None:
+    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations.
+
+    `deviation` (n_states,) is room to work in.
+    """
+    n = x.size
+    for row in range(n):
+        deviation[row] = x[row] - centre[row]
+    for row in range(n):
+        s = centre[row] + b[row] * now + b_late[row] * late
+        for column in range(n):
+            s += a[row, column] * deviation[column]
+        for column in range(e.shape[1]):
+            s += e[row, column] * disturbance[column]
+        x[row] = s
+
+
+@compiled
+def run(
+    linear: bool,
+    excitation: Array,
+    setpoint: Array,
+    sensor_noise: Array,
+    disturbance: Array,
+    start: Array,
+    centre: Array,
+    centre_input: float,
+    outputs: Integers,
+    roles: tuple[int, int],
+    a: Array,
+    b: Array,
+    b_late: Array,
+    e: Array,
+    magnet: Array,
+    body: Array,
+    gains: Array,
+    delay: int,
+    fraction: float,
+    period: float,
+    substeps: int,
+    resolution: Array,
+    input_limits: tuple[float, float, float],
+    stops: tuple[float, float],
+    gap: tuple[float, float],
+) -> tuple[Array, Array, Array, int, int, int, int]:
+    """Run the loop over all samples.
+
+    `outputs` are the states that are measured, `roles` the columns among them of position and current (-1: none),
+    `gains` kp, ki T, kd, kc, tau, T, and `input_limits` low, high and resolution of the command.
+    """
+    n, ny = sensor_noise.shape
+    measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))
+    contact, saturated, n_saturated = -1, -1, 0
+    x, room = start.copy(), np.empty(start.size)
+    at, current_at = roles
+    integral = derivative = last = 0.0
+    low, high, step = input_limits
+    for k in range(n):
+        for j in range(ny):
+            truth = x[outputs[j]]
+            if not math.isfinite(truth):
+                return measured, command, states, contact, saturated, n_saturated, k
+            measured[k, j] = quantise(truth + sensor_noise[k, j], resolution[j])
+        states[k] = x
+        wanted, error = centre_input + excitation[k], 0.0
+        if at >= 0:
+            y = measured[k, at]
+            error = setpoint[k] - y
+            derivative = (gains[4] * derivative - (gains[2] * (y - last) if k > 0 else 0.0)) / (gains[4] + gains[5])
+            last = y
+            wanted += gains[0] * error + integral + derivative
+        if current_at >= 0:
+            wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
+        beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
+        if beyond != 0.0:
+            n_saturated += 1
+            saturated = k if saturated < 0 else saturated
+        # Anti-windup: while the command is limited the integral may only move back.
+        growth = gains[1] * error
+        if beyond * growth <= 0.0:
+            integral += growth
+        command[k] = min(max(quantise(wanted, step), low), high)
+        now = command[k - delay] if k >= delay else centre_input
+        late = command[k - delay - 1] if k > delay else centre_input
+        if linear:
+            advance_linear(x, centre, late - centre_input, now - centre_input, disturbance[k], a, b, b_late, e, room)
+            touched = False
+            if at >= 0:
+                x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
+        else:
+            touched = advance_nonlinear(
+                x, late, now, fraction, disturbance[k], period, substeps, magnet, body, stops[0], stops[1]
+            )
+            # Beyond a pole face the equations hold no more, though they give finite numbers again.
+            if not gap[0] < x[0] < gap[1] and k + 1 < n:
+                return measured, command, states, contact, saturated, n_saturated, k + 1
+        if touched and contact < 0:
+            contact = k + 1
+    return measured, command, states, contact, saturated, n_saturated, -1
+
+
+@compiled
+def run_varying(
+    excitation: Array,
+    noise: Array,
+    noise_size: Array,
+    force: Array,
+    force_column: int,
+    edges: Integers,
+    a: Array,
+    b: Array,
+    b_late: Array,
+    e: Array,
+    sensor_gain: Array,
+    x: Array,
+    memory: Array,
+    line: Array,
+    counts: Integers,
+    centre: Array,
+    settings: Array,
+    outputs: Integers,
+    roles: Integers,
+    gains: Array,
+    resolution: Array,
+    limits: Array,
+    measured: Array,
+    command: Array,
+    states: Array,
+) -> int:
+    """Run the loop over some samples and keep what the next call needs; the law is that of `_kernels.run`.
+
+    `noise` (n, n_outputs + n_disturbances) are standard normal numbers, `noise_size` what they are multiplied with;
+    `force` (n,) adds to the disturbance `force_column`, or is empty. `edges` (n_pieces + 1) bound the stretches of the
+    matrices a (n_pieces, n, n), b, b_late (n_pieces, n), e and of sensor_gain (n_pieces, n_outputs). settings: centre
+    input, set point. limits: low and high of command and of position, resolution of the command.
+
+    Kept between calls: x (n,), memory = integral, derivative, last position; line = the newest commands, newest first
+    (whole delay + 2); counts = samples done, first contact, first limited command (-1: none), limited commands.
+    Filled: measured, command, states. Returns the first sample of these that is not finite, -1 for none.
+    """
+    at, current_at = roles[0], roles[1]
+    integral, derivative, last = memory[0], memory[1], memory[2]
+    centre_input, setpoint = settings[0], settings[1]
+    whole = line.size - 2
+    n_outputs, loaded = outputs.size, force.size > 0
+    disturbance, room = np.empty(noise_size.size - n_outputs), np.empty(x.size)
+    for piece in range(edges.size - 1):
+        a_now, b_now, b_before, e_now, gain = a[piece], b[piece], b_late[piece], e[piece], sensor_gain[piece]
+        for k in range(edges[piece], edges[piece + 1]):
+            for j in range(n_outputs):
+                truth = x[outputs[j]]
+                if not math.isfinite(truth):
+                    return k
+                measured[k, j] = quantise(gain[j] * truth + noise[k, j] * noise_size[j], resolution[j])
+            for row in range(x.size):
+                states[k, row] = x[row]
+            wanted, error = centre_input + excitation[k], 0.0
+            if at >= 0:
+                y = measured[k, at]
+                error = setpoint - y
+                moved = y - last if counts[0] > 0 else 0.0
+                derivative = (gains[4] * derivative - gains[2] * moved) / (gains[4] + gains[5])
+                last = y
+                wanted += gains[0] * error + integral + derivative
+            if current_at >= 0:
+                wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
+            beyond = max(wanted - limits[1], 0.0) + min(wanted - limits[0], 0.0)
+            if beyond != 0.0:
+                counts[3] += 1
+                if counts[2] < 0:
+                    counts[2] = counts[0]
+            growth = gains[1] * error
+            if beyond * growth <= 0.0:
+                integral += growth
+            command[k] = min(max(quantise(wanted, limits[4]), limits[0]), limits[1])
+            for j in range(whole + 1, 0, -1):
+                line[j] = line[j - 1]
+            line[0] = command[k]
+            late, now = line[whole + 1] - centre_input, line[whole] - centre_input
+            for j in range(disturbance.size):
+                disturbance[j] = noise[k, n_outputs + j] * noise_size[n_outputs + j]
+            if loaded:
+                disturbance[force_column] += force[k]
+            advance_linear(x, centre, late, now, disturbance, a_now, b_now, b_before, e_now, room)
+            if at >= 0:
+                x[0], x[1], touched = stop(x[0], x[1], limits[2], limits[3])
+                if touched and counts[1] < 0:
+                    counts[1] = counts[0] + 1
+            counts[0] += 1
+    memory[0], memory[1], memory[2] = integral, derivative, last
+    return -1
+
+
+@compiled
+def advance_plant(
+    linear: bool,
+    x: Array,
+    centre: Array,
+    voltages: tuple[float, float, float],
+    disturbance: Array,
+    matrices: tuple[Array, Array, Array, Array],
+    magnet: Array,
+    body: Array,
+    timing: tuple[float, float, int],
+    stops: tuple[float, float],
+    room: Array,
+) -> bool:
+    """Carry the state of a plant over one sample, in place.
+
+    `linear`: which equations: the matrices, or magnet and body; `x`: (n_states,), SI, state; position and velocity come
+    first where the plant has them; `centre`: (n_states,), SI, where the matrices hold; `voltages`: before and after the
+    delay's fraction has passed, and that at `centre`, V; `disturbance`: (n_disturbances,), SI, held over the sample; of
+    the nonlinear plant force, then voltage; `matrices`: a (n_states, n_states), B and B_late (n_states,), E (n_states,
+    n_disturbances), as `Standing.matrices` has them; `magnet`, `body`: as `Standing.nonlinear` has them; `stops`: where
+    the rotor is stopped, m; `room`: (n_states,), to work in. Returns whether the rotor touched a stop.
+    """
+    late, now, rest = voltages
+    if not linear:
+        fraction, period, substeps = timing
+        return bool(
+            advance_nonlinear(x, late, now, fraction, disturbance, period, substeps, magnet, body, stops[0], stops[1])
+        )
+    a, b, b_late, e = matrices
+    advance_linear(x, centre, late - rest, now - rest, disturbance, a, b, b_late, e, room)
+    if x.size < 3:
+        return False
+    x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
+    return bool(touched)

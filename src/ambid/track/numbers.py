@@ -1,0 +1,457 @@
+"""What is tracked beside the physical parameters, where tracking begins, and how sure one is of that.
+
+The tracked numbers q are, in this order: physical parameters that are not fixed, gains of the sensors (1 unless a fault
+is found), the delay where it was estimated as a real number (what is known of the parameters depends on it), the noise
+description, constant disturbances (offsets), and unbalance where the angle is known. All are in
+units of their own magnitude. The noise is that of the start estimate, where its predictor forgets soon enough.
+
+The force of unbalance is f = m e (speed^2) cos(angle + phase) (theory.md sec. 1). With a = m e cos(phase) and
+b = -m e sin(phase) it is a speed^2 cos(angle) + b speed^2 sin(angle): linear in a and b, with regressors that need no
+filter and follow the rotor through a spin-up. The force is held over a sample at its middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.innovations import predictor_gain
+from ambid.estimation.predictor import assemble
+from ambid.estimation.problem import NoiseForm, PredictorProblem, Scales
+from ambid.estimation.scaling import scales_for
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.models import model
+from ambid.physics.sensor_gain import SensorGains
+from ambid.record import Record
+
+MEMORY_S = 0.02  # longest memory of the predictor: it is deaf for ten of them after a gap, and slow to show a change
+_LEAST_MEMORY = 200  # samples that the predictor may remember at any rate
+_LOG_LEVEL_SD = 0.3  # of a log noise level taken over from an estimate that explains its record
+_GAIN_SD = 0.1  # relative, of an entry of the predictor gain
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoiseNumbers:
+    """The noise of a predictor."""
+
+    form: NoiseForm
+    numbers: Array  # (n_noise,), that describe it, and their standard deviations
+    sd: Array
+    gain: Array  # (n_states, n_outputs), predictor gain in scaled units
+
+
+def rate_of(estimate: Estimate) -> float:
+    """Return the sampling rate of the record behind an estimate.
+
+    Returns hz.
+    """
+    return float(str(estimate.record["rate_hz"]))
+
+
+def overdispersion_of(estimate: Estimate) -> float:
+    """Return how much larger than the model says the variance of weighted innovations' sums is.
+
+    Returns 1 where the model explains its record.
+    """
+    if estimate.covariance_method == "information":
+        return 1.0
+    return max(float(str(estimate.information.get("robust_over_information_sd", 1.0))) ** 2, 1.0)
+
+
+def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> NoiseNumbers:
+    """Return the noise with which tracking begins.
+
+    Returns form "given" with a gain that forgets where the estimate's own predictor does not forget soon enough.
+    """
+    found = estimate.noise
+    gain = found.gain * scales.output / scales.state[:, None]
+    if found.form == "gain":
+        entries = gain.ravel()
+        return NoiseNumbers(form="gain", numbers=entries, sd=_GAIN_SD * (np.abs(entries) + 0.1), gain=gain)
+    A, C, E = _discrete(plant, estimate, scales)
+    longest = max(MEMORY_S * rate_of(estimate), _LEAST_MEMORY)
+    if found.form == "levels":
+        sensor = np.array([found.sensor_sd[o] for o in plant.outputs]) / scales.output
+        held = np.array([found.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
+        with np.errstate(divide="ignore"):
+            numbers = np.log(np.concatenate([held, sensor[1:]]) / sensor[0])
+        if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
+            sd = np.full(numbers.size, _LOG_LEVEL_SD * np.sqrt(overdispersion_of(estimate)))
+            return NoiseNumbers(form="levels", numbers=numbers, sd=sd, gain=gain)
+    nothing = np.zeros(0)
+    return NoiseNumbers(form="given", numbers=nothing, sd=nothing, gain=_bounded_gain(A, C, E, longest))
+
+
+def _discrete(plant: SensorGains, estimate: Estimate, scales: Scales) -> tuple[Array, Array, Array]:
+    """A, C and E of the sampled plant in scaled units."""
+    at, _ = discretise(plant.matrices(estimate.values), 1.0 / rate_of(estimate))
+    state = scales.state
+    return (
+        at.A * state / state[:, None],
+        at.C * state / scales.output[:, None],
+        at.E * scales.disturbance / state[:, None],
+    )
+
+
+def _memory(F: Array) -> float:
+    """Memory of a predictor in samples."""
+    radius = float(np.abs(np.linalg.eigvals(F)).max())
+    return np.inf if radius >= 1.0 else 1.0 / (1.0 - radius)
+
+
+def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
+    """Gain of a predictor that forgets soon enough: disturbances are taken a little larger than they are.
+
+    An estimate without disturbances remembers its initial state for ever. The larger variance of the innovations that
+    this costs is about the number of states over the memory in samples.
+    """
+    for level in 10.0 ** np.arange(-4.0, 2.1, 0.25):
+        try:
+            gain = predictor_gain(A, C, level**2 * E @ E.T, np.eye(C.shape[0])).K
+        except np.linalg.LinAlgError:
+            continue
+        if _memory(A - gain @ C) <= longest:
+            return gain
+    raise EstimationError("no predictor of this estimate forgets its start. Give a model whose states the outputs show")
+
+
+_PARTS, _PART_RAD = 25, 10.0  # parts of a record in which speed and angle are compared, each at least so long
+_AGREE = 0.05  # relative difference of speed and turning that sensors make
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Forcing:
+    """Regressors of the unbalance."""
+
+    # (n_samples, 2), (speed/top speed)^2 times cosine and sine of the angle, in the middle of each sample
+    columns: Array
+    top_speed: float  # rad/s
+
+
+def forcing_of(record: Record) -> Forcing | None:
+    """Return the regressors of a record that holds the speed or the angle of its rotor.
+
+    Returns none where the record holds neither, or the rotor stands still.
+    """
+    if "angle" not in record.names and "speed" not in record.names:
+        return None
+    period = 1.0 / record.rate_hz
+    if "speed" in record.names:
+        speed = record["speed"]
+        angle = record["angle"] if "angle" in record.names else _integrated(speed, period)
+    else:
+        angle = record["angle"]
+        speed = np.gradient(np.unwrap(angle), period)
+    top = float(np.nanmax(np.abs(speed), initial=0.0))
+    if top == 0.0:
+        return None
+    if top * period > np.pi:
+        raise EstimationError(
+            f"the speed reaches {top:.4g} rad/s, more than half a turn a sample at {record.rate_hz:g} Hz."
+            " Check its unit"
+        )
+    if "speed" in record.names and "angle" in record.names:
+        _check_agreement(speed, angle, period)
+    middle = angle + 0.5 * period * speed
+    size = (speed / top) ** 2
+    return Forcing(columns=np.column_stack([size * np.cos(middle), size * np.sin(middle)]), top_speed=top)
+
+
+def _integrated(speed: Array, period: float) -> Array:
+    """Angle from the speed by the trapezium rule, 0 at the first sample."""
+    known = np.nan_to_num(speed)  # after a gap the phase is lost; the recursion finds it anew
+    return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * period)])
+
+
+def _check_agreement(speed: Array, angle: Array, period: float) -> None:
+    """Refuse a speed that is not the derivative of the angle; a unit that is wrong is off by a factor."""
+    expected = 0.5 * (speed[1:] + speed[:-1]) * period
+    turned = np.mod(np.diff(angle) + np.pi, 2.0 * np.pi) - np.pi  # an angle may be wrapped
+    known = np.isfinite(expected) & np.isfinite(turned)
+    expected, turned = expected[known], turned[known]
+    way = np.cumsum(np.abs(expected))
+    parts = 0 if way.size == 0 else min(_PARTS, int(way[-1] / _PART_RAD))
+    if parts == 0:
+        return
+    ends = np.searchsorted(way, way[-1] * np.arange(1, parts) / parts)
+    begins = np.concatenate([[0], ends])
+    along = np.add.reduceat(turned * np.sign(expected), begins)
+    ratio = float(np.median(along / np.add.reduceat(np.abs(expected), begins)))  # gaps spoil few of the parts
+    if abs(ratio - 1.0) > _AGREE:
+        raise EstimationError(
+            f"the angle turns at {ratio:.4g} times the speed; they have to agree within {_AGREE:.0%}. Check the units"
+            " of both (rpm or rad/s, deg or rad) and their signs, or leave one of them out"
+        )
+
+
+def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, float, float, float]:
+    """Return the unbalance as amplitude and phase.
+
+    `a`, `b`: m e cos(phase) and -m e sin(phase), kg m; `covariance`: (2, 2), of a and b. Returns `amplitude,
+    amplitude_sd`: kg m; `phase, phase_sd`: rad; the standard deviation is pi where the amplitude is within its own of
+    zero.
+    """
+    size = float(np.hypot(a, b))
+    if size == 0.0:
+        return 0.0, float(np.sqrt(covariance.trace() / 2)), 0.0, float(np.pi)
+    along, across = np.array([a, b]) / size, np.array([b, -a]) / size
+    sd, turned = float(np.sqrt(along @ covariance @ along)), float(np.sqrt(across @ covariance @ across)) / size
+    return size, sd, float(np.arctan2(-b, a)), min(turned, float(np.pi))
+
+
+Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
+
+UNBALANCE = ("unbalance_cos", "unbalance_sin")
+_WIDE = 0.15  # relative standard deviation above which a first-order step is too long
+_GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
+_OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
+_UNBALANCE_SD = 10.0  # forces that would throw the rotor through the noise in one sample
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedNumbers:
+    """The tracked numbers of a bench and their state at the start."""
+
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]  # the delay counts as noise: it belongs to the predictor, not to the bench
+    units: tuple[str, ...]  # SI units of parameters and gains; "1" for the others, except ``kg m`` for the unbalance
+    magnitude: Array  # (p,), SI size of one unit of q
+    start: Array  # (p,), q at the start
+    covariance: Array  # (p, p), of q at the start
+    problem: PredictorProblem  # without data: model, scales, delay and noise form from which predictors are assembled
+    point: Array  # (n_inputs + n_outputs,), SI, operating point that is taken off the samples: inputs, then outputs
+    innovation_covariance: Array  # (n_outputs, n_outputs), at the start, in scaled output units
+    information_s: float  # length of the record behind the start, s
+    # variance of weighted innovations' sums over what the model says of them: above 1 where the start estimate
+    # explains its record only in part
+    overdispersion: float = 1.0
+    speed: float = 1.0  # rad/s at which the unbalance force has the size of its magnitude
+    warnings: tuple[str, ...] = ()  # what to mistrust, one line each
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate in Hz."""
+        return self.problem.rate_hz
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether the unbalance is among the numbers."""
+        return "unbalance" in self.kinds
+
+    @property
+    def positive(self) -> NDArray[np.bool_]:
+        """Which numbers physics allows positive values of only, shape (p,): mass, resistance, inductance, gains."""
+        allowed = {s.name for s in self.problem.model.parameters if s.positive}
+        return np.array([name in allowed for name in self.names])
+
+    def places(self, *kinds: Kind) -> NDArray[np.int64]:
+        """Return where the numbers of some kinds stand in q.
+
+        Returns (n_places,).
+        """
+        return np.array([j for j, k in enumerate(self.kinds) if k in kinds], dtype=np.int64)
+
+    def values(self, q: Array) -> dict[str, float]:
+        """Return numbers in SI units.
+
+        `q`: (p,).
+        """
+        return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
+
+    def physical(self, q: Array) -> Array:
+        """Return the physical parameters in SI units.
+
+        `q`: (p,). Returns (n_parameters,).
+        """
+        own = self.places("parameter")
+        return np.asarray(q[own] * self.magnitude[own])
+
+    def physical_covariance(self, covariance: Array) -> Array:
+        """Return the covariance of the physical parameters in SI units.
+
+        `covariance`: (p, p), of q. Returns (n_parameters, n_parameters).
+        """
+        own = self.places("parameter")
+        return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
+
+    def vector(self, q: Array) -> Array:
+        """Return q in the layout of `PredictorProblem`, initial state zero.
+
+        `q`: (p,). Returns (problem.size,).
+        """
+        out = np.zeros(self.problem.size)
+        n = self.problem.slices["initial"].start
+        out[:n] = q[:n]
+        return out
+
+
+def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed: float = 1.0) -> TrackedNumbers:
+    """Set up tracking from an off-line estimate.
+
+    `estimate`: parameters, covariance, noise, delay and operating point are taken from it; `synchronous`: track an
+    unbalance too: the angle of the rotor is known; `top_speed`: speed at which the unbalance is felt most, rad/s.
+    """
+    from scipy.linalg import block_diag
+
+    plant = SensorGains(model(estimate.model))
+    if estimate.status == "failed" or not estimate.covariance_names:
+        raise EstimationError("the start estimate has no estimated parameters. Identify with free parameters first")
+    scales = _scales(plant, estimate)
+    noise = noise_numbers(plant, estimate, scales)
+    free = tuple(estimate.covariance_names)
+    sizes = [_size(plant, estimate, k) for k in free] + [1.0] * len(plant.gains)
+    problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
+    groups = _groups(problem, estimate, noise, free, top_speed if synchronous else None)
+    found = TrackedNumbers(
+        names=tuple(name for g in groups for name in g.names),
+        kinds=tuple(g.kind for g in groups for _ in g.names),
+        units=tuple(unit for g in groups for unit in g.units),
+        magnitude=np.concatenate([g.magnitude for g in groups]),
+        start=np.concatenate([g.start for g in groups]),
+        covariance=block_diag(*(g.covariance for g in groups)),
+        problem=problem,
+        point=np.array([estimate.operating_point[role] for role in (*plant.inputs, *plant.outputs)]),
+        innovation_covariance=estimate.noise.innovation_covariance / np.outer(scales.output, scales.output),
+        information_s=float(str(estimate.record["samples"])) / problem.rate_hz,
+        overdispersion=overdispersion_of(estimate),
+        speed=top_speed,
+        warnings=_poorly_known(estimate),
+    )
+    if assemble(problem, found.vector(found.start), with_derivatives=False) is None:
+        raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Group:
+    """Numbers of one kind."""
+
+    kind: Kind
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    magnitude: Array
+    start: Array
+    covariance: Array
+
+
+def _problem(
+    plant: SensorGains, estimate: Estimate, scales: Scales, noise: NoiseNumbers, names: tuple[str, ...], sizes: Array
+) -> PredictorProblem:
+    delay = estimate.delay[plant.inputs[0]]
+    few = delay.samples + 3
+    return PredictorProblem(
+        model=plant,
+        rate_hz=rate_of(estimate),
+        u=np.zeros((few, len(plant.inputs))),
+        y=np.zeros((few, len(plant.outputs))),
+        estimated=names,
+        known={k: v for k, v in estimate.values.items() if k not in names},
+        magnitude=sizes,
+        prior_mean=np.zeros(len(names)),
+        prior_sd=np.full(len(names), np.inf),
+        scales=scales,
+        delay=delay.samples,
+        lag=0.0 if _tracks_delay(plant, estimate) else delay.fraction,
+        fractional=_tracks_delay(plant, estimate),
+        skip=delay.samples + 2,
+        noise=noise.form,
+        gain=noise.gain,
+    )
+
+
+def _groups(
+    problem: PredictorProblem,
+    estimate: Estimate,
+    noise: NoiseNumbers,
+    free: tuple[str, ...],
+    top_speed: float | None,
+) -> list[_Group]:
+    """The tracked numbers, kind by kind, in the order of the predictor's vector."""
+    plant, scales = problem.model, problem.scales
+    n, count, specs = len(free), noise.numbers.size, {s.name: s.unit for s in plant.parameters}
+    gains = problem.estimated[n:]
+    size, held = problem.magnitude[:n], scales.disturbance
+    groups = [
+        _Group(
+            kind="parameter", names=free, units=tuple(specs[k] for k in free), magnitude=size,
+            start=np.array([estimate.values[k] for k in free]) / size,
+            covariance=estimate.covariance / np.outer(size, size),
+        ),
+        _Group(
+            kind="gain", names=gains, units=("1",) * len(gains), magnitude=np.ones(len(gains)),
+            start=np.ones(len(gains)), covariance=_GAIN_KNOWN**2 * np.eye(len(gains)),
+        ),
+        *_delay(problem, estimate),
+        _Group(
+            kind="noise", names=tuple(f"noise_{k}" for k in range(count)), units=("1",) * count,
+            magnitude=np.ones(count), start=noise.numbers, covariance=np.diag(noise.sd**2),
+        ),
+        _Group(
+            kind="offset", names=tuple(f"offset_{d}" for d in plant.disturbances),
+            units=tuple(plant.units[d] for d in plant.disturbances), magnitude=held, start=np.zeros(held.size),
+            covariance=_OFFSET_SD**2 * np.eye(held.size),
+        ),
+    ]  # fmt: skip
+    if top_speed is not None and "force" in plant.disturbances:
+        size = np.full(2, held[plant.disturbances.index("force")] / top_speed**2)
+        groups.append(
+            _Group(
+                kind="unbalance", names=UNBALANCE, units=("kg m",) * 2, magnitude=size, start=np.zeros(2),
+                covariance=_UNBALANCE_SD**2 * np.eye(2),
+            )
+        )  # fmt: skip
+    return groups
+
+
+def _poorly_known(estimate: Estimate) -> tuple[str, ...]:
+    """Parameters so wide that evidence linearised at the start is worth less than it claims."""
+    wide = [
+        f"{name} to {sd / abs(value):.0%}"
+        for name, sd in zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True)
+        if sd > _WIDE * abs(value := estimate.values[name])
+    ]
+    if not wide:
+        return ()
+    return (
+        f"the start knows {', '.join(wide)} only: what is tracked of them may claim too narrow an interval. Start from"
+        " a longer or better excited record",
+    )
+
+
+def _tracks_delay(plant: SensorGains, estimate: Estimate) -> bool:
+    return bool(estimate.delay[plant.inputs[0]].sd)
+
+
+def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
+    """The delay beyond the whole samples, in samples, where the start has estimated it."""
+    if not problem.fractional:
+        return []
+    found = estimate.delay[problem.model.inputs[0]]
+    return [
+        _Group(
+            kind="noise", names=("delay",), units=("1",), magnitude=np.ones(1), start=np.array([found.fraction]),
+            covariance=np.array([[float(found.sd or 0.0) ** 2]]),
+        )
+    ]  # fmt: skip
+
+
+def _size(plant: LinearModel, estimate: Estimate, name: str) -> float:
+    value = estimate.values[name]
+    return max(abs(value), plant.references(estimate.values).get(name, 0.0)) or 1.0
+
+
+def _scales(plant: LinearModel, estimate: Estimate) -> Scales:
+    """Scales from the innovations; an input is measured by what moves an output by about its innovation in a sample."""
+    outputs = np.sqrt(np.diag(estimate.noise.innovation_covariance))
+    rate = rate_of(estimate)
+    scales = scales_for(plant, estimate.values, np.ones(len(plant.inputs)), outputs, rate)
+    discrete, _ = discretise(plant.matrices(estimate.values), 1.0 / rate)
+    reach = np.abs(discrete.C @ discrete.B) + np.abs(discrete.C @ discrete.A @ discrete.B)
+    return replace(scales, input=1.0 / np.max(reach / outputs[:, None], axis=0))

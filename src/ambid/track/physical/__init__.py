@@ -1,1 +1,0 @@
-"""Recursive prediction error estimation of physical parameters, on the innovations form of the off-line estimator."""
