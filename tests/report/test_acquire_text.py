@@ -1,6 +1,6 @@
 """What is said of an acquisition and of a commissioning: true in each state, and visible where something is poor."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,9 +8,8 @@ import pytest
 from ambid.acquire.device import Counters, DeviceInfo
 from ambid.acquire.quality import ColumnQuality, QualityReport
 from ambid.acquire.session import RunReport
-from ambid.job.commission import STEPS, Step
-from ambid.report.acquire_text import acquired_text, progress_line
-from ambid.report.commission_text import next_text, step_text
+from ambid.job.commission import STEPS
+from ambid.report.device_text import acquired_text, next_text, progress_line, step_text
 
 COLUMN = ColumnQuality(
     name="gap", role="position", unit="1", mean=512.0, sd=20.0, rms=512.0, least=400.0, most=600.0, saturated=0.0,
@@ -21,20 +20,15 @@ QUALITY = QualityReport(
     samples=1000, lost=0, gaps=0, repeated=0, damaged=0, seconds=0.5, rate_hz=2000.0, measured_hz=2000.4,
     measured_sd=0.1, excited=True, columns=(COLUMN, DUTY),
 )  # fmt: skip
+NOTHING = Counters()
 RUN = RunReport(samples=1000, wanted=1000, lost=0, first=0, after=1000, fault=None, interrupted=False, events=())
 
 
-@dataclass(frozen=True)
-class Done:
-    info = DeviceInfo(kind="serial", port="/dev/ttyX", rate_hz=2000.0, columns=())
-    run: RunReport = RUN
-    quality: QualityReport = QUALITY
-    counters: Counters = Counters()  # noqa: RUF009 - frozen
-    not_stored: int = 0
+INFO = DeviceInfo(kind="serial", port="/dev/ttyX", rate_hz=2000.0, columns=())
 
 
-def said(**changes):
-    return " ".join(acquired_text(Done(**changes), Path("o.h5")).split())
+def said(run=RUN, quality=QUALITY, counters=NOTHING, not_stored=0):
+    return " ".join(acquired_text(Path("o.h5"), INFO, run, quality, counters, not_stored=not_stored).split())
 
 
 def test_a_whole_record_is_told_with_its_columns():
@@ -55,7 +49,7 @@ def test_without_an_excitation_there_is_no_ratio():
     text = said(quality=still)
     assert "dB" not in text
     assert "at most" in text
-    assert "dB" not in progress_line(Done(quality=still))
+    assert "dB" not in progress_line(still, NOTHING)
 
 
 def test_lost_samples_say_how_to_read_the_record():
@@ -80,13 +74,12 @@ def test_the_clock_of_the_controller_is_told_with_its_uncertainty():
     [(float("nan"), "2000 Hz,"), (1990.2, "1990 Hz,"), (52_000.0, "2000 Hz at 26 times real time,")],
 )
 def test_the_line_of_progress_tells_the_rate_as_it_comes(measured, words):
-    line = progress_line(Done(quality=replace(QUALITY, measured_hz=measured)))
+    line = progress_line(replace(QUALITY, measured_hz=measured), NOTHING)
     assert line.startswith(f"0.5 s, {words} 0 lost, position 14 dB")
 
 
 def test_a_step_shows_findings_cautions_and_reasons():
-    step = Step(name="rest", findings=("found",), cautions=("beware",), reasons=("broken",))
-    text = step_text(step, 2, 9)
+    text = step_text("rest", "2/9", findings=("found",), cautions=("beware",), reasons=("broken",))
     assert "2/9 rest" in text
     assert [line.strip() for line in text.splitlines()[1:]] == ["found", "note: beware", "stopped: broken"]
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.report.bearing_figure import bearing_evidence, bearing_figures, bearing_overview
-from ambid.report.bearing_page import bearing_html
-from ambid.report.bearing_text import bearing_text, curve_rows
+from ambid.report.estimate_text import curve_rows, estimate_text
+from ambid.report.figures import bearing_evidence, figures, overview
+from ambid.report.page import report_html
 from tests.bearing.magnet.estimates import by_hand, seen
 
 
@@ -30,7 +30,7 @@ def evidence(estimate, records):
 
 
 def test_the_text_holds_all_and_keeps_its_width(estimate):
-    text = bearing_text(estimate)
+    text = estimate_text(estimate)
     assert max(map(len, text.splitlines())) <= 80
     for p in estimate.parameters:
         assert any(line.startswith(f"{p.name} ") for line in text.splitlines())
@@ -39,8 +39,8 @@ def test_the_text_holds_all_and_keeps_its_width(estimate):
     assert text.index("warning: one thing") < text.index("value ± sd")
     (row,) = [x.split() for x in text.splitlines() if x.startswith("held.csv ")]
     assert row[1] == "held"
-    assert "– stalled" in bearing_text(replace(estimate, status="stalled")).splitlines()[0]
-    unfinished = bearing_text(replace(estimate, status="stalled"))
+    assert "– stalled" in estimate_text(replace(estimate, status="stalled")).splitlines()[0]
+    unfinished = estimate_text(replace(estimate, status="stalled"))
     assert "UNFINISHED" in unfinished
     assert "identified" not in unfinished
 
@@ -68,7 +68,7 @@ def test_extrapolation_is_marked(estimate):
 
 
 def test_every_record_is_drawn(evidence, estimate):
-    drawn = bearing_figures(evidence)
+    drawn = figures(evidence)
     assert set(drawn) == {"curves", "map", "records"}
     titles = [a.get_title(loc="left") for a in drawn["records"].axes]
     assert [t for t in titles if t] == list(estimate.noise)
@@ -77,12 +77,12 @@ def test_every_record_is_drawn(evidence, estimate):
     assert np.all(np.isfinite(first.predicted))
     assert np.all(np.isnan(held.predicted[:, 0]))
     assert np.mean((first.measured - first.predicted)[:, 1] ** 2 / first.sd[:, 1] ** 2) == pytest.approx(1.0, abs=0.1)
-    page = bearing_overview(evidence)
+    page = overview(evidence)
     assert page.get_size_inches()[1] > sum(1.0 for _ in estimate.noise)
 
 
 def test_the_line_of_balance_is_drawn_for_one_magnet(evidence):
-    where = bearing_figures(evidence)["map"].axes[0]
+    where = figures(evidence)["map"].axes[0]
     assert "carries the weight" in [t.get_text() for t in where.get_legend().get_texts()]
 
 
@@ -91,7 +91,7 @@ def test_the_page_holds_all_and_escapes_names(evidence, estimate):
     renamed = {bad if n == "one.csv" else n: levels for n, levels in estimate.noise.items()}
     fits = {bad if n == "one.csv" else n: f for n, f in estimate.fit.items()}
     e = replace(estimate, noise=renamed, fit=fits)
-    page = bearing_html(replace(evidence, estimate=e), made="2001-02-03")
+    page = report_html(replace(evidence, estimate=e), made="2001-02-03")
     assert "&lt;b&gt;one.csv" in page
     assert bad not in page
     assert page.count("data:image/png") == 3

@@ -5,8 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from ambid.report._drawing import autocorrelation
-from ambid.report.figures import figures, overview, save
+from ambid.report.drawing import autocorrelation, save
+from ambid.report.figures import figures, overview
 
 
 def test_the_overview_has_all_parts(unstable):
@@ -28,7 +28,7 @@ def test_measured_and_predicted_are_drawn_as_they_are(unstable):
     axes = figures(unstable)["signals"].axes[1]  # close view
     points, line = axes.lines[:2]
     t = np.asarray(points.get_xdata())
-    first = int(np.argmin(np.abs(unstable.time_s - t[0])))
+    first = int(np.argmin(np.abs(unstable.traces.time_s - t[0])))
     rows = slice(first, first + t.size)
     np.testing.assert_allclose(np.asarray(points.get_ydata()), 1e6 * unstable.run.measured[rows, 0])
     np.testing.assert_allclose(np.asarray(line.get_ydata()), 1e6 * unstable.run.predicted[rows, 0])

@@ -7,8 +7,8 @@ import pytest
 
 from ambid.blackbox.frequency.measured import Measured, model_responses
 from ambid.job import frf
-from ambid.report.frf_figure import figure
-from ambid.report.frf_text import frf_text, pair_lines, response_unit, warnings_of
+from ambid.report.fit_figures import frf_figure
+from ambid.report.fit_text import frf_text, pair_lines, response_unit, warnings_of
 from ambid.rig import default_rig
 from ambid.signals.frf import FrequencyResponse
 from tests.job.loops import loop_record, odd_record
@@ -89,7 +89,7 @@ def test_distortion_levels_are_shown_beside_their_noise():
 
 
 def test_the_figure_has_levels_bands_and_both_models(both):
-    page = figure(both)
+    page = frf_figure(both)
     assert len(page.axes) == 4
     _, labels = page.axes[0].get_legend_handles_labels()
     assert {"measured", "measured, 95 %", "frf-ml", "physical parameters of one-axis"} <= set(labels)
@@ -101,7 +101,7 @@ def test_the_figure_has_levels_bands_and_both_models(both):
 
 
 def test_measured_phases_follow_the_model_where_noise_would_make_them_jump(both):
-    phase = next(a for a in figure(both).axes if a.get_ylabel().startswith("phase"))
+    phase = next(a for a in frf_figure(both).axes if a.get_ylabel().startswith("phase"))
     model_line, *_, measured = (line for line in phase.lines)
     (m, *_) = model_responses(both, both.response.frequency_hz)
     turn = np.rad2deg(np.unwrap(np.angle(m.G[:, 0, 0])))
@@ -111,12 +111,12 @@ def test_measured_phases_follow_the_model_where_noise_would_make_them_jump(both)
 
 def test_many_pairs_are_counted_and_a_single_line_is_drawn():
     one = drawn(n=2).between(5.0, 6.0)
-    assert figure(Measured(response=one)).axes
+    assert frf_figure(Measured(response=one)).axes
     n_y = 4
     f = np.linspace(5.0, 100.0, 10)
     wide = FrequencyResponse(
         frequency_hz=f, G=np.ones((10, n_y, 2), dtype=complex), covariance=np.tile(0.01 * np.eye(8) + 0j, (10, 1, 1)),
         method="drawn", inputs=("a", "b"), outputs=("p", "q", "r", "s"), rate_hz=1000.0, degrees_of_freedom=20.0,
     )  # fmt: skip
-    page = figure(Measured(response=wide))
+    page = frf_figure(Measured(response=wide))
     assert "6 of 8 pairs" in page.get_suptitle()

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.nonlinear.narmax.estimate import narmax
-from ambid.report.nonlinear_figure import nonlinear_overview, traces_of
-from ambid.report.nonlinear_panels import bars_of, columns_of
-from ambid.report.nonlinear_parameters import named_lines, schedule_lines, term_lines
-from ambid.report.nonlinear_text import curve_line, curve_lines, nonlinear_text, setting_text
+from ambid.report.fit_text import (
+    curve_line,
+    curve_lines,
+    fit_text,
+    named_lines,
+    schedule_lines,
+    setting_text,
+    term_lines,
+)
+from ambid.report.nonlinear_figures import bars_of, columns_of, nonlinear_overview, traces_of
 from ambid.validate.nonlinear import judged
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
 
@@ -104,7 +110,7 @@ def test_the_table_fits_a_terminal_and_holds_every_part(fit: NonlinearFit) -> No
     curve = LearningCurve(
         method="descent", seconds=np.array([0.0, 0.5]), training=np.array([1.0, 0.25]), held_out=np.array([1.1, 0.3])
     )
-    text = nonlinear_text(replace(fit, curves=(curve,), warnings=("mind the gap " * 12,), settings={"nu": (2, 3)}))
+    text = fit_text(replace(fit, curves=(curve,), warnings=("mind the gap " * 12,), settings={"nu": (2, 3)}))
     assert max(map(len, text.splitlines())) <= 80
     for part in ("settings: nu = 2/3; seed 0", "criteria: aic", "residuals_nonlinear", "warning: mind", "descent: 2"):
         assert part in text
@@ -114,7 +120,7 @@ def test_the_table_fits_a_terminal_and_holds_every_part(fit: NonlinearFit) -> No
 
 def test_a_failed_fit_shows_its_reason(fit: NonlinearFit) -> None:
     failed = replace(fit, model=None, covariance=None, status="failed", reason="no finite weights " * 9, fit={})
-    text = nonlinear_text(replace(failed, checks={}, criteria={}))
+    text = fit_text(replace(failed, checks={}, criteria={}))
     assert "no model: no finite weights" in text
     assert max(map(len, text.splitlines())) <= 80
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ambid.record import Channel, Record
-from ambid.report.record_text import record_text
+from ambid.report.tables import record_text
 
 
 def record_of(**channels):

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
-from ambid.report.response import poles, responses
+from ambid.report.figures import poles, responses
 
 
 def moved(estimate: Estimate, values) -> Estimate:

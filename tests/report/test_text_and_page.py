@@ -4,8 +4,9 @@ import re
 from dataclasses import replace
 
 from ambid.estimation.estimate import Check
+from ambid.report.estimate_text import estimate_text
 from ambid.report.page import report_html
-from ambid.report.text import check_lines, columns, estimate_text, verdict
+from ambid.report.text import check_lines, columns, verdict
 
 
 def line_of(text, name):

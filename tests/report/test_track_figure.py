@@ -10,9 +10,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 
 from ambid.recursive.lines import Event, TrackedValue
-from ambid.report.figures import save
-from ambid.report.track_figure import event_words, runs, track_figure, truth_words
-from ambid.report.track_history import STATES, TrackHistory
+from ambid.report.drawing import save
+from ambid.report.track_figure import STATES, TrackHistory, event_words, runs, track_figure, truth_words
 from tests.track.tracks import track_of, truth_of
 
 

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from ambid.recursive.lines import Event
-from ambid.report.track_view import TrackView, interval_bar, live_view, sparkline
+from ambid.report.track_text import TrackView, interval_bar, live_view, sparkline
 from tests.track.tracks import track_of
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.report.comparison import text
+from ambid.report.tables import comparison_text
 from ambid.validate.comparison import compare
 from ambid.validate.holdout import folds, hold_out
 from tests.validate.blackbox.fits import io, polynomial, run
@@ -45,7 +45,7 @@ def test_orders_are_chosen_where_none_are_given():
 
 
 def test_the_table_fits_the_terminal_and_names_every_structure():
-    shown = text(compare(record(4), [RIGHT, ("fir", {"nb": 2, "nk": 1}), ("cliv", None)]))
+    shown = comparison_text(compare(record(4), [RIGHT, ("fir", {"nb": 2, "nk": 1}), ("cliv", None)]))
     assert max(map(len, shown.splitlines())) <= 80
     for word in ("arx", "fir", "cliv was not fitted", "na=2 nb=2 nk=1", "BIC", "last 30 %"):
         assert word in shown

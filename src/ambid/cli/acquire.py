@@ -206,10 +206,10 @@ def _trial_s(wish: Wish, device: Device) -> float:
 
 def _record(wish: Wish, device: Device, course: Course, stop: Stop, watch: Watch) -> Acquired:
     from ambid.job.acquire import acquire
-    from ambid.report.acquire_text import progress_line
+    from ambid.report.device_text import progress_line
 
     def show(now: Progress) -> None:
-        watch.show("record", now.samples / max(now.wanted, 1), progress_line(now))
+        watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
 
     return acquire(
         device, wish.rig, wish.record, course, force=wish.force, on_progress=show, on_trouble=told,

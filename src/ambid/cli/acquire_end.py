@@ -28,10 +28,14 @@ def tell(done: Acquired, wish: Wish, stop: Stop, *, table: bool) -> None:
     if done.recorded is None:
         return
     if table:
-        from ambid.report.acquire_text import acquired_text
+        from ambid.report.device_text import acquired_text
 
         try:
-            typer.echo(acquired_text(done, wish.record, paint=painter()))
+            said = acquired_text(
+                wish.record, done.info, done.run, done.quality, done.counters, not_stored=done.not_stored,
+                paint=painter(),
+            )  # fmt: skip
+            typer.echo(said)
         except OSError:
             if stop.number is None:
                 raise

@@ -59,8 +59,7 @@ def command(
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
     """
     from ambid.job.commission import STEPS, Wishes, check_folder, commission
-    from ambid.report.acquire_text import progress_line
-    from ambid.report.commission_text import next_text, step_text
+    from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
     check_positive(
@@ -88,12 +87,16 @@ def command(
             watch.show(name, STEPS.index(name) / len(STEPS), "")
 
         def show(now: Progress) -> None:
-            watch.show("record", now.samples / max(now.wanted, 1), progress_line(now))
+            watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
 
         def tell(step: Step) -> None:
             last.append(step)
             watch.clear()
-            typer.echo(step_text(step, STEPS.index(step.name) + 1, len(STEPS), paint=paint))
+            place = f"{STEPS.index(step.name) + 1}/{len(STEPS)}"
+            said = step_text(
+                step.name, place, findings=step.findings, reasons=step.reasons, cautions=step.cautions, paint=paint
+            )
+            typer.echo(said)
 
         def agreed(name: StepName) -> bool:
             watch.clear()

@@ -44,7 +44,7 @@ def command(
     """
     from ambid.estimation.documents import plain_json
     from ambid.job import compare
-    from ambid.report.comparison import text
+    from ambid.report.tables import comparison_text
 
     with Outputs(record, second) as outputs:
         outputs.claim(json_path(json), "--json")
@@ -74,6 +74,6 @@ def command(
     if json == "-":
         typer.echo(written, nl=False)
     else:
-        typer.echo(text(found, paint=painter()))
+        typer.echo(comparison_text(found, paint=painter()))
     if strict and any(e.fit is None or not e.fit.passed for e in found.entries):
         raise typer.Exit(FAILED_CHECK)

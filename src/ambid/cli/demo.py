@@ -39,7 +39,8 @@ def command(
     from ambid.cli.demo_record import PRESET, demo_file
     from ambid.job import identify
     from ambid.physics.presets import preset
-    from ambid.report.text import check_lines, columns, delay_lines, fit_rows, header_line
+    from ambid.report.estimate_text import delay_lines, header_lines, output_rows
+    from ambid.report.text import check_lines, columns
 
     with as_file(demo_file(_FILES[0])) as record, as_file(demo_file(_FILES[1])) as rig, Outputs() as outputs:
         if copy is not None:
@@ -48,9 +49,9 @@ def command(
             estimate = identify(record, rig, tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
-    typer.echo(f"{header_line(estimate, paint)}\nsimulated in closed loop; nothing was known beforehand\n")
+    typer.echo(f"{header_lines(estimate, paint=paint)[0]}\nsimulated in closed loop; nothing was known beforehand\n")
     typer.echo("\n".join(truth_lines(estimate.parameters, truth, paint)))
-    typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(fit_rows(estimate))]))
+    typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(output_rows(estimate))]))
     typer.echo("\n" + "\n".join(check_lines(estimate.checks, paint=paint)))
     whole = sum(estimate.timing_s.values())
     typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate; the thesis needed about 5 s")

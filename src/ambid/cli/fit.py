@@ -156,7 +156,8 @@ def command(
         return
     record = one_record(records, structure, settings, seed)
     from ambid.job import fit, physics, read_data
-    from ambid.report.fit_text import fit_text, physics_text
+    from ambid.report.estimate_text import physics_text
+    from ambid.report.fit_text import fit_text
     from ambid.rig import load_rig
 
     with Outputs(record, second, rig) as outputs:
@@ -207,7 +208,7 @@ def command(
         if physical is not None:
             typer.echo("\n" + physics_text(physical, paint=painter()))
         if matter is not None:
-            from ambid.report.sensitivity import sensitivity_text
+            from ambid.report.tables import sensitivity_text
 
             typer.echo("\n" + sensitivity_text(matter, paint=painter()))
     against = against_second(found)
@@ -226,16 +227,16 @@ def _draw(
     tick: Callable[[str], None],
 ) -> None:
     """Draw the figures that are asked for."""
-    from ambid.report.figures import save
+    from ambid.report.drawing import save
 
     if plot is not None:
-        from ambid.report.fit_figures import overview
+        from ambid.report.fit_figures import fit_overview
 
         tick("draw")
-        page = overview(found, data)
+        page = fit_overview(found, data)
         outputs.stage(plot, lambda path: save(page, path))
     if stabilisation is not None:
-        from ambid.report.stabilisation import stabilisation_figure
+        from ambid.report.fit_figures import stabilisation_figure
         from ambid.validate.stabilisation import stabilisation as poles_by_order
 
         method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"

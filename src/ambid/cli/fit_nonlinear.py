@@ -49,7 +49,7 @@ def fit_records(
     """
     from ambid.job import fit_nonlinear
     from ambid.nonlinear.fit_file import nonlinear_fit_text
-    from ambid.report.nonlinear_text import nonlinear_text
+    from ambid.report.fit_text import fit_text
 
     stop = Stop()
     with Outputs(*records, second, rig) as files:
@@ -87,7 +87,7 @@ def fit_records(
     if json == "-":
         typer.echo(written, nl=False)
     else:
-        typer.echo(nonlinear_text(found, paint=painter()))
+        typer.echo(fit_text(found, paint=painter()))
     if stop.wished():
         raise typer.Exit(stop.code)
     against = against_second(found)
@@ -205,8 +205,8 @@ def _draw(
     rig: Path | None,
 ) -> None:
     from ambid.job import read_data
-    from ambid.report.figures import save
-    from ambid.report.nonlinear_figure import nonlinear_overview
+    from ambid.report.drawing import save
+    from ambid.report.nonlinear_figures import nonlinear_overview
     from ambid.rig import load_rig
 
     bench = None if rig is None else load_rig(rig)

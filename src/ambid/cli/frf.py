@@ -108,7 +108,7 @@ def command(
     """
     from ambid.blackbox.frequency.measured_file import measured_text
     from ambid.job import frf
-    from ambid.report.frf_text import frf_text
+    from ambid.report.fit_text import frf_text
 
     with Outputs(record, rig) as outputs:
         outputs.claim(json_path(json), "--json")
@@ -137,11 +137,11 @@ def command(
                 tick=tick,
             )
             if plot is not None:
-                from ambid.report.figures import save
-                from ambid.report.frf_figure import figure
+                from ambid.report.drawing import save
+                from ambid.report.fit_figures import frf_figure
 
                 tick("draw")
-                page = figure(found)
+                page = frf_figure(found)
                 outputs.stage(plot, lambda path: save(page, path))
         path = json_path(json)
         if path is not None:

@@ -127,7 +127,7 @@ def command(
                 draw(estimate, used, outputs, plot=plot, report=report)
         stage_json(estimate, json, outputs)
     if json != "-":
-        from ambid.report.text import estimate_text
+        from ambid.report.estimate_text import estimate_text
 
         typer.echo(estimate_text(estimate, paint=painter()))
     if estimate.global_search is not None and estimate.global_search["interrupted"]:
@@ -158,7 +158,8 @@ def draw(estimate: Estimate, used: Record, outputs: Outputs, *, plot: Path | Non
 
     from ambid.job import signals_of
     from ambid.physics.models import model
-    from ambid.report.figures import Evidence, overview, save
+    from ambid.report.drawing import save
+    from ambid.report.figures import Evidence, overview
     from ambid.report.page import report_html
     from ambid.validate.second_record import replay
 

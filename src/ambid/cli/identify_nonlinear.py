@@ -76,7 +76,7 @@ def identify_records(
     """
     from ambid.job.bearing_records import Reading
     from ambid.job.nonlinear_bearing import identify_taken, read_records
-    from ambid.report.bearing_text import bearing_text
+    from ambid.report.estimate_text import estimate_text
 
     stop = Stop()
     with Outputs(*records, *wishes.held, rig, second) as outputs:
@@ -102,7 +102,7 @@ def identify_records(
     if json == "-":
         typer.echo(written, nl=False)
     else:
-        typer.echo(bearing_text(estimate, paint=painter()))
+        typer.echo(estimate_text(estimate, paint=painter()))
     if stop.wished():
         raise typer.Exit(stop.code)
     if strict and not (estimate.passed and (estimate.validation is None or estimate.validation["passed"])):
@@ -125,13 +125,13 @@ def _draw(
 ) -> None:
     from datetime import UTC, datetime
 
-    from ambid.report.bearing_figure import bearing_evidence, bearing_overview
-    from ambid.report.bearing_page import bearing_html
-    from ambid.report.figures import save
+    from ambid.report.drawing import save
+    from ambid.report.figures import bearing_evidence, overview
+    from ambid.report.page import report_html
 
     evidence = bearing_evidence(estimate, [(t.record, t.start_s) for t in taken])
     if plot is not None:
-        outputs.stage(plot, lambda path: save(bearing_overview(evidence), path))
+        outputs.stage(plot, lambda path: save(overview(evidence), path))
     if report is not None:
         made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        outputs.stage_text(report, bearing_html(evidence, made=made))
+        outputs.stage_text(report, report_html(evidence, made=made))

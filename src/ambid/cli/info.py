@@ -15,7 +15,7 @@ def command(record: RecordFile, rig: RigFile = None, rate: Rate = None, gaps: Ga
     """
     from ambid.physics.models import model
     from ambid.record import read_record
-    from ambid.report.record_text import record_text
+    from ambid.report.tables import record_text
     from ambid.rig import load_rig, read_bench
 
     with progress("look"):

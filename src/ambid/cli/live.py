@@ -21,8 +21,8 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
-    from ambid.report.track_history import TrackHistory
-    from ambid.report.track_view import TrackView
+    from ambid.report.track_figure import TrackHistory
+    from ambid.report.track_text import TrackView
     from ambid.track.lines_file import Tally, TrackWriter
 
 T = TypeVar("T")
@@ -164,7 +164,7 @@ class Follower:
         self._before_header.close()
         self._tally = Tally(header)
         if self._keep:
-            from ambid.report.track_history import TrackHistory
+            from ambid.report.track_figure import TrackHistory
 
             self.history = TrackHistory(header)
         self._begin_wall = time.perf_counter()
@@ -215,7 +215,7 @@ class Follower:
 
     def _view(self, keys: bool) -> TrackView | None:
         """What is shown now; None before the first line. Called by the drawing thread."""
-        from ambid.report.track_view import TrackView
+        from ambid.report.track_text import TrackView
 
         header, line, tally = self.header, self.last, self._tally
         if header is None or line is None or tally is None:
@@ -288,7 +288,7 @@ class _Picture:
         from rich.console import Console
         from rich.live import Live
 
-        from ambid.report.track_view import live_view
+        from ambid.report.track_text import live_view
 
         console = Console(stderr=True)
         ascii_only = console.options.ascii_only

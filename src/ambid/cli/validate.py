@@ -87,7 +87,7 @@ def _judged_estimate(
 ) -> tuple[dict[str, Any], list[str]]:
     from ambid.job import load, signals_of
     from ambid.physics.models import model
-    from ambid.report.text import validation_lines
+    from ambid.report.estimate_text import validation_lines
     from ambid.validate.second_record import validation
 
     used = load(record, bench, from_s=part[0], to_s=part[1], rate_hz=rate, gaps=gaps)
@@ -99,7 +99,7 @@ def _judged_bearing(
     known: NonlinearBearingEstimate, record: Path, bench: Rig, part: Part, rate: float | None, gaps: str | None
 ) -> tuple[dict[str, Any], list[str]]:
     from ambid.job.nonlinear_bearing import validate_bearing
-    from ambid.report.bearing_text import validation_lines
+    from ambid.report.estimate_text import validation_lines
 
     found = validate_bearing(known, record, bench, from_s=part[0], to_s=part[1], rate_hz=rate, gaps=gaps)
     return found, validation_lines(found, paint=painter())
@@ -112,7 +112,7 @@ def _judged_fit(
     from ambid.estimation.documents import plain_json
     from ambid.job import read_data
     from ambid.job.blackbox import same_bench
-    from ambid.report.fit_text import validation_lines
+    from ambid.report.fit_text import second_lines
     from ambid.validate.blackbox.judge import validation
     from ambid.validate.second_fit import objections
 
@@ -120,14 +120,12 @@ def _judged_fit(
     data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)
     same_bench(known.units, known.dt, data)
     if not isinstance(known, BlackBoxFit):
-        from ambid.report.nonlinear_text import second_record_lines
         from ambid.validate.nonlinear import validation as nonlinear_validation
 
         found = nonlinear_validation(known, data)
-        lines = second_record_lines(found)
     else:
         found = validation(known, data)
-        lines = validation_lines(found)
+    lines = second_lines(found)
     against = objections(known, found)
     said = {"samples": data.n_samples, "fit": plain_json(found), "passed": not against, "objections": list(against)}
     return said, lines + [f"it does not hold there: {x}" for x in against]

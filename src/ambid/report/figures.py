@@ -1,35 +1,58 @@
-"""Figures of an estimate: measured against predicted, residuals with bounds, Bode with uncertainty, poles.
-
-Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot: no window system, no global state.
-"""
+"""Figures of physical parameters: of a record beside its model, and of a nonlinear bearing with its curves."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.bearing.magnet.problem import BearingRecord
+from ambid.bearing.magnet.result import Curve, Curves, NonlinearBearingEstimate
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
-from ambid.report._drawing import (
+from ambid.report.drawing import (
     BOUND,
     MEASURED,
+    NORMAL_99,
     PREDICTED,
+    Pole,
+    Response,
+    Traces,
+    bode_panel,
+    curve,
+    frequency_grid,
     grid,
-    magnitude_axis,
-    phase_axis,
-    pole_region,
-    pole_words,
+    note,
+    poles_panel,
+    residuals_panel,
+    responses_with_spread,
+    signals_panel,
+    single,
+    stacked,
 )
-from ambid.report._panels import Traces, residuals_panel, signals_panel
-from ambid.report.response import poles, responses
+from ambid.report.estimate_text import names_words
+from ambid.report.numbers import prefixed
+from ambid.report.text import pure
+from ambid.validate import nonlinear_bearing
 from ambid.validate.second_record import Replay
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
+
+    from ambid.report.drawing import Draw
+
+_LOWEST_HZ = 0.1
+_DEFECTIVE = 1e-6  # |wᴴ v| of unit vectors under which a pole counts as multiple: its derivative does not exist
+_LEVELS = 3  # currents or positions for which a curve is drawn
+_POINTS = 121
+_BEYOND = 0.1  # part of the usual range by which curves go beyond it
+_CLOUD = 1500  # points of a record in the map
+_ROW = 1.5  # height of a record, inches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,140 +64,306 @@ class Evidence:
     start_s: float = 0.0  # time of the record's first sample in s
 
     @property
-    def rate_hz(self) -> float:
-        """Sampling rate in Hz."""
-        return self.run.fit.problem.rate_hz
-
-    @property
-    def time_s(self) -> Array:
-        """Time of the rows of `run`, shape (n_used,), in s."""
-        return self.start_s + (self.run.first + np.arange(self.run.measured.shape[0])) / self.rate_hz
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Roles of the columns of `run`."""
-        return model(self.estimate.model).outputs
+    def title(self) -> str:
+        """What stands above the figures."""
+        return f"{self.estimate.record.get('file') or 'record'}: model {self.estimate.model}"
 
     @property
     def traces(self) -> Traces:
         """What the panels of signals and residuals draw."""
-        run, units = self.run, model(self.estimate.model).units
+        run, plant = self.run, model(self.estimate.model)
+        rate_hz = run.fit.problem.rate_hz
         return Traces(
-            time_s=self.time_s,
-            names=self.outputs,
-            units=tuple(units[role] for role in self.outputs),
+            time_s=self.start_s + (run.first + np.arange(run.measured.shape[0])) / rate_hz,
+            names=plant.outputs,
+            units=tuple(plant.units[role] for role in plant.outputs),
             measured=run.measured,
             predicted=run.predicted,
             simulated=run.simulated,
             innovation_sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
         )
 
-
-def overview(evidence: Evidence) -> Figure:
-    """Draw all figures on one page.
-
-    `evidence`: estimate and replayed record. Returns signals, residuals, Bode and poles, one below the other.
-    """
-    from matplotlib.figure import Figure
-
-    n_y = len(evidence.outputs)
-    heights = [2.3 * n_y, 2.2 * n_y, 4.6, 3.4]
-    page = Figure(figsize=(11, sum(heights) + 0.5), layout="constrained")
-    name = evidence.estimate.record.get("file") or "record"
-    page.suptitle(f"{name}: model {evidence.estimate.model}", fontsize=13)
-    parts: Any = page.subfigures(4, 1, height_ratios=heights)
-    for part, draw in zip(parts, (_signals, _residuals, _bode, _poles), strict=True):
-        draw(part, evidence)
-    return page
+    def drawings(self) -> dict[str, tuple[float, Draw]]:
+        """Return the drawings by name, each with its height in inches."""
+        traces, estimate = self.traces, self.estimate
+        n_y = len(traces.names)
+        return {
+            "signals": (2.3 * n_y, lambda place: signals_panel(place, traces)),
+            "residuals": (2.2 * n_y, lambda place: residuals_panel(place, traces)),
+            "bode": (4.6, lambda place: _bode(place, estimate)),
+            "poles": (3.4, lambda place: _poles(place, estimate)),
+        }
 
 
-def figures(evidence: Evidence) -> dict[str, Figure]:
-    """Draw the figures one by one, as a report shows them.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingTrace:
+    """One record of a nonlinear bearing beside what the model says of it."""
 
-    `evidence`: estimate and replayed record. Returns ``signals``, ``residuals``, ``bode`` and ``poles``.
-    """
-    from matplotlib.figure import Figure
-
-    n_y = len(evidence.outputs)
-    drawings = {
-        "signals": (2.4 * n_y, _signals),
-        "residuals": (2.2 * n_y, _residuals),
-        "bode": (4.8, _bode),
-        "poles": (3.4, _poles),
-    }
-    found = {}
-    for name, (height, draw) in drawings.items():
-        found[name] = Figure(figsize=(11, height), layout="constrained")
-        draw(found[name], evidence)
-    return found
+    name: str
+    held: bool  # whether the rotor was held, so that its position is not predicted
+    time_s: Array  # (n_used,), s
+    # (n_used, 2), position in m and current in A: measured, predicted from all samples before, and the standard
+    # deviation that the predictor expects of the difference; NaN for what is not predicted
+    measured: Array
+    predicted: Array
+    sd: Array
 
 
-def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = None) -> None:
-    """Write a figure.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BearingEvidence:
+    """What the figures of a nonlinear bearing show beside it."""
 
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        What to write.
-    target : str, Path or binary file
-        ``.png``, ``.svg`` or ``.pdf``.
-    kind : str, optional
-        Format, where the name does not tell it.
-    """
-    # no date inside: equal estimates give equal files
-    dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    ending = kind or Path(str(target)).suffix.lower().removeprefix(".")
-    figure.savefig(target, dpi=130, format=ending, metadata=dates.get(ending))
+    estimate: NonlinearBearingEstimate
+    traces: tuple[BearingTrace, ...]  # one for each of its records
 
+    @property
+    def title(self) -> str:
+        """What stands above the figures."""
+        return f"{names_words(list(self.estimate.noise))}: {self.estimate.law}"
 
-def _signals(figure: Figure | SubFigure, evidence: Evidence) -> None:
-    signals_panel(figure, evidence.traces)
-
-
-def _residuals(figure: Figure | SubFigure, evidence: Evidence) -> None:
-    residuals_panel(figure, evidence.traces)
+    def drawings(self) -> dict[str, tuple[float, Draw]]:
+        """Return the drawings by name, each with its height in inches."""
+        height = 0.7 + _ROW * len(self.traces)
+        return {
+            "curves": (3.6, lambda place: _curves(place, self.estimate)),
+            "map": (3.6, lambda place: _map(place, self)),
+            "records": (height, lambda place: _records(place, self.traces)),
+        }
 
 
-def _bode(figure: Figure | SubFigure, evidence: Evidence) -> None:
-    """Magnitude and phase of each output per input, with 95 % bands."""
-    found = responses(evidence.estimate)
-    axes = figure.subplots(2, len(found), squeeze=False, sharex=True, height_ratios=(3, 2))
-    units = model(evidence.estimate.model).units
-    for j, r in enumerate(found):
-        magnitude, phase = axes[:, j]
-        magnitude_axis(magnitude, r)
-        phase_axis(phase, r)
-        magnitude.set_ylabel(f"magnitude [{units[r.output]}/{units[r.source]}]")
-        phase.set_ylabel("phase [°]")
-        phase.set_xlabel("frequency [Hz]")
-        late = evidence.estimate.delay[r.source]
-        aside = (
-            f", without its delay of {late.samples + late.fraction:.3g} samples" if late.samples + late.fraction else ""
+def bearing_evidence(
+    estimate: NonlinearBearingEstimate, records: Sequence[tuple[BearingRecord, float]]
+) -> BearingEvidence:
+    """Run the records of an estimate, each with the time of its first sample, through it again."""
+    traces = []
+    for name, (record, start_s) in zip(estimate.noise, records, strict=True):
+        run = nonlinear_bearing.replay(estimate, record, noise_of=name)
+        traces.append(
+            BearingTrace(
+                name=name,
+                held=record.held,
+                time_s=start_s + (run.first + np.arange(run.measured.shape[0])) / record.rate_hz,
+                measured=run.measured,
+                predicted=run.predicted,
+                sd=run.sd,
+            )
         )
-        magnitude.set_title(f"{r.source} → {r.output}{aside}", fontsize=10)
-        magnitude.legend(loc="lower left", fontsize=8, framealpha=0.85)
-        grid(magnitude, phase)
+    return BearingEvidence(estimate=estimate, traces=tuple(traces))
 
 
-def _poles(figure: Figure | SubFigure, evidence: Evidence) -> None:
-    """Poles with 95 % regions, and beside them in numbers."""
-    axes, beside = figure.subplots(1, 2, width_ratios=(3, 2))
-    found = poles(evidence.estimate)
-    for pole in found:
-        unstable = pole.value.real > 0
-        color = BOUND if unstable else PREDICTED
-        axes.plot(pole.value.real, pole.value.imag, "x", color=color, markersize=8, markeredgewidth=1.8)
-        pole_region(axes, pole, color)
-    axes.margins(0.15)
-    axes.axvline(0, color=MEASURED, linewidth=0.8)
-    axes.axhline(0, color=MEASURED, linewidth=0.8)
-    low, high = axes.get_xlim()
-    axes.axvspan(0, max(high, 0.15 * -low), color="#fbe9e7", zorder=0)
-    axes.set_xlim(low, max(high, 0.15 * -low))
-    axes.set_xlabel("real part [rad/s] – right of zero the plant is unstable")
-    axes.set_ylabel("imaginary part [rad/s]")
-    axes.set_title("poles of the identified plant, 95 % regions", fontsize=10)
-    grid(axes)
-    beside.axis("off")
-    lines = ["pole [rad/s]", "", *(line for pole in found if pole.value.imag >= 0 for line in pole_words(pole))]
-    beside.text(0.0, 0.97, "\n".join(lines), fontsize=10, va="top", family="monospace", transform=beside.transAxes)
+def overview(evidence: Evidence | BearingEvidence) -> Figure:
+    """Draw all figures on one page, one below the other."""
+    return stacked(evidence.title, list(evidence.drawings().values()))
+
+
+def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
+    """Draw the figures one by one, as a report shows them."""
+    return {name: single(height + 0.1, draw) for name, (height, draw) in evidence.drawings().items()}
+
+
+# --- a linear plant -------------------------------------------------------------------------------------------------
+
+
+def responses(estimate: Estimate, *, n_frequencies: int = 600) -> tuple[Response, ...]:
+    """Compute the frequency response of every pair with its spread, from 0.1 Hz to half the sampling rate.
+
+    With Φ = (jω - A)⁻¹, G = C Φ B and dG = C Φ (dA Φ B + dB) + dC Φ B. The delay of the input is not in it.
+    """
+    plant = model(estimate.model)
+    space = plant.matrices(estimate.values)
+    nyquist = 0.5 * float(str(estimate.record["rate_hz"]))
+    frequency = frequency_grid(estimate.continuous.poles, min(_LOWEST_HZ, 0.01 * nyquist), nyquist, n_frequencies)
+    s = 2j * np.pi * frequency[:, None, None]
+    resolvent = np.linalg.inv(s * np.eye(space.A.shape[0]) - space.A)
+    states = resolvent @ space.B
+    G = space.C @ states
+    slopes = np.zeros((*G.shape, len(estimate.covariance_names)), dtype=np.complex128)
+    for k, name in enumerate(estimate.covariance_names):
+        d = plant.derivative(estimate.values, name)
+        slopes[..., k] = space.C @ resolvent @ (d.A @ states + d.B) + d.C @ states
+    return responses_with_spread(frequency, G, slopes, estimate.covariance, plant.inputs, plant.outputs)
+
+
+def poles(estimate: Estimate) -> tuple[Pole, ...]:
+    """Compute the poles of the plant with their spread, sorted by real part.
+
+    A simple pole moves by dλ = wᴴ dA v / (wᴴ v), v and w its right and left eigenvectors.
+    """
+    from scipy.linalg import matrix_balance
+
+    plant = model(estimate.model)
+    space = plant.matrices(estimate.values)
+    slopes = [plant.derivative(estimate.values, name) for name in estimate.covariance_names]
+    _, (scale, _) = matrix_balance(space.A, permute=False, separate=True)  # rows and columns of like size
+    A = space.A * scale / scale[:, None]
+    values, right = np.linalg.eig(A)
+    # rows of the inverse are the left eigenvectors, scaled so that wᴴ v = 1; a multiple pole has none
+    left = np.linalg.inv(right) if np.linalg.cond(right) < 1 / _DEFECTIVE else None
+    found = []
+    for k in np.argsort(values.real):
+        covariance = None
+        if left is not None:
+            slope = np.array([left[k] @ (d.A * scale / scale[:, None]) @ right[:, k] for d in slopes])
+            J = np.array([slope.real, slope.imag]).reshape(2, len(slopes))
+            covariance = J @ estimate.covariance @ J.T
+        found.append(Pole(value=complex(values[k]), covariance=covariance))
+    return tuple(found)
+
+
+def _bode(figure: Figure | SubFigure, estimate: Estimate) -> None:
+    late = {role: d.samples + d.fraction for role, d in estimate.delay.items()}
+    asides = {role: f", without its delay of {x:.3g} samples" for role, x in late.items() if x}
+    bode_panel(figure, responses(estimate), model(estimate.model).units, asides)
+
+
+def _poles(figure: Figure | SubFigure, estimate: Estimate) -> None:
+    found = poles(estimate)
+    text = ["pole [rad/s]", "", *(line for pole in found if pole.value.imag >= 0 for line in _pole_words(pole))]
+    poles_panel(figure, found, "\n".join(text), "poles of the identified plant, 95 % regions")
+
+
+def _pole_words(pole: Pole) -> list[str]:
+    spread = np.zeros(2) if pole.covariance is None else np.sqrt(np.maximum(np.diag(pole.covariance), 0.0))
+    p = pole.value
+    real = pure(p.real, float(spread[0]))
+    if p.imag == 0:
+        if not p.real:
+            return [real, "    integrator", ""]
+        scale, unit = prefixed(1 / abs(p.real), "s")
+        state = "unstable" if p.real > 0 else "stable"
+        return [real, f"    {state}, time constant {1 / abs(p.real) / scale:.3g} {unit}", ""]
+    oscillation = f"    {abs(p) / (2 * np.pi):.4g} Hz, damping {-p.real / abs(p):.3g}"
+    return [real, f"  ± j({pure(p.imag, float(spread[1]))})", oscillation, ""]
+
+
+# --- a nonlinear bearing --------------------------------------------------------------------------------------------
+
+
+def _wide(limits: tuple[float, float]) -> Array:
+    low, high = limits
+    beyond = _BEYOND * (high - low)
+    return np.linspace(low - beyond, high + beyond, _POINTS)
+
+
+def _curves(figure: Figure | SubFigure, e: NonlinearBearingEstimate) -> None:
+    """k_i, k_x and L over the position at some currents."""
+    x, levels = _wide(e.usual["position"]), np.linspace(*e.usual["current"], _LEVELS)
+    scale, unit = prefixed(float(np.max(np.abs(x))), "m")
+    axes = figure.subplots(1, 3)
+    found = [e.curves(x, level) for level in levels.tolist()]
+    for a, name, meaning in zip(
+        axes, ("k_i", "k_x", "L"), ("force per current", "stiffness", "inductance"), strict=True
+    ):
+        size, shown = _unit_of(found, name)
+        for k, (level, at) in enumerate(zip(levels, found, strict=True)):
+            inside = at.coil_inside if name == "L" else at.inside
+            _banded(a, x / scale, getattr(at, name), inside, size, f"C{k}", f"at {level:.3g} A")
+        a.set_xlabel(f"position [{unit}]")
+        a.set_ylabel(f"{name} [{shown}]")
+        a.set_title(f"{meaning} {name}", fontsize=10)
+        grid(a)
+    axes[0].legend(loc="best", fontsize=8, framealpha=0.85)
+    figure.suptitle("curves with 95 % bands; dotted where the free rotor did not come (L: no record)", fontsize=10)
+
+
+def _unit_of(found: Sequence[Curves], name: str) -> tuple[float, str]:
+    largest = max(float(np.max(np.abs(getattr(at, name).value))) for at in found)
+    return prefixed(largest, getattr(found[0], name).unit)
+
+
+def _banded(axes: Axes, x: Array, c: Curve, inside: NDArray[np.bool_], scale: float, color: str, label: str) -> None:
+    axes.fill_between(x, c.low / scale, c.high / scale, color=color, alpha=0.25, linewidth=0)
+    axes.plot(x, c.value / scale, ":", color=color, linewidth=1.2)
+    axes.plot(x, np.where(inside, c.value / scale, np.nan), "-", color=color, linewidth=1.6, label=label)
+
+
+def _map(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
+    """Where the records were, and L over the current."""
+    e = evidence.estimate
+    where, over = figure.subplots(1, 2, width_ratios=(3, 2))
+    scale, unit = prefixed(float(np.max(np.abs(e.coil_hull[:, 0]))), "m")
+    for k, t in enumerate(evidence.traces):
+        every = max(1, t.measured.shape[0] // _CLOUD)
+        used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
+        x, i = used[:, 0] / scale, used[:, 1]
+        where.plot(x, i, "." if not t.held else "|", color=f"C{k % 10}", markersize=2.5, alpha=0.5)
+        where.plot([], [], "o" if not t.held else "|", color=f"C{k % 10}", markersize=5, label=t.name)
+    for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
+        corners = np.vstack([hull, hull[:1]])
+        where.plot(corners[:, 0] / scale, corners[:, 1], "-", color=MEASURED, linewidth=width)
+    _balance(where, e, scale)
+    where.set_xlabel(f"position [{unit}]")
+    where.set_ylabel("current [A]")
+    where.set_title("where the records were; hulls of the free rotor and of all", fontsize=10)
+    where.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, framealpha=0.85)
+    low, high = e.coil_hull[:, 1].min(), e.coil_hull[:, 1].max()
+    currents, levels = np.linspace(low, high, _POINTS), np.linspace(*e.usual["position"], _LEVELS)
+    found = [e.curves(np.full(_POINTS, x), currents) for x in levels.tolist()]
+    size, shown = _unit_of(found, "L")
+    for k, (x, at) in enumerate(zip(levels, found, strict=True)):
+        _banded(over, currents, at.L, at.coil_inside, size, f"C{k}", f"at {x / scale:.3g} {unit}")
+    over.set_xlabel("current [A]")
+    over.set_ylabel(f"L [{shown}]")
+    over.set_title("inductance over the current", fontsize=10)
+    over.legend(loc="best", fontsize=8, framealpha=0.85)
+    grid(where, over)
+
+
+def _balance(axes: Axes, e: NonlinearBearingEstimate, scale: float) -> None:
+    """The line on which one magnet carries the weight: where a rotor at rest has to be, whatever the dynamics say."""
+    weight = e.values["m"] * e.values["g"]
+    if e.law.pair or weight == 0.0:
+        return
+    x, i = np.meshgrid(_wide(e.usual["position"])[::4], np.linspace(*e.range["current"], 60))
+    force = e.curves(x.ravel(), i.ravel()).force.value.reshape(x.shape)
+    axes.contour(x / scale, i, force + weight, levels=[0.0], colors="black", linewidths=1.4, linestyles="--")
+    axes.plot([], [], "--", color="black", linewidth=1.4, label="carries the weight")
+
+
+def _records(figure: Figure | SubFigure, traces: Sequence[BearingTrace]) -> None:
+    """Each record: position and current, measured and predicted, and what the predictor missed."""
+    axes = figure.subplots(len(traces), 4, squeeze=False, sharex="row", width_ratios=(3, 3, 2, 2))
+    for row, t in zip(axes, traces, strict=True):
+        for c, unit in enumerate(("m", "A")):
+            whole, missed = row[c], row[2 + c]
+            if c == 0 and t.held:
+                x, shown = prefixed(abs(float(t.measured[:, 0].mean())), "m")
+                held = f"held at {float(t.measured[:, 0].mean()) / x:.4g} {shown}"
+                whole.text(0.5, 0.5, held, ha="center", va="center", fontsize=9, transform=whole.transAxes)
+                whole.axis("off")
+                missed.axis("off")
+                continue
+            _outputs(whole, t, c, unit)
+            _missed(missed, t, c)
+        row[0].set_title(t.name, fontsize=9, loc="left")
+        grid(*[a for a in row if a.axison])
+        for a in row:
+            a.tick_params(labelsize=7)
+            a.set_axisbelow(True)
+            a.locator_params(axis="x", nbins=5)
+    for a, title in zip(
+        axes[0], ("position", "current", "errors of position / sd", "errors of current / sd"), strict=True
+    ):
+        a.set_title(title, fontsize=9, loc="right" if a is axes[0][0] else "center")
+    for a in axes[-1]:
+        a.set_xlabel("time [s]", fontsize=8)
+    figure.suptitle(
+        "measured (grey), predicted one step ahead (blue), and what the predictor missed (99 % bounds)", fontsize=10
+    )
+
+
+def _outputs(axes: Axes, t: BearingTrace, c: int, unit: str) -> None:
+    scale, shown = prefixed(float(np.max(np.abs(t.measured[:, c]))), unit)
+    curve(axes, t.time_s, t.measured[:, c] / scale, MEASURED, None)
+    curve(axes, t.time_s, t.predicted[:, c] / scale, PREDICTED, None)
+    axes.set_ylabel(f"[{shown}]", fontsize=8)
+
+
+def _missed(axes: Axes, t: BearingTrace, c: int) -> None:
+    e = (t.measured[:, c] - t.predicted[:, c]) / t.sd[:, c]
+    curve(axes, t.time_s, e, MEASURED, None)
+    for side in (-NORMAL_99, NORMAL_99):
+        axes.axhline(side, color=BOUND, linewidth=0.8, linestyle="--")
+    reach = max(1.3 * NORMAL_99, float(np.nanquantile(np.abs(e), 0.999)))
+    axes.set_ylim(-1.15 * reach, 1.15 * reach)
+    note(axes, f"{100 * float(np.mean(np.abs(e[np.isfinite(e)]) > NORMAL_99)):.2g} % outside")

@@ -1,177 +1,305 @@
-"""Figures of a black-box fit: measured and predicted, residuals with bounds, Bode with uncertainty, poles and zeros."""
+"""Figures of linear fits: a record beside its model, a measured frequency response, a stabilisation diagram."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.frequency.measured import Measured, ModelResponse, model_responses
 from ambid.blackbox.response import one_step, simulation
 from ambid.blackbox.spread import pole_covariance, zero_covariance
 from ambid.blackbox.transfer_model import TransferModel
-from ambid.report._drawing import BOUND, MEASURED, PREDICTED, grid, magnitude_axis, phase_axis, pole_region
-from ambid.report._panels import Traces, residuals_panel, signals_panel
-from ambid.report.fit_text import pole_lines
-from ambid.report.response import Pole, Response
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    MEASURED,
+    PREDICTED,
+    Complex,
+    Pole,
+    Response,
+    Traces,
+    angle_ticks,
+    bode_panel,
+    frequency_grid,
+    grid,
+    magnitude_axis,
+    phase_axis,
+    poles_panel,
+    residuals_panel,
+    responses_with_spread,
+    signals_panel,
+    stacked,
+    unwrapped,
+)
+from ambid.report.fit_text import pole_lines, response_unit
+from ambid.report.numbers import sized
 from ambid.validate.blackbox.predictor import innovations_form, plant_form
+from ambid.validate.stabilisation import ModePole, Stabilisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
+    from ambid.report.drawing import Draw
 
-_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
+_PAIRS = 6  # diagrams beside each other; of more pairs the first are drawn, and the title says so
+_NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
+_MODELS: tuple[tuple[str, str, Literal["-", "--"]], ...] = (
+    (PREDICTED, BAND, "-"),
+    (BOUND, "#f1c4be", "--"),
+)  # line and band of the black-box fit and of the physical parameters
+_GRID = 800  # frequencies at which a model is drawn
+_STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
+_WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
 
 
-def overview(fit: BlackBoxFit, data: IOData) -> Figure:
-    """Draw all figures of a fit on one page.
-
-    `data`: the record that it came from, or another.
-    """
-    from matplotlib.figure import Figure
-
-    n_y, traces = data.n_outputs, traces_of(fit, data)
-    parts: list[tuple[float, Any]] = [
-        (2.3 * n_y, lambda part: signals_panel(part, traces)),
-        (2.2 * n_y, lambda part: residuals_panel(part, traces)),
+def fit_overview(fit: BlackBoxFit, data: IOData) -> Figure:
+    """Draw all figures of a fit on one page, beside the record that it came from or another."""
+    n_y, traces = data.n_outputs, fit_traces(fit, data)
+    parts: list[tuple[float, Draw]] = [
+        (2.3 * n_y, lambda place: signals_panel(place, traces)),
+        (2.2 * n_y, lambda place: residuals_panel(place, traces)),
     ]
     if fit.inputs:
-        parts.append((4.6, lambda part: _bode(part, fit)))
-    parts.append((3.6, lambda part: _poles(part, fit)))
-    heights = [h for h, _ in parts]
+        parts.append((4.6, lambda place: bode_panel(place, fit_responses(fit), fit.units, {})))
+    parts.append((3.6, lambda place: _poles(place, fit)))
     pairs = min(_PAIRS, len(fit.inputs) * n_y)
-    page = Figure(figsize=(max(11.0, 3.3 * pairs), sum(heights) + 0.5), layout="constrained")
-    page.suptitle(f"{fit.record.get('file') or 'record'}: {fit.structure}", fontsize=13)
-    figures: Any = page.subfigures(len(parts), 1, height_ratios=heights)
-    for figure, (_, draw) in zip(figures, parts, strict=True):
-        draw(figure)
-    return page
+    return stacked(f"{fit.record.get('file') or 'record'}: {fit.structure}", parts, max(11.0, 3.3 * pairs))
 
 
-def traces_of(fit: BlackBoxFit, data: IOData) -> Traces:
+def fit_traces(fit: BlackBoxFit, data: IOData) -> Traces:
     """Run a record through a fit."""
-    model = innovations_form(fit)
     return Traces(
         time_s=np.arange(data.n_samples, dtype=np.float64) * data.dt,
         names=data.outputs,
         units=tuple(fit.units[o] for o in data.outputs),
         measured=data.y,
-        predicted=one_step(model, data.u, data.y, fit.offsets),
+        predicted=one_step(innovations_form(fit), data.u, data.y, fit.offsets),
         simulated=simulation(plant_form(fit), data.u, data.y, fit.offsets),
         innovation_sd=np.sqrt(np.diag(fit.noise_covariance)),
     )
 
 
-def responses(fit: BlackBoxFit, n_frequencies: int = 600) -> tuple[Response, ...]:
-    """Compute the frequency response of every pair with its uncertainty, up to half the sampling rate.
-
-    `n_frequencies`: spaced evenly in the logarithm, with more points at lightly damped poles. Returns output by output.
-    """
-    frequency = _frequencies(fit, n_frequencies)
-    omega = 2 * np.pi * frequency
-    G = fit.model.frequency_response(omega)
-    log_sd, phase_sd = np.zeros(G.shape), np.zeros(G.shape)
-    if fit.covariance is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            relative = np.nan_to_num(fit.model.frequency_response_derivative(omega) / G[..., None])
-        log_sd, phase_sd = (
-            np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", J, fit.covariance, J), 0.0))
-            for J in (relative.real, relative.imag)
-        )
-    return tuple(
-        Response(
-            source=source,
-            output=output,
-            frequency_hz=frequency,
-            value=G[:, o, i],
-            log_sd=log_sd[:, o, i],
-            phase_sd=phase_sd[:, o, i],
-        )
-        for o, output in enumerate(fit.outputs)
-        for i, source in enumerate(fit.inputs)
-    )
-
-
-def _frequencies(fit: BlackBoxFit, n_frequencies: int) -> Array:
+def fit_responses(fit: BlackBoxFit) -> tuple[Response, ...]:
+    """Compute the frequency response of every pair with its spread, up to half the sampling rate."""
     nyquist = 0.5 / fit.dt
     lowest = max(1 / (int(str(fit.record["samples"])) * fit.dt), 1e-5 * nyquist)
     poles = fit.model.poles()
     s = poles if fit.model.dt is None else np.log(poles[np.abs(poles) > 0]) / fit.dt
-    extra = [
-        abs(p) / (2 * np.pi) + abs(p.real) / (2 * np.pi) * np.linspace(-5, 5, 41)
-        for p in s
-        if p.imag > 0 and lowest < abs(p) / (2 * np.pi) < nyquist
-    ]
-    found = np.unique(np.concatenate([np.geomspace(lowest, nyquist, n_frequencies), *extra]))
-    return np.asarray(found[(found >= lowest) & (found <= nyquist)])
-
-
-def _bode(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
-    found = responses(fit)
-    shown = found[:_PAIRS]
-    axes = figure.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
-    for j, r in enumerate(shown):
-        magnitude, phase = axes[:, j]
-        magnitude_axis(magnitude, r)
-        phase_axis(phase, r)
-        if not j:
-            phase.set_ylabel("phase [°]")
-        magnitude.set_ylabel(f"magnitude [{fit.units[r.output]}/{fit.units[r.source]}]")
-        phase.set_xlabel("frequency [Hz]")
-        magnitude.set_title(f"{r.source} → {r.output}", fontsize=10)
-        magnitude.legend(loc="lower left", fontsize=8, framealpha=0.85)
-        grid(magnitude, phase)
-    if len(found) > len(shown):
-        figure.suptitle(f"{len(shown)} of {len(found)} pairs", fontsize=10)
+    frequency = frequency_grid(s, lowest, nyquist)
+    omega = 2 * np.pi * frequency
+    G = fit.model.frequency_response(omega)
+    slopes, covariance = np.zeros((*G.shape, 1), dtype=np.complex128), np.zeros((1, 1))
+    if fit.covariance is not None:
+        slopes, covariance = fit.model.frequency_response_derivative(omega), fit.covariance
+    return responses_with_spread(frequency, G, slopes, covariance, fit.inputs, fit.outputs)
 
 
 def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
     """Poles and zeros with 95 % regions, and beside them the poles in numbers."""
-    axes, beside = figure.subplots(1, 2, width_ratios=(3, 3))
-    discrete = fit.model.dt is not None
     poles, zeros = fit.model.poles(), fit.model.zeros()
-    spread = pole_covariance(fit.model, fit.covariance) if fit.covariance is not None else None
-    for k, p in enumerate(poles):
-        unstable = abs(p) > 1 if discrete else p.real > 0
-        color = BOUND if unstable else PREDICTED
-        axes.plot(p.real, p.imag, "x", color=color, markersize=8, markeredgewidth=1.8)
-        _region(axes, p, None if spread is None else spread[k], color, 1e3)
     reach = 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))
     near = np.abs(zeros) < reach
-    seen = zeros[near]
-    axes.plot(seen.real, seen.imag, "o", color=MEASURED, markersize=7, markerfacecolor="none", markeredgewidth=1.4)
-    if fit.covariance is not None:
-        for z, of_zero in zip(seen, zero_covariance(fit.model, fit.covariance)[near], strict=True):
-            _region(axes, z, of_zero, MEASURED, reach)
-    hidden = f"; {zeros.size - seen.size} zero(s) farther out" if seen.size < zeros.size else ""
-    _stability(axes, discrete)
-    delayed = isinstance(fit.model, TransferModel) and any(fit.model.delay)
-    axes.set_title(f"poles (x) and zeros (o), 95 % regions{hidden}{', delay apart' if delayed else ''}", fontsize=10)
-    grid(axes)
-    beside.axis("off")
-    text = "\n".join(pole_lines(fit))
-    beside.text(0.0, 0.97, text, fontsize=9, va="top", family="monospace", transform=beside.transAxes)
+    known, of_poles, of_zeros = fit.covariance, None, None
+    if known is not None:
+        of_poles, of_zeros = pole_covariance(fit.model, known), zero_covariance(fit.model, known)[near]
+    far = int(zeros.size - np.count_nonzero(near))
+    hidden = f"; {far} zero(s) farther out" if far else ""
+    delayed = ", delay apart" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
+    poles_panel(
+        figure,
+        _roots(poles, of_poles, 1e3),
+        "\n".join(pole_lines(fit)),
+        f"poles (x) and zeros (o), 95 % regions{hidden}{delayed}",
+        zeros=_roots(zeros[near], of_zeros, reach),
+        discrete=fit.model.dt is not None,
+    )
 
 
-def _region(axes: Axes, root: complex, covariance: Array | None, color: str, most: float) -> None:
-    """Draw it where there is one, and not much wider than the figure: a multiple root has no spread of first order."""
-    usable = covariance is not None and np.all(np.isfinite(covariance)) and np.max(np.abs(covariance)) < most**2
-    pole_region(axes, Pole(value=complex(root), covariance=covariance if usable else None), color)
+def _roots(values: Complex, covariance: Array | None, most: float) -> list[Pole]:
+    """Roots with their spread, where it is not much wider than the figure: that of a multiple root is infinite."""
+    if covariance is None:
+        return [Pole(value=complex(x), covariance=None) for x in values]
+    usable = [bool(np.all(np.isfinite(c)) and np.max(np.abs(c)) < most**2) for c in covariance]
+    return [
+        Pole(value=complex(x), covariance=c if use else None)
+        for x, c, use in zip(values, covariance, usable, strict=True)
+    ]
 
 
-def _stability(axes: Axes, discrete: bool) -> None:
-    axes.axhline(0, color=MEASURED, linewidth=0.8)
-    if discrete:
-        angle = np.linspace(0, 2 * np.pi, 361)
-        axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.8)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_xlabel("real part – outside the circle the plant is unstable")
-        axes.set_ylabel("imaginary part")
-        return
-    axes.margins(0.15)
-    axes.axvline(0, color=MEASURED, linewidth=0.8)
-    axes.set_xlabel("real part [rad/s] – right of zero the plant is unstable")
-    axes.set_ylabel("imaginary part [rad/s]")
+# --- a measured frequency response ----------------------------------------------------------------------------------
+
+
+def frf_figure(measured: Measured) -> Figure:
+    """Draw magnitude and phase of every pair: lines with 95 % bands, noise and distortion, the models over them."""
+    from matplotlib.figure import Figure
+
+    frf = measured.response
+    pairs = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)]
+    shown, f = pairs[:_PAIRS], frf.frequency_hz
+    models = model_responses(measured, np.geomspace(f[0], f[-1], _GRID)) if f.size > 1 else ()
+    page = Figure(figsize=(max(8.0, 5.5 * len(shown)), 7.0), layout="constrained")
+    axes = page.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
+    for column, (j, k) in enumerate(shown):
+        magnitude, phase = axes[:, column]
+        of_pair = [_of_pair(m, j, k) for m in models]
+        _magnitude(magnitude, measured, of_pair, j, k)
+        _phase(phase, measured, of_pair, j, k)
+        magnitude.set_title(f"{frf.inputs[k]} → {frf.outputs[j]}", fontsize=10)
+        magnitude.set_ylabel(f"magnitude [{response_unit(frf.units, frf.outputs[j], frf.inputs[k])}]")
+        phase.set_xlabel("frequency [Hz]")
+        grid(magnitude, phase)
+    axes[1, 0].set_ylabel("phase [°]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), fontsize=9)
+    name = measured.record.get("file") or "record"
+    some = f" ({len(shown)} of {len(pairs)} pairs)" if len(pairs) > len(shown) else ""
+    page.suptitle(f"{name}: frequency response, {frf.method}{some}", fontsize=12)
+    return page
+
+
+def _of_pair(m: ModelResponse, j: int, k: int) -> Response:
+    return Response(
+        source=m.source,
+        output="",
+        frequency_hz=m.frequency_hz,
+        value=m.G[:, j, k],
+        log_sd=m.log_sd[:, j, k],
+        phase_sd=m.phase_sd[:, j, k],
+    )
+
+
+def _magnitude(axes: Axes, measured: Measured, models: Sequence[Response], j: int, k: int) -> None:
+    """Measured lines with their band, the levels under them, the models over them."""
+    frf = measured.response
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, j, k], frf.confidence_radius()[:, j, k]
+    noise = None if frf.noise_sd is None else frf.noise_sd[:, j, k]
+    distortion = None if measured.distortion_sd is None else measured.distortion_sd[:, j, k]
+    levels = [(frf.sd[:, j, k], _NOISE, "sd of measured")] if distortion is None else []
+    levels += [(noise, _NOISE, "noise sd")] if distortion is not None and noise is not None else []
+    levels += [(distortion, _DISTORTION, "distortion sd")] if distortion is not None else []
+    drawn = [x[x > 0] for x, _, _ in levels if np.any(x > 0)]
+    bottom = 0.5 * min([float(size[size > 0].min()), *(float(np.percentile(x, 2)) for x in drawn)])
+    lower = np.maximum(size - radius, 0.1 * bottom)
+    axes.fill_between(f, lower, size + radius, color=_RANGE, linewidth=0, label="measured, 95 %")
+    for m, (line, band, style) in zip(models, _MODELS, strict=False):
+        magnitude_axis(axes, m, label=m.source, band_label=f"{m.source}, 95 %", colors=(line, band))
+        axes.lines[-1].set_linestyle(style)
+    dot = _marker(f.size)
+    axes.plot(f, size, ".", color=MEASURED, markersize=dot, label="measured", zorder=1.8)
+    for x, color, label in levels:
+        seen = np.where(x > 0, x, np.nan)
+        axes.plot(f, seen, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if f.size > 1:
+        axes.set_xlim(f[0], f[-1])
+    axes.set_ylim(bottom, 2.0 * float(np.max(size)))
+
+
+def _phase(axes: Axes, measured: Measured, models: Sequence[Response], j: int, k: int) -> None:
+    """Phase, unwrapped beginning near zero; where |G| is lost in its sd the band is all angles."""
+    frf = measured.response
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, j, k], frf.confidence_radius()[:, j, k]
+    angle = np.rad2deg(_angle(frf.G[:, j, k], f, models))
+    ratio = np.minimum(radius / np.maximum(size, 1e-300), 1.0)
+    spread = np.where(ratio < 1, np.rad2deg(np.arcsin(ratio)), 180.0)
+    near = float(unwrapped(models[0].value)[0]) if models else 0.0  # a phase near ±180° begins on one side
+    for m, (line, band, style) in zip(models, _MODELS, strict=False):
+        phase_axis(axes, m, near=near, colors=(line, band))
+        axes.lines[-1].set_linestyle(style)
+    axes.fill_between(f, angle - spread, angle + spread, color=_RANGE, linewidth=0, zorder=0.5)
+    axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
+    axes.set_xscale("log")
+    lines = [np.rad2deg(unwrapped(m.value, near)) for m in models]
+    angle_ticks(axes, np.concatenate([angle[ratio < 0.5] if np.any(ratio < 0.5) else angle, *lines]))
+
+
+def _angle(G: Complex, f: Array, models: Sequence[Response]) -> Array:
+    """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
+    if not models:
+        return unwrapped(G)
+    near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].value))
+    return np.asarray(near + np.angle(G * np.exp(-1j * near)))
+
+
+def _marker(n: int) -> float:
+    return 4.0 if n <= 300 else 2.0 if n <= 3000 else 1.0
+
+
+# --- a stabilisation diagram ----------------------------------------------------------------------------------------
+
+
+def stabilisation_figure(found: Stabilisation) -> Figure:
+    """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
+    from matplotlib.figure import Figure
+
+    page = Figure(figsize=(11, 7), layout="constrained")
+    page.suptitle(f"stabilisation diagram, {found.method}", fontsize=13)
+    (damping, empty), (diagram, values) = page.subplots(
+        2, 2, width_ratios=(4, 1), height_ratios=(1, 2), sharex="col", sharey="row"
+    )
+    empty.axis("off")
+    _frequency_axis(diagram, found)
+    _diagram(diagram, found)
+    empty.legend(*diagram.get_legend_handles_labels(), loc="center", fontsize=8, title="poles", title_fontsize=9)
+    _damping(damping, found)
+    size = np.asarray(found.singular_values)
+    values.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
+    values.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
+    values.set_xlabel("singular value")
+    values.set_title(f"least BIC: order {found.suggested}", fontsize=10)
+    for axes in (damping, diagram, values):
+        axes.grid(True, color="#dddddd", linewidth=0.6)
+        axes.tick_params(labelsize=9)
+    return page
+
+
+def _diagram(axes: Axes, found: Stabilisation) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    kinds = (
+        ("new", "x", _NEW),
+        ("stable in frequency", "^", _FREQUENCY),
+        ("stable in frequency, damping and shape", "o", _STABLE),
+    )
+    for k, (label, marker, color) in enumerate(kinds):
+        chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
+        axes.plot(*_places(chosen), marker, color=color, markersize=5, label=label, linestyle="none")
+    for mode in found.modes:
+        axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6)
+    axes.set_xlabel("frequency of the pole [Hz]")
+    axes.set_ylabel("order")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def _frequency_axis(axes: Axes, found: Stabilisation) -> None:
+    """Frequencies over several decades want a logarithmic axis."""
+    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
+    if seen.size and seen.max() > _WIDE * seen.min():
+        axes.set_xscale("log")
+
+
+def _damping(axes: Axes, found: Stabilisation) -> None:
+    stable = [p for p in found.poles if p.stable]
+    axes.set_ymargin(0.2)
+    axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
+    for mode in found.modes:
+        axes.annotate(
+            sized(mode.frequency_hz, "Hz"),
+            (mode.frequency_hz, mode.damping),
+            textcoords="offset points",
+            xytext=(4, 4),
+            fontsize=8,
+        )
+    axes.axhline(0, color=_NEW, linewidth=0.8)
+    axes.set_ylabel("damping (under 0: unstable)")
+
+
+def _places(poles: list[ModePole]) -> tuple[list[float], list[int]]:
+    return [p.frequency_hz for p in poles], [p.order for p in poles]

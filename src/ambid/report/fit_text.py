@@ -1,80 +1,134 @@
-"""A black-box fit as a table for the terminal: 80 columns, readable without colour."""
+"""Black-box fits, nonlinear fits and measured frequency responses as tables for the terminal."""
 
 from __future__ import annotations
 
+import math
+import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.spread import pole_covariance
-from ambid.blackbox.structures import structure
-from ambid.report.numbers import quantity, sized
-from ambid.report.text import WIDTH, Paint, check_lines, columns, parameter_lines, plain, timing_line, warning_lines
+from ambid.blackbox.structures import any_structure
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.nonlinear.structures import nonlinear_structure
+from ambid.report.estimate_text import frequency_lines
+from ambid.report.numbers import prefixed, quantity, sized
+from ambid.report.text import (
+    WIDTH,
+    Paint,
+    check_lines,
+    coefficient_text,
+    columns,
+    criteria_lines,
+    fit_rows,
+    fraction,
+    joined,
+    other_warnings,
+    plain,
+    pure,
+    status_words,
+    timing_lines,
+    title_line,
+    warning_lines,
+    wrapped,
+)
+from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
-    from ambid.bearing.physical import PhysicalFit
+    from ambid.blackbox.frequency.measured import Measured
+    from ambid.blackbox.model import BlackBoxModel
+    from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 
-_SHOWN = 24  # coefficients that a terminal shows; the file has all
-
-
-def fit_text(fit: BlackBoxFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write a fit for people.
-
-    `width`: columns of the terminal; `paint`: adds colour; the layout does not depend on it. Returns header,
-    coefficients, poles, fit, validation, criteria, checks, warnings and timing, without a final line feed.
-    """
-    blocks = [
-        _header(fit, width, paint),
-        coefficient_lines(fit),
-        pole_lines(fit, paint=paint),
-        columns(_fit_rows(fit)),
-        [] if fit.validation is None else [paint("on the second record", "strong"), *validation_lines(fit.validation)],
-        _criteria_lines(fit, width),
-        check_lines(fit.checks, width=width, paint=paint),
-        warning_lines(_unsaid(fit), width=width, paint=paint),
-        [paint(timing_line(fit.timing_s), "dim")] if fit.timing_s else [],
-    ]
-    return "\n\n".join("\n".join(block) for block in blocks if block)
+_COEFFICIENTS = 24  # that a terminal shows; the file has all
+_TERMS = 20  # rows of terms and named parameters
+_TRAININGS = 6  # learning curves
+_SINGULAR_VALUES = 8
+_WEIGHT = re.compile(r"\bunit \d|\bhidden\b|: bias\b")  # of a network: says nothing by itself
+_SOURCES = {
+    "information": "the information matrix",
+    "laplace": "Laplace's approximation",
+    "sandwich": "the sandwich formula, for coloured errors",
+    "bootstrap": "bootstrap",
+}
 
 
-def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write the physical parameters that follow from a fit.
-
-    `width`: columns of the terminal; `paint`: adds colour. Returns parameters, delay, whether the fit can be this
-    physics, and warnings, without a final line feed.
-    """
-    d = found.delay
-    total = d.samples + d.fraction
-    low, high = found.band_hz
-    lines = [
-        paint(f"physical parameters of model {found.model}, from {found.structure}", "strong"),
-        *parameter_lines(found, width=width, paint=paint),
-        f"delay {total:.3g} sample{'' if total == 1 else 's'}, {d.how}; from {sized(low, 'Hz')} to {sized(high, 'Hz')}",
-        *check_lines({"misfit": found.misfit}, width=width, paint=paint),
-        *warning_lines([w for w in found.warnings if w != found.misfit.detail], width=width, paint=paint),
-    ]
-    return "\n".join(lines)
-
-
-def _header(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
-    name = str(fit.record.get("file") or "record")
-    samples = int(str(fit.record["samples"]))
-    orders = ", ".join(f"{k} = {_order(v)}" for k, v in fit.orders.items())
-    verdict = "" if fit.status == "converged" else paint(f" – {fit.status}", "bad")
-    signals = f"from {', '.join(fit.inputs)} to " if fit.inputs else "of "
-    first = (
-        f"{paint(name, 'strong')}: {fit.structure}, {samples} samples at {1 / fit.dt:g} Hz"
-        f" ({samples * fit.dt:.4g} s){verdict}"
+def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write a fit for people; colour does not change the layout. Of a failed fit the settings and the reason."""
+    trainings: list[str] = []
+    if isinstance(fit, BlackBoxFit):
+        own = [_linear_header(fit, width, paint), coefficient_lines(fit), pole_lines(fit, paint=paint)]
+        none = "none (unstable, or no input)"
+    else:
+        own = [*_nonlinear_header(fit, width, paint), _number_lines(fit, width)]
+        none = "none (diverges, or no input)"
+        trainings = wrapped(curve_lines(fit.curves), width, "  ")
+    second = [] if fit.validation is None else [paint("on the second record", "strong"), *second_lines(fit.validation)]
+    return joined(
+        [
+            *own,
+            columns(fit_rows(fit.fit, fit.units, none)) if fit.fit else [],
+            second,
+            criteria_lines(fit.criteria, fit.n_estimated, width),
+            trainings,
+            check_lines(fit.checks, width=width, paint=paint),
+            warning_lines(other_warnings(fit), width=width, paint=paint),
+            timing_lines(fit.timing_s, width=width, paint=paint),
+        ]
     )
-    about = f"{structure(fit.structure).summary}; {orders}; {signals}{', '.join(fit.outputs)}"
+
+
+def _linear_header(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
+    orders = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.orders.items())
+    samples = int(str(fit.record["samples"]))
+    first = title_line(fit.record.get("file"), fit.structure, samples, 1 / fit.dt, fit.status, paint)
+    about = f"{any_structure(fit.structure).summary}; {orders}; {_signals(fit)}"
     return [first, *textwrap.wrap(about, width)]
 
 
-def _order(value: int | tuple[int, ...]) -> str:
-    return str(value) if isinstance(value, int) else "/".join(map(str, value))
+def _nonlinear_header(fit: NonlinearFit, width: int, paint: Paint) -> list[list[str]]:
+    names = [str(x.get("file") or "record") for x in fit.records]
+    name = names[0] if len(names) == 1 else f"{len(names)} records"
+    total = sum(int(str(x["samples"])) for x in fit.records)
+    settings = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.settings.items())
+    lines = [title_line(name, fit.structure, total, 1 / fit.dt, fit.status, paint)]
+    lines += textwrap.wrap(", ".join(names), width) if len(names) > 1 else []
+    lines += textwrap.wrap(f"{nonlinear_structure(fit.structure).summary}; {_signals(fit)}", width)
+    lines += textwrap.wrap(f"settings: {settings}; seed {fit.seed}", width)
+    return [lines, textwrap.wrap(f"no model: {fit.reason}", width) if fit.reason else []]
+
+
+def _signals(fit: BlackBoxFit | NonlinearFit) -> str:
+    return (f"from {', '.join(fit.inputs)} to " if fit.inputs else "of ") + ", ".join(fit.outputs)
+
+
+def setting_text(value: object) -> str:
+    """Write an order or a setting as the command line takes it, several numbers with a slash between."""
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return "/".join(map(str, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def second_lines(validation: Mapping[str, Any]) -> list[str]:
+    """Write how a fit does on a second record, by output; errors in SI. Of a nonlinear fit what is extrapolated too."""
+    rows = [("fit", "one step", "rmse", "simulation", "rmse")]
+    for output, found in validation.items():
+        rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
+    outside = next((found.get("extrapolated") for found in validation.values()), None)
+    more = [] if outside is None else [f"outside the training data: {100 * float(outside):.2g} % of it"]
+    return [*columns(rows), *more]
+
+
+def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
+    return ("–", "–") if found is None or found["fit"] is None else (fraction(found["fit"]), f"{found['rmse']:.4g}")
+
+
+# --- coefficients and poles of a linear model -----------------------------------------------------------------------
 
 
 def coefficient_lines(fit: BlackBoxFit) -> list[str]:
@@ -82,37 +136,25 @@ def coefficient_lines(fit: BlackBoxFit) -> list[str]:
     theta, sd = fit.model.theta, fit.sd
     free = np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0]
     rows = [
-        (
-            fit.model.names[k],
-            _coefficient(float(theta[k]), 0.0 if sd is None else float(sd[k])),
-        )
-        for k in free[:_SHOWN]
+        (fit.model.names[k], coefficient_text(float(theta[k]), 0.0 if sd is None else float(sd[k])))
+        for k in free[:_COEFFICIENTS]
     ]
-    half = -(-len(rows) // 2) if len(rows) > 8 else len(rows)
-    left, right = rows[:half], rows[half:]
-    right += [("", "")] * (len(left) - len(right)) if right else []
-    table = [(*a, *b) for a, b in zip(left, right, strict=True)] if right else left
-    head = ("", "value ± sd" if sd is not None else "value", *(("", "value ± sd") if right else ()))
-    rest = [f"… and {free.size - _SHOWN} more; --json has them all"] if free.size > _SHOWN else []
-    return [*columns([head, *table]), *rest] if rows else []
-
-
-def _coefficient(value: float, sd: float) -> str:
-    """Value ± sd; in a power of ten where decimals would be too many to read, or cut off."""
-    exponent = int(np.floor(np.log10(max(abs(value), sd)))) if value or sd else 0
-    if -4 <= exponent < 7:
-        return quantity(value, sd, "1").text.removesuffix(" 1")
-    scale = 10.0**exponent
-    return f"({quantity(value / scale, sd / scale, '1').text.removesuffix(' 1')})e{exponent}"
+    if not rows:
+        return []
+    head = ("", "value" if sd is None else "value ± sd")
+    table: list[tuple[str, ...]] = [head, *rows]
+    if len(rows) > 8:
+        half = -(-len(rows) // 2)
+        right = [*rows[half:], ("", "")][:half]
+        table = [(*a, *b) for a, b in zip([head, *rows[:half]], [head, *right], strict=True)]
+    rest = free.size - len(rows)
+    return [*columns(table), *([f"… and {rest} more; --json has them all"] if rest else [])]
 
 
 def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
-    """Write the poles with frequency, damping and standard deviation, one of each pair.
-
-    `paint`: adds colour.
-    """
+    """Write the poles with frequency, damping and standard deviation, one of each pair."""
     poles, discrete = fit.model.poles(), fit.model.dt is not None
-    shown = [k for k in range(poles.size) if poles[k].imag >= 0][: _SHOWN // 2]
+    shown = [k for k in range(poles.size) if poles[k].imag >= 0][: _COEFFICIENTS // 2]
     if not shown:
         return []
     spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
@@ -120,9 +162,9 @@ def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
     for k in shown:
         p = complex(poles[k])
         sd = np.zeros(2) if spread is None else np.sqrt(np.maximum(np.diag(spread[k]), 0.0))
-        text = quantity(p.real, float(sd[0]), "1").text.removesuffix(" 1")
+        text = pure(p.real, float(sd[0]))
         if p.imag:
-            text += f" ± j({quantity(p.imag, float(sd[1]), '1').text.removesuffix(' 1')})"
+            text += f" ± j({pure(p.imag, float(sd[1]))})"
         if p == 0:
             rows.append((text, "", "", "delay"))
             continue
@@ -134,47 +176,337 @@ def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
     return columns(rows)
 
 
-def _fit_rows(fit: BlackBoxFit) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [("fit", "one step", "simulation", "innovations")]
-    for output, f in fit.fit.items():
-        rows.append(
-            (output, _number(f.one_step), _simulation(f.simulation), f"{sized(f.innovation_sd, fit.units[output])} rms")
-        )
-    return rows
+# --- numbers of a nonlinear model -----------------------------------------------------------------------------------
 
 
-def _simulation(fit: float | None) -> str:
-    return "none (unstable, or no input)" if fit is None else f"{fit:.4f}"
-
-
-def validation_lines(validation: Mapping[str, Any]) -> list[str]:
-    """Write how a fit does on a second record.
-
-    `validation`: by output, as `ambid.validate.blackbox.validation` gives it. Returns a header and a line for each
-    output; errors in SI.
-    """
-    rows = [("fit", "one step", "rmse", "simulation", "rmse")]
-    for output, found in validation.items():
-        rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
-    return columns(rows)
-
-
-def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
-    return ("–", "–") if found is None or found["fit"] is None else (_number(found["fit"]), f"{found['rmse']:.4g}")
-
-
-def _criteria_lines(fit: BlackBoxFit, width: int) -> list[str]:
-    if not fit.criteria:
+def _number_lines(fit: NonlinearFit, width: int) -> list[str]:
+    """Write terms with ratios, named parameters or a schedule, and where their standard deviations come from."""
+    if fit.model is None:
         return []
-    text = ", ".join(f"{name} {value:.6g}" for name, value in fit.criteria.items())
-    return textwrap.wrap(f"criteria: {text}; {fit.n_estimated} numbers estimated", width)
+    if isinstance(fit.details.get("terms"), Mapping):
+        rows = term_lines(fit)
+    elif isinstance(fit.details.get("schedule"), Mapping):
+        rows = schedule_lines(fit)
+    else:
+        rows = named_lines(fit)
+    lines = [*rows, *_count(fit, shown=bool(rows))]
+    return [x for line in lines for x in (textwrap.wrap(line, width) if len(line) > width else [line])]
 
 
-def _number(x: float | None) -> str:
-    return "–" if x is None else f"{x:.4f}"
+def is_weight(name: str) -> bool:
+    """Return whether a parameter is a weight of a network's unit, which says nothing by itself."""
+    return _WEIGHT.search(name) is not None
 
 
-def _unsaid(fit: BlackBoxFit) -> list[str]:
-    """Warnings that are not the detail of a check, which stands with the checks."""
-    said = {c.detail for c in fit.checks.values()}
-    return [w for w in fit.warnings if w not in said]
+def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
+    assert fit.model is not None
+    known = "no standard deviations"
+    if fit.sd is not None:
+        known = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
+    elif "uncertainty" in fit.settings:
+        known += " (--settings uncertainty=... asks for them)"
+    size = fit.model.theta.size
+    lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{'' if shown else '; --json has them all'}"]
+    effective = fit.details.get("effective_parameters")
+    if isinstance(effective, (int, float)) and math.isfinite(effective) and round(effective, 1) < fit.n_estimated:
+        lines.append(f"as many as {effective:.3g} parameters would be without the prior")
+    return lines
+
+
+def term_lines(fit: NonlinearFit) -> list[str]:
+    """Write the first terms in the order of choice, with error reduction ratios in percent where there are any.
+
+    `fit` has ``terms`` in its details. Weights of a network beside them are counted.
+    """
+    assert fit.model is not None
+    several, terms = len(fit.outputs) > 1, fit.details["terms"]
+    assert isinstance(terms, Mapping)
+    ratio = {
+        (f"y{o + 1}: " if several else "") + str(t["term"]): t.get("err")
+        for o, output in enumerate(fit.outputs)
+        for t in terms[output]
+    }
+    named = [k for k, name in enumerate(fit.model.names) if not is_weight(name)]
+    weights, rest = fit.model.theta.size - len(named), max(len(named) - _TERMS, 0)
+    rows: list[tuple[str, ...]] = [("term", _column(fit)), *(_row(fit, k) for k in named[:_TERMS])]
+    if any(isinstance(x, (int, float)) for x in ratio.values()):
+        shares = ["ERR", *(_percent(ratio.get(fit.model.names[k])) for k in named[:_TERMS])]
+        rows = [(*r, x) for r, x in zip(rows, shares, strict=True)]
+    more = [f"… and {rest} more; --json has them all"] if rest else []
+    beside = [f"beside them a network of {weights} weights; --json has them"] if weights else []
+    return [*columns(rows, right=(2,)), *more, *beside]
+
+
+def named_lines(fit: NonlinearFit) -> list[str]:
+    """Write parameters that have a meaning of their own; none for a network, or for more than twenty."""
+    assert fit.model is not None
+    sd = fit.sd
+    estimated = [k for k in range(fit.model.theta.size) if sd is None or sd[k] > 0]
+    if len(estimated) > _TERMS or any(map(is_weight, fit.model.names)):
+        return []
+    return columns([("parameter", _column(fit)), *(_row(fit, k) for k in estimated)])
+
+
+def schedule_lines(fit: NonlinearFit) -> list[str]:
+    """Write what a model with a schedule is where the schedule stands still: at its ends and in the middle.
+
+    `fit` has ``schedule`` and ``frozen`` in its details; poles in rad/s, gains at 0 Hz in SI, ± standard deviations.
+    """
+    schedule, table = fit.details["schedule"], fit.details.get("frozen")
+    assert isinstance(schedule, Mapping)
+    low, high, unit = float(schedule["low"]), float(schedule["high"]), str(schedule["unit"])
+    signal = str(schedule["signal"])
+    what = "the output, low-passed" if signal == "level" else signal
+    slow = f" ({float(schedule['time_constant_s']):.3g} s)" if schedule.get("time_constant_s") else ""
+    head = [f"schedule: {what}{slow}, {low:.4g} to {high:.4g} {unit} in training"]
+    if not isinstance(table, Sequence) or not table:
+        return head
+    places = [table[0], table[len(table) // 2], table[-1]]
+    gains = list(places[0].get("dc_gain", {}))
+    names = (f"at [{unit}]", "poles [rad/s]", *(f"gain from {x} at 0 Hz" for x in gains))
+    rows = [(f"{x['p']:.4g}", _poles(x["poles_rad_s"]), *(_number(x["dc_gain"][g]) for g in gains)) for x in places]
+    return [*head, *columns([names, *rows])]
+
+
+def _poles(found: Sequence[Sequence[Any]]) -> str:
+    """Real poles one by one, pairs once."""
+    out = []
+    for pole in found:
+        real, imaginary, *sd = (math.nan if v is None else float(v) for v in pole)
+        if imaginary < 0:
+            continue
+        text = _number([real, sd[0] if sd else None])
+        out.append(text if imaginary == 0 else f"{text} ± j {_number([imaginary, sd[1] if len(sd) > 1 else None])}")
+    return ", ".join(out)
+
+
+def _number(found: Sequence[Any]) -> str:
+    value = float(found[0])
+    sd = math.nan if len(found) < 2 or found[1] is None else float(found[1])
+    return coefficient_text(value, sd if math.isfinite(sd) and sd > 0 else None) if math.isfinite(value) else "none"
+
+
+def _row(fit: NonlinearFit, k: int) -> tuple[str, str]:
+    assert fit.model is not None
+    sd = None if fit.sd is None else float(fit.sd[k])
+    return fit.model.names[k], coefficient_text(float(fit.model.theta[k]), sd)
+
+
+def _column(fit: NonlinearFit) -> str:
+    return "coefficient" if fit.sd is None else "coefficient ± sd"
+
+
+def _percent(err: object) -> str:
+    """In percent; small ratios, which fast sampling makes of all but the last output, in a power of ten."""
+    if not isinstance(err, (int, float)):
+        return ""
+    return f"{100 * err:.3f} %" if err >= 1e-4 or err == 0 else f"{100 * err:.1e} %"
+
+
+def curve_lines(curves: Sequence[LearningCurve]) -> list[str]:
+    """Say in a line each how the trainings went; of many the first and the last ones."""
+    lines = [curve_line(c) for c in curves]
+    between, half = len(lines) - _TRAININGS, _TRAININGS // 2
+    if between <= 0:
+        return lines
+    return [*lines[:half], f"… {between} more trainings; --json has them", *lines[-half:]]
+
+
+def curve_line(curve: LearningCurve) -> str:
+    """Say in one line how a training went: steps, time, errors in multiples of the outputs' standard deviations."""
+    n = curve.training.size
+    if not n:
+        return f"{curve.method}: no iterations"
+    text = (
+        f"{curve.method}: {n} step{'' if n == 1 else 's'}, {sized(float(curve.seconds[-1]), 's')}, error"
+        f" {curve.training[0]:.3g} -> {curve.training[-1]:.3g} of the output"
+    )
+    held = curve.held_out[np.isfinite(curve.held_out)]
+    return text + (f", held out {held[0]:.3g} -> {np.min(held):.3g}" if held.size else "")
+
+
+# --- frequency responses --------------------------------------------------------------------------------------------
+
+
+def frf_text(measured: Measured, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write a measured response, and what was fitted to it, for people; colour does not change the layout."""
+    fit, estimate = measured.fit, measured.estimate
+    return joined(
+        [
+            _response_header(measured, width, paint),
+            pair_lines(measured, width=width),
+            _distortion_lines(measured, width),
+            [] if fit is None else _response_fit_lines(fit, width, paint),
+            [] if estimate is None else frequency_lines(estimate, width, paint),
+            warning_lines(warnings_of(measured), width=width, paint=paint),
+            timing_lines(measured.timing_s, paint=paint),
+        ]
+    )
+
+
+def _response_header(measured: Measured, width: int, paint: Paint) -> list[str]:
+    frf, record = measured.response, measured.record
+    name, samples = str(record.get("file") or "record"), int(str(record.get("samples", 0)))
+    first = f"{paint(name, 'strong')}: frequency response"
+    if samples:
+        first = title_line(name, "frequency response", samples, frf.rate_hz, "converged", paint)
+    reference = f", reference {', '.join(measured.references)}" if measured.references else ""
+    loop = ", said to be open loop" if measured.open_loop else ""
+    signals = f"from {', '.join(frf.inputs)} to {', '.join(frf.outputs)}{reference}{loop}"
+    f = frf.frequency_hz
+    method = f"{frf.method}{_periods(frf.details)}; {f.size} lines, {sized(f[0], 'Hz')} to {sized(f[-1], 'Hz')}"
+    return [first, *textwrap.wrap(signals, width), *textwrap.wrap(method, width)]
+
+
+def _periods(details: Any) -> str:
+    if "period" not in details:
+        return ""
+    counts = "+".join(str(n) for n in details["periods"])
+    dropped = sum(details.get("dropped_periods", ()))
+    return f", {counts} periods of {details['period']} samples" + (f" ({dropped} more left out)" if dropped else "")
+
+
+def pair_lines(measured: Measured, *, width: int = WIDTH) -> list[str]:
+    """Write size and quality of the response of every pair: medians over the lines, in percent of the magnitude."""
+    frf, noise, distortion = measured.response, measured.response.noise_sd, measured.distortion_sd
+    size = frf.magnitude
+    rows: list[tuple[str, ...]] = [("", "|G|", "sd", "noise", "distortion", "coherence")]
+    for j, o in enumerate(frf.outputs):
+        for k, i in enumerate(frf.inputs):
+            g = size[:, j, k]
+            shares = [_share(sd, g, j, k) for sd in (frf.sd, noise, distortion)]
+            coherence = "–" if frf.coherence is None else f"{float(np.median(frf.coherence[:, j])):.4f}"
+            rows.append((f"{i} → {o}", _range(g, response_unit(frf.units, o, i)), *shares, coherence))
+    lines = columns(rows, right=(2, 3, 4, 5))
+    if max(map(len, lines)) > width:
+        lines = columns([(row[0], *row[2:]) for row in rows], right=(1, 2, 3, 4))
+    if max(map(len, lines)) > width:  # names too long to stand beside anything: each on a line of its own
+        head, *values = columns([("  ", *row[2:]) for row in rows], right=(1, 2, 3, 4))
+        named = [[*textwrap.wrap(row[0], width), line] for row, line in zip(rows[1:], values, strict=True)]
+        lines = [head, *(line for pair in named for line in pair)]
+    about = "medians over the lines, of |G|"
+    about += "; noise and distortion were not told apart" if distortion is None else ""
+    return [*lines, *textwrap.wrap(f"({about})", width)]
+
+
+def response_unit(units: Any, output: str, source: str) -> str:
+    """Return the unit of a response, such as ``"m/V"``; a name that is missing has an unknown unit."""
+    above, below = str(units.get(output, UNKNOWN)), str(units.get(source, UNKNOWN))
+    if above == below:
+        return "1"
+    if below == "1":
+        return above
+    return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
+
+
+def _range(g: Array, unit: str) -> str:
+    low, high = float(np.min(g)), float(np.max(g))
+    scale, shown = (1.0, unit) if unit.startswith((UNKNOWN, "1/")) else prefixed(high, unit)
+    return f"{low / scale:.3g} … {high / scale:.3g} {shown}".removesuffix(" 1")
+
+
+def _share(sd: Array | None, g: Array, j: int, k: int) -> str:
+    if sd is None:
+        return "–"
+    with np.errstate(divide="ignore"):
+        return f"{100 * float(np.median(sd[:, j, k] / g)):.2g} %"
+
+
+def _distortion_lines(measured: Measured, width: int) -> list[str]:
+    """Levels at the lines that the excitation left out, beside the signal."""
+    found: Any = measured.response.details.get("distortions")
+    if found is None:
+        return []
+    rows: list[tuple[str, ...]] = [("at lines without excitation", "even", "its noise", "odd", "its noise")]
+    for k, output in enumerate(measured.response.outputs):
+        signal = _rms(found.signal, k)
+        cells = [found.even, found.even_noise, found.odd, found.odd_noise]
+        rows.append((output, *("–" if x is None or not x.size else _decibel(_rms(x, k), signal) for x in cells)))
+    return [*columns(rows, right=(1, 2, 3, 4)), *textwrap.wrap("(rms of a line beside that of an excited one)", width)]
+
+
+def _rms(levels: Array, k: int) -> float:
+    return float(np.sqrt(np.mean(levels[:, k] ** 2)))
+
+
+def _decibel(x: float, beside: float) -> str:
+    return f"{20 * np.log10(x / beside):.1f} dB" if x > 0 and beside > 0 else "none"
+
+
+def _response_fit_lines(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
+    orders = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.orders.items())
+    about = f"{fit.structure}: {any_structure(fit.structure).summary}; {orders}{status_words(fit.status)}"
+    lines = textwrap.wrap(about, width)
+    lines[0] = lines[0].replace(fit.structure, paint(fit.structure, "strong"), 1)
+    if fit.structure == "frf-ml":  # states are in coordinates of the method's own: their numbers say nothing
+        fit = _once(fit)
+        lines += coefficient_lines(fit)
+    lines += [*pole_lines(_first_entry(fit), paint=paint), *_late_lines(fit), *_laguerre_lines(fit, width)]
+    return [*lines, *check_lines(fit.checks, width=width, paint=paint)]
+
+
+def _common(model: BlackBoxModel) -> bool:
+    if not isinstance(model, TransferModel):
+        return False
+    dens = [d for row in model.den for d in row]
+    return len(dens) > 1 and all(np.array_equal(d, dens[0]) for d in dens)
+
+
+def _once(fit: BlackBoxFit) -> BlackBoxFit:
+    """Leave a denominator that all entries share to the first, so that its coefficients are shown once."""
+    if not isinstance(fit.model, TransferModel) or not _common(fit.model) or fit.covariance is None:
+        return fit
+    covariance = fit.covariance.copy()
+    for o, i, which, _, place in fit.model.parts():
+        if which == "den" and (o or i):
+            covariance[place, :] = covariance[:, place] = 0.0
+    return replace(fit, covariance=covariance)
+
+
+def _first_entry(fit: BlackBoxFit) -> BlackBoxFit:
+    """Where all entries share a denominator, the fit of the first: it has all the poles."""
+    model = fit.model
+    if not isinstance(model, TransferModel) or not _common(model):
+        return fit
+    places = [np.arange(p.start, p.stop) for o, i, _, _, p in model.parts() if not (o or i)]
+    own = np.concatenate(places)
+    first = TransferModel(num=((model.num[0][0],),), den=((model.den[0][0],),), dt=model.dt, delay=model.delay[:1])
+    return replace(fit, model=first, covariance=None if fit.covariance is None else fit.covariance[np.ix_(own, own)])
+
+
+def _late_lines(fit: BlackBoxFit) -> list[str]:
+    delay, sd = (fit.details.get(k) for k in ("delay_s", "delay_sd_s"))
+    if not delay and sd is None:
+        return []
+    value = float(str(delay))
+    text = quantity(value, 0.0 if sd is None else float(str(sd)), "s").text
+    return [f"delay {text} ({value / fit.dt:.4g} samples)"]
+
+
+def _laguerre_lines(fit: BlackBoxFit, width: int) -> list[str]:
+    d: Any = fit.details
+    if "condition_without" not in d:
+        return []
+    values = " ".join(f"{s:.3g}" for s in d["singular_values"][:_SINGULAR_VALUES])
+    more = " …" if len(d["singular_values"]) > _SINGULAR_VALUES else ""
+    text = (
+        f"Laguerre operator p = {d['p']:.4g} rad/s: condition {d['condition']:.3g} of {d['block_rows']} block rows, "
+        f"{d['condition_without']:.3g} without it; singular values {values}{more} (noise alone: about 1)"
+    )
+    return textwrap.wrap(text, width)
+
+
+def warnings_of(measured: Measured) -> list[str]:
+    """Return all warnings, each once, without what only repeats a failed check; those of the response first."""
+    found = [*measured.response.warnings]
+    for x in (measured.fit, measured.estimate):
+        if x is None:
+            continue
+        said = [c.detail for c in x.checks.values() if not c.passed]
+        for whole in x.warnings:
+            warning = whole
+            for detail in said:  # it stands with the checks
+                warning = warning.replace(f"{detail}; ", "")
+            if not warning.endswith(tuple(said)):
+                found.append(warning)
+    return list(dict.fromkeys(found))

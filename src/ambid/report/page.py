@@ -10,13 +10,23 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ambid.estimation.estimate import Estimate, EstimatedParameter
+from ambid.arrays import Array
+from ambid.estimation.estimate import Check, Estimate, EstimatedParameter
+from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.models import model
-from ambid.report.figures import Evidence, figures, save
+from ambid.report.drawing import save
+from ambid.report.estimate_text import (
+    curve_rows,
+    delay_lines,
+    names_words,
+    output_rows,
+    seconds_of,
+    validation_rows,
+)
+from ambid.report.figures import BearingEvidence, Evidence, figures
 from ambid.report.numbers import quantity
-from ambid.report.text import delay_lines, fit_rows, other_warnings, style_of, validation_rows, verdict
+from ambid.report.text import checks_of, interval_words, other_warnings, style_of, verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,118 +45,126 @@ _CAPTIONS = {
         "From the physical parameters, with the 95 % band that their covariance gives, up to half the sampling rate.",
     ),
     "poles": ("Poles", "Of the identified plant in open loop, with the 95 % regions that the covariance gives."),
+    "curves": (
+        "Curves",
+        "From one co-energy, so that force and motional voltage agree, with the bands that the covariance gives. "
+        "Dotted where no record came: there the law extrapolates, and the band does not know it.",
+    ),
+    "map": (
+        "Where the records were",
+        "Each point a sample. For one magnet, the line on which its force is the weight: a rotor at rest stands on it.",
+    ),
+    "records": (
+        "Records",
+        "Each sample predicted from all samples before it; errors over the standard deviation that the predictor "
+        "expects of them. For a right model they are white: about 1 % outside the bounds, no pattern.",
+    ),
 }
 _LIBRARIES = ("ambid", "numpy", "scipy", "numba")
 
 
-def report_html(evidence: Evidence, *, made: str = "") -> str:
-    """Write the report of an estimate.
-
-    `evidence`: estimate and the replayed record it came from; `made`: date of the report, for its provenance; left out
-    where empty. Returns HTML; figures are inside it.
-    """
-    return rendered(_content(evidence, made))
-
-
-def rendered(content: Mapping[str, Any]) -> str:
-    """Fill the page.
-
-    `content`: what its template names. Returns HTML; texts are escaped.
-    """
+def report_html(evidence: Evidence | BearingEvidence, *, made: str = "") -> str:
+    """Return the report of an estimate as HTML with its figures inside; `made` is its date, left out where empty."""
     from jinja2 import Environment, StrictUndefined
 
     source = files("ambid").joinpath("data", "report.html.j2").read_text(encoding="utf-8")
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(source)
-    return template.render(**content)
+    return template.render(**_content(evidence, made))
 
 
-def _content(evidence: Evidence, made: str) -> dict[str, Any]:
+def _content(evidence: Evidence | BearingEvidence, made: str) -> dict[str, Any]:
     e = evidence.estimate
-    samples, rate = int(str(e.record["samples"])), float(str(e.record["rate_hz"]))
-    meaning = {spec.name: spec.meaning for spec in model(e.model).parameters}
+    meaning = {spec.name: spec.meaning for spec in (*model(e.model).parameters, *BEARING_NUMBERS)}
+    about = _about_record(e) if isinstance(e, Estimate) else _about_records(e)
+    validation = None
+    if e.validation is not None:
+        validation = {"fits": validation_rows(e.validation), "checks": _check_cells(checks_of(e.validation))}
+    provenance = [*about.pop("origin"), ("rig", str(e.rig.get("name") or "–"))]
+    provenance += [("operating point", ", ".join(f"{role} {x:.6g}" for role, x in e.operating_point.items()) + " (SI)")]
+    provenance += [("computing time", f"{sum(e.timing_s.values()):.3g} s")] if e.timing_s else []
+    provenance += [("made", made)] if made else []
+    provenance += [("versions", ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]
     return {
-        "title": f"{e.record.get('file') or 'record'}: physical parameters",
-        "subtitle": f"{e.rig.get('name') or 'no rig'} – model {e.model}, {samples} samples at {rate:g} Hz"
-        f" ({samples / rate:.4g} s), search {e.status}",
+        **about,
         "status": e.status,
         "warnings": other_warnings(e),
-        "parameters": parameter_cells(e.parameters, meaning, finished=e.status == "converged"),
+        "parameters": _parameter_cells(e.parameters, meaning, finished=e.status == "converged"),
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),
         "correlations": list(zip(e.covariance_names, correlations(e.covariance), strict=True)),
-        "curves": [],
         "delays": delay_lines(e),
-        "fits": fit_rows(e),
-        "checks": [{"name": name, "passed": c.passed, "detail": c.detail} for name, c in e.checks.items()],
-        "validation": None if e.validation is None else _validation(e.validation),
-        "figures": embedded(figures(evidence), _CAPTIONS),
-        "provenance": _provenance(e, made),
-        "history": _listed(e.record.get("history")),
+        "fits": output_rows(e),
+        "checks": _check_cells(e.checks),
+        "validation": validation,
+        "figures": _embedded(figures(evidence)),
+        "provenance": provenance,
         "rig": str(e.rig.get("text") or ""),
     }
 
 
-def parameter_cells(
+def _about_record(e: Estimate) -> dict[str, Any]:
+    """Title, subtitle and origin of an estimate from one record."""
+    record = e.record
+    samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
+    return {
+        "title": f"{record.get('file') or 'record'}: physical parameters",
+        "subtitle": f"{e.rig.get('name') or 'no rig'} – model {e.model}, {samples} samples at {rate:g} Hz"
+        f" ({samples / rate:.4g} s), search {e.status}",
+        "curves": [],
+        "history": _steps(record),
+        "origin": [
+            ("record", str(record.get("file") or "–")),
+            ("SHA-256 of the record", str(record.get("sha256") or "–")),
+        ],
+    }
+
+
+def _about_records(e: Any) -> dict[str, Any]:
+    """Title, subtitle, curves and origin of a nonlinear bearing."""
+    named = list(zip(e.noise, e.records, strict=True))
+    return {
+        "title": f"{names_words(list(e.noise))}: nonlinear bearing",
+        "subtitle": f"{e.rig.get('name') or 'no rig'} – {e.law}, {seconds_of(e):.4g} s in all, search {e.status}",
+        "curves": curve_rows(e),
+        "history": [f"{name}: {step}" for name, record in named for step in _steps(record)],
+        "origin": [(name, f"SHA-256 {record.get('sha256') or '–'}") for name, record in named],
+    }
+
+
+def _steps(record: Mapping[str, object]) -> list[str]:
+    history = record.get("history")
+    return [str(step) for step in history] if isinstance(history, (list, tuple)) else []
+
+
+def _parameter_cells(
     parameters: Sequence[EstimatedParameter], meaning: Mapping[str, str], *, finished: bool
 ) -> list[dict[str, str]]:
-    """Make the rows of the table of parameters.
-
-    `meaning`: what each is, in a line; `finished`: whether the search converged. Returns ``name``, ``meaning``,
-    ``text``, ``interval``, ``si``, ``verdict`` and ``style`` of each.
-    """
     rows = []
     for p in parameters:
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
-        style = style_of(p, finished=finished)
-        interval = f"{q.low} … {q.high}" if q.low else ""
+        said, style = verdict(p, finished=finished), style_of(p, finished=finished)
         rows.append(
-            {"name": p.name, "meaning": meaning[p.name], "text": q.text, "interval": interval, "si": q.si,
-             "verdict": verdict(p, finished=finished), "style": style}
+            {"name": p.name, "meaning": meaning[p.name], "text": q.text, "interval": interval_words(q), "si": q.si,
+             "verdict": said, "style": style}
         )  # fmt: skip
     return rows
 
 
-def correlations(covariance: NDArray[np.float64]) -> list[list[str]]:
-    """Write a covariance as correlations.
+def _check_cells(checks: Mapping[str, Check]) -> list[dict[str, object]]:
+    return [{"name": name, "passed": c.passed, "detail": c.detail} for name, c in checks.items()]
 
-    `covariance`: (n, n).
-    """
+
+def correlations(covariance: Array) -> list[list[str]]:
+    """Write a covariance (n, n) as correlations."""
     sd = np.sqrt(np.diag(covariance))
     return [[f"{x:.3f}" for x in row] for row in covariance / np.outer(sd, sd)]
 
 
-def _validation(validation: Mapping[str, Any]) -> dict[str, Any]:
-    checks = [{"name": n, "passed": c["passed"], "detail": c["detail"]} for n, c in validation["checks"].items()]
-    return {"fits": validation_rows(validation), "checks": checks}
-
-
-def embedded(drawn: Mapping[str, Figure], captions: Mapping[str, tuple[str, str]]) -> list[dict[str, str]]:
-    """Put figures into the page.
-
-    `captions`: title and caption of each. Returns ``title``, ``caption`` and ``png`` of each.
-    """
+def _embedded(drawn: Mapping[str, Figure]) -> list[dict[str, str]]:
     found = []
     for name, figure in drawn.items():
-        title, caption = captions[name]
+        title, caption = _CAPTIONS[name]
         buffer = io.BytesIO()
         save(figure, buffer, kind="png")
         found.append({"title": title, "caption": caption, "png": base64.b64encode(buffer.getvalue()).decode()})
     return found
-
-
-def library_versions() -> str:
-    """Name the libraries that a result hangs on, with their versions."""
-    return ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
-
-
-def _provenance(e: Estimate, made: str) -> list[tuple[str, str]]:
-    rows = [("record", str(e.record.get("file") or "–")), ("SHA-256 of the record", str(e.record.get("sha256") or "–"))]
-    rows += [("rig", str(e.rig.get("name") or "–"))]
-    rows += [("operating point", ", ".join(f"{role} {x:.6g}" for role, x in e.operating_point.items()) + " (SI)")]
-    rows += [("computing time", f"{sum(e.timing_s.values()):.3g} s")] if e.timing_s else []
-    rows += [("made", made)] if made else []
-    return [*rows, ("versions", library_versions())]
-
-
-def _listed(history: object) -> Sequence[str]:
-    return [str(step) for step in history] if isinstance(history, (list, tuple)) else []

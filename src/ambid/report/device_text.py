@@ -1,0 +1,180 @@
+"""What is said of a device: an acquisition under way and at its end, and the steps of a commissioning."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from ambid.report.text import WIDTH, Paint, columns, joined, plain, wrapped
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ambid.acquire.device import Counters, DeviceInfo
+    from ambid.acquire.quality import ColumnQuality, QualityReport
+    from ambid.acquire.session import RunReport
+
+_SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
+_ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
+_INDENT = "  "
+_NEXT = {
+    "self-test": "put right what the self-test names; nothing was switched on",
+    "rest": "put sensors, wiring or calibrations right; nothing was switched on",
+    "levitate": "put the bench right, or [loop], [daq.trip] and the calibrations of the rig",
+    "excite": "give a smaller --amplitude or another --band, or put the bench right",
+    "record": "see to what spoilt the record; {folder}/record.h5 holds what came",
+    "identify": (
+        "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig;"
+        " 'ambid identify {folder}/record.h5 --rig RIG' tries a corrected rig without the bench"
+    ),
+    "validate": (
+        "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for what"
+        " changed between the two"
+    ),
+    "report": "see to the folder and its disk",
+    "track": "look for what changed since the record: load, temperature, supply; {folder}/track.jsonl shows when",
+}
+"""What to do after a step that was not good enough."""
+
+
+def progress_line(q: QualityReport, counters: Counters) -> str:
+    """Write in a short line how an acquisition goes: time, rate, gaps, signal-to-noise ratio, saturation."""
+    parts = [f"{q.seconds:.1f} s", _rate(q), f"{q.lost} lost"]
+    if counters.damaged:
+        parts.append(f"{counters.damaged} damaged")
+    # before some periods of an excitation are over, nobody knows what is signal
+    known = [c for c in q.columns if c.role in _SHOWN and c.snr_db is not None and c.noise_by == "periods"]
+    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in known]
+    saturated = max((c.saturated for c in q.columns), default=0.0)
+    if saturated > 0.0:
+        parts.append(f"saturated {100.0 * saturated:.1f} %")
+    return ", ".join(parts)
+
+
+def _rate(q: QualityReport) -> str:
+    """The rate as it comes; of a bench that is played faster than real, how much faster."""
+    pace = q.measured_hz / q.rate_hz
+    if not math.isfinite(pace):
+        return f"{q.rate_hz:g} Hz"
+    return f"{q.measured_hz:.0f} Hz" if 0.5 < pace < 2.0 else f"{q.rate_hz:g} Hz at {pace:.2g} times real time"
+
+
+def acquired_text(
+    path: Path,
+    info: DeviceInfo,
+    run: RunReport,
+    q: QualityReport,
+    counters: Counters,
+    *,
+    not_stored: int = 0,
+    width: int = WIDTH,
+    paint: Paint = plain,
+) -> str:
+    """Write what an acquisition gave; colour does not change the layout."""
+    stored = run.samples - not_stored - q.repeated
+    whole = "" if stored == run.wanted else f" of {run.wanted} wanted"
+    head = (
+        f"{path}: {stored} samples{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from {info.kind} {info.port}"
+    )
+    words = [paint(line, "dim") for line in textwrap.wrap(_noise_words(q), width)]
+    words += textwrap.wrap(_line_words(run, counters), width)
+    verdict = [paint(line, "bad") for line in wrapped(q.verdict, width, "  ")]
+    return joined([textwrap.wrap(head, width), _table(q, paint), words, verdict])
+
+
+def _line_words(run: RunReport, counters: Counters) -> str:
+    words = f"{run.lost} samples lost, {counters.damaged} frames damaged, {counters.overruns} blocks overrun"
+    if run.lost:
+        words += "; read it with --gaps"
+    busy = counters.controller.get("busy_us")
+    if busy is not None:
+        words += f"; the controller worked {busy:.0f} us in its longest tick"
+    if math.isfinite(counters.drift):
+        words += f"; its clock is {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm off"
+    return words
+
+
+def _noise_words(q: QualityReport) -> str:
+    """Say what the column of noise is: neither way of telling it knows what the sensor's own noise is."""
+    if q.columns and q.columns[0].noise_by == "periods":
+        return (
+            "noise is what does not repeat with the excitation: the sensor's, and how the bench and its loop answer to"
+            " disturbance; SNR is what repeats over it"
+        )
+    return "noise is what changes from sample to sample, at most: fast motion counts as noise too"
+
+
+def _table(q: QualityReport, paint: Paint) -> list[str]:
+    """Write one row for each column, in its own unit; SNR only where an excitation tells signal from noise."""
+    rows = [("column", "mean", "rms about it", "noise", "SNR", "range used", "saturated")]
+    for c in q.columns:
+        unit = "" if c.unit == "1" else f" {c.unit}"
+        sensed = c.role not in _ORDERED
+        rows.append(
+            (
+                c.name,
+                f"{c.mean:.4g}{unit}",
+                f"{c.sd:.3g}{unit}",
+                f"{c.noise_sd:.2g}{unit}" if sensed else "-",
+                _decibels(c) if sensed and q.excited else "-",
+                "-" if c.used is None else f"{100.0 * c.used:.0f} %",
+                f"{100.0 * c.saturated:.2g} %",
+            )
+        )
+    lines = columns(rows)
+    return [paint(lines[0], "dim"), *lines[1:]]
+
+
+def _decibels(c: ColumnQuality) -> str:
+    if c.snr_db is None:
+        return "-"
+    return f"{c.snr_db:.1f} dB" if math.isfinite(c.snr_db) else "no noise"
+
+
+def step_text(
+    name: str,
+    place: str,
+    *,
+    findings: Sequence[str] = (),
+    reasons: Sequence[str] = (),
+    cautions: Sequence[str] = (),
+    width: int = WIDTH,
+    paint: Paint = plain,
+) -> str:
+    """Write a step that was done; `place` says which of how many it is, such as ``"2/9"``."""
+    mark = paint("✗", "bad") if reasons else paint("✓", "good")
+    lines = [f"{mark} {place} {paint(name, 'strong')}", *_wrapped(findings, width)]
+    lines += [paint(line, "dim") for line in _wrapped([f"note: {c}" for c in cautions], width)]
+    lines += [paint(line, "bad") for line in _wrapped([f"stopped: {r}" for r in reasons], width)]
+    return "\n".join(lines)
+
+
+def next_text(passed: bool, step: str, number: int, of: int, folder: str, *, width: int = WIDTH) -> str:
+    """Say where a commissioning ended, and what to do next.
+
+    `passed`: whether it came to its end; `step`: the last one; `number`, `of`: which of how many it is; `folder`: where
+    the files are; `width`: columns of the terminal. Returns lines without the last line's end.
+    """
+    if passed:
+        said = [
+            f"commissioned; {folder} holds rig, records, estimate, report and track.",
+            f"Next: read {folder}/report.html; follow the running bench with 'ambid acquire --track"
+            f" {folder}/estimate.json'.",
+        ]
+    else:
+        said = [
+            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found.",
+            f"Next: {_NEXT.get(step, 'see the reason above').format(folder=folder)}."
+            " Then commission again, into another folder.",
+        ]
+    return "\n".join(line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False))
+
+
+def _wrapped(texts: Sequence[str], width: int) -> list[str]:
+    lines: list[str] = []
+    for text in texts:
+        if text:
+            lines += textwrap.wrap(text, width, initial_indent=_INDENT, subsequent_indent=2 * _INDENT)
+    return lines

@@ -1,0 +1,372 @@
+"""What all figures are made of: pages, curves, bands, signals, residuals, Bode diagrams, poles with their regions.
+
+Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot: no window system, no global state. Spreads of
+responses and poles are by the delta method: real and imaginary part of d(ln G) are the changes of the logarithm of the
+magnitude and of the phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.report.numbers import prefixed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+    Draw = Callable[[Figure | SubFigure], object]
+
+Complex = NDArray[np.complex128]
+
+MEASURED, PREDICTED, BAND, BOUND = "#444444", "#0b6fb8", "#9ecae8", "#c0392b"
+NORMAL_95, NORMAL_99 = 1.959963984540054, 2.5758293035489004
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+_CHI2_95 = 5.991464547107979  # of two degrees of freedom
+_PIXELS = 1200  # samples from which a curve is drawn as the band of its extremes
+_ZOOM = 240  # samples of a close view
+_LAGS = 50
+_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
+
+
+def stacked(title: str, parts: Sequence[tuple[float, Draw]], width: float = 11.0) -> Figure:
+    """Return a page of drawings, one below the other, each with its height in inches."""
+    from matplotlib.figure import Figure
+
+    heights = [height for height, _ in parts]
+    page = Figure(figsize=(width, sum(heights) + 0.5), layout="constrained")
+    page.suptitle(title, fontsize=13)
+    places: Any = page.subfigures(len(parts), 1, height_ratios=heights)
+    for place, (_, draw) in zip(np.atleast_1d(places), parts, strict=True):
+        draw(place)
+    return page
+
+
+def single(height: float, draw: Draw) -> Figure:
+    """Return one drawing as a figure."""
+    from matplotlib.figure import Figure
+
+    page = Figure(figsize=(11.0, height), layout="constrained")
+    draw(page)
+    return page
+
+
+def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = None) -> None:
+    """Write a figure.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        What to write.
+    target : str, Path or binary file
+        ``.png``, ``.svg`` or ``.pdf``.
+    kind : str, optional
+        Format, where the name does not tell it.
+    """
+    # no date inside: equal estimates give equal files
+    dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    ending = kind or Path(str(target)).suffix.lower().removeprefix(".")
+    figure.savefig(target, dpi=130, format=ending, metadata=dates.get(ending))
+
+
+def curve(axes: Axes, t: Array, y: Array, color: str, label: str | None) -> None:
+    """Draw a curve, or, where there are more samples than the paper shows, the band between its extremes."""
+    options: dict[str, Any] = {} if label is None else {"label": label}
+    if y.size <= 2 * _PIXELS:
+        axes.plot(t, y, color=color, linewidth=0.8, **options)
+        return
+    edges = np.linspace(0, y.size, _PIXELS + 1).astype(int)[:-1]
+    low, high = np.minimum.reduceat(y, edges), np.maximum.reduceat(y, edges)
+    axes.fill_between(t[edges], low, high, color=color, linewidth=0.4, alpha=0.75, **options)
+
+
+def worst_stretch(e: Array) -> tuple[int, int]:
+    """First and last sample of the stretch with the largest errors, each output counted in its own spread."""
+    length = min(_ZOOM, e.shape[0])
+    size = np.sum((e / np.maximum(e.std(axis=0), 1e-300)) ** 2, axis=1)
+    total = np.concatenate([[0.0], np.cumsum(size)])
+    first = int(np.argmax(total[length:] - total[:-length]))
+    return first, first + length
+
+
+def autocorrelation(e: Array, n_lags: int) -> Array:
+    """Return the autocorrelation coefficients of a signal of mean near zero.
+
+    `e`: (n_samples,), such as innovations; `n_lags`: largest lag; at most n_samples - 1 are given. Returns (n_lags +
+    1,), the first is 1.
+    """
+    power = float(e @ e)
+    lags = range(1, min(n_lags, e.size - 1) + 1)
+    return np.array([1.0, *(float(e[k:] @ e[:-k]) / power for k in lags)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Traces:
+    """Outputs beside what a model says of them, SI."""
+
+    time_s: Array  # (n_samples,), s
+    names: tuple[str, ...]  # of the outputs
+    units: tuple[str, ...]
+    measured: Array  # (n_samples, n_outputs), predicted one step ahead
+    predicted: Array
+    simulated: Array | None  # (n_samples, n_outputs), or None
+    innovation_sd: Array  # (n_outputs,), as the model says
+
+
+def signals_panel(figure: Figure | SubFigure, traces: Traces) -> None:
+    """Measured against predicted: the whole record, and the stretch with the largest errors."""
+    t = traces.time_s
+    axes = figure.subplots(len(traces.names), 2, squeeze=False, width_ratios=(3, 2), sharex="col")
+    innovations = traces.measured - traces.predicted
+    first, last = worst_stretch(innovations)
+    for j, role in enumerate(traces.names):
+        whole, zoom = axes[j]
+        scale, unit = _axis_unit(traces, j, traces.measured[:, j])
+        y, p = traces.measured[:, j] / scale, traces.predicted[:, j] / scale
+        curve(whole, t, y, MEASURED, "measured")
+        curve(whole, t, p, PREDICTED, "predicted one step ahead")
+        zoom.plot(t[first:last], y[first:last], ".", color=MEASURED, markersize=3.5)
+        zoom.plot(t[first:last], p[first:last], "-", color=PREDICTED, linewidth=1.0)
+        if traces.simulated is not None:
+            simulated = traces.simulated[first:last, j] / scale
+            zoom.plot(t[first:last], simulated, "--", color=BOUND, linewidth=0.9, label="simulated from the input")
+        whole.axvspan(t[first], t[last - 1], color="#f3d9a4", zorder=0)
+        whole.set_ylabel(f"{role} [{unit}]")
+        grid(whole, zoom)
+    axes[0, 0].set_title("measured and predicted", fontsize=10)
+    axes[0, 1].set_title("close view where the errors are largest", fontsize=10)
+    axes[0, 0].legend(loc="upper right", fontsize=8, ncols=3, framealpha=0.85)
+    if traces.simulated is not None:
+        axes[0, 1].legend(loc="upper left", fontsize=8, framealpha=0.85)
+    axes[-1, 0].set_xlabel("time [s]")
+    axes[-1, 1].set_xlabel("time [s]")
+
+
+def residuals_panel(figure: Figure | SubFigure, traces: Traces) -> None:
+    """Innovations over time with 99 % bounds, and their autocorrelation."""
+    t = traces.time_s
+    axes = figure.subplots(len(traces.names), 2, squeeze=False, width_ratios=(3, 2), sharex="col")
+    sds = traces.innovation_sd
+    for j, role in enumerate(traces.names):
+        over_time, over_lag = axes[j]
+        e = traces.measured[:, j] - traces.predicted[:, j]
+        scale, unit = _axis_unit(traces, j, 3 * sds[j : j + 1])
+        curve(over_time, t, e / scale, MEASURED, None)
+        bound = NORMAL_99 * sds[j]
+        for side in (-bound, bound):
+            over_time.axhline(side / scale, color=BOUND, linewidth=1.0, linestyle="--")
+        outside = 100 * float(np.mean(np.abs(e) > bound))
+        over_time.set_ylabel(f"{role} [{unit}]")
+        note(over_time, f"{outside:.2g} % outside (1 % expected)")
+        rho = autocorrelation(e, _LAGS)
+        limit = NORMAL_99 / np.sqrt(e.size)
+        over_lag.vlines(np.arange(1, rho.size), 0, rho[1:], color=MEASURED, linewidth=1.4)
+        over_lag.axhspan(-limit, limit, color=BAND, alpha=0.6, zorder=0)
+        over_lag.axhline(0, color=MEASURED, linewidth=0.6)
+        reach = max(3 * limit, 1.1 * float(np.max(np.abs(rho[1:]), initial=0.0)))
+        over_lag.set_ylim(-reach, reach)
+        grid(over_time, over_lag)
+    axes[0, 0].set_title("innovations (measured - predicted) with 99 % bounds", fontsize=10)
+    axes[0, 1].set_title("their autocorrelation with 99 % bounds of white noise", fontsize=10)
+    axes[-1, 0].set_xlabel("time [s]")
+    axes[-1, 1].set_xlabel("lag [samples]")
+
+
+def _axis_unit(traces: Traces, j: int, values: Array) -> tuple[float, str]:
+    return prefixed(float(np.max(np.abs(values))), traces.units[j])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Response:
+    """Frequency response from one input to one output."""
+
+    source: str
+    output: str
+    frequency_hz: Array  # (n_frequencies,)
+    value: Complex  # (n_frequencies,), output unit per input unit
+    log_sd: Array  # (n_frequencies,), standard deviation of the natural logarithm of the magnitude
+    phase_sd: Array  # (n_frequencies,), rad
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pole:
+    """A pole or zero with the covariance of its real and imaginary part; None where it has none of first order."""
+
+    value: complex
+    covariance: Array | None  # (2, 2)
+
+
+def frequency_grid(poles: Complex | Array, lowest_hz: float, nyquist_hz: float, n_frequencies: int = 600) -> Array:
+    """Return frequencies in Hz, even in the logarithm, with more points at lightly damped poles (rad/s)."""
+    extra = [
+        abs(p) / (2 * np.pi) + abs(p.real) / (2 * np.pi) * np.linspace(-5, 5, 41)
+        for p in poles
+        if p.imag > 0 and lowest_hz < abs(p) / (2 * np.pi) < nyquist_hz
+    ]
+    found = np.unique(np.concatenate([np.geomspace(lowest_hz, nyquist_hz, n_frequencies), *extra]))
+    return np.asarray(found[(found >= lowest_hz) & (found <= nyquist_hz)])
+
+
+def responses_with_spread(
+    frequency_hz: Array, G: Complex, slopes: Complex, covariance: Array, inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[Response, ...]:
+    """Return every pair of a response (n_f, n_y, n_u) with slopes (n_f, n_y, n_u, n), output by output."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.nan_to_num(slopes / G[..., None])
+    log_sd, phase_sd = (
+        np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", J, covariance, J), 0.0))
+        for J in (relative.real, relative.imag)
+    )
+    return tuple(
+        Response(
+            source=source,
+            output=output,
+            frequency_hz=frequency_hz,
+            value=G[:, o, i],
+            log_sd=log_sd[:, o, i],
+            phase_sd=phase_sd[:, o, i],
+        )
+        for o, output in enumerate(outputs)
+        for i, source in enumerate(inputs)
+    )
+
+
+def bode_panel(
+    figure: Figure | SubFigure, found: Sequence[Response], units: Mapping[str, str], asides: Mapping[str, str]
+) -> None:
+    """Draw magnitude and phase of the first pairs with 95 % bands; `asides` by input stand in the titles."""
+    shown = found[:_PAIRS]
+    axes = figure.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
+    for j, r in enumerate(shown):
+        magnitude, phase = axes[:, j]
+        magnitude_axis(magnitude, r)
+        phase_axis(phase, r)
+        magnitude.set_ylabel(f"magnitude [{units[r.output]}/{units[r.source]}]")
+        phase.set_xlabel("frequency [Hz]")
+        magnitude.set_title(f"{r.source} → {r.output}{asides.get(r.source, '')}", fontsize=10)
+        magnitude.legend(loc="lower left", fontsize=8, framealpha=0.85)
+        grid(magnitude, phase)
+    axes[1, 0].set_ylabel("phase [°]")
+    if len(found) > len(shown):
+        figure.suptitle(f"{len(shown)} of {len(found)} pairs", fontsize=10)
+
+
+def magnitude_axis(
+    axes: Axes,
+    r: Response,
+    *,
+    label: str = "identified plant",
+    band_label: str | None = None,
+    colors: tuple[str, str] = (PREDICTED, BAND),
+) -> None:
+    """Draw the magnitude of a response with its 95 % band."""
+    size = np.abs(r.value)
+    spread = np.exp(np.minimum(NORMAL_95 * r.log_sd, 20.0))
+    about = band_label or f"95 % band (median ± {100 * (float(np.median(spread)) - 1):.2g} %)"
+    axes.fill_between(r.frequency_hz, size / spread, size * spread, color=colors[1], label=about, linewidth=0)
+    axes.loglog(r.frequency_hz, size, color=colors[0], linewidth=1.4, label=label)
+    axes.set_xlim(r.frequency_hz[0], r.frequency_hz[-1])
+    axes.set_ylim(0.5 * size.min(), 2 * size.max())
+
+
+def unwrapped(value: NDArray[np.complex128], near: float = 0.0) -> Array:
+    """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`."""
+    angle = np.unwrap(np.angle(value))
+    return np.asarray(angle - 2 * np.pi * np.round((angle[0] - near) / (2 * np.pi)))
+
+
+def phase_axis(axes: Axes, r: Response, *, near: float = 0.0, colors: tuple[str, str] = (PREDICTED, BAND)) -> None:
+    """Draw the phase of a response with its 95 % band, begun within half a turn of `near` (rad)."""
+    angle = unwrapped(r.value, near)
+    spread = np.minimum(NORMAL_95 * r.phase_sd, np.pi)
+    low, high = np.rad2deg(angle - spread), np.rad2deg(angle + spread)
+    axes.fill_between(r.frequency_hz, low, high, color=colors[1], linewidth=0)
+    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=colors[0], linewidth=1.4)
+    angle_ticks(axes, np.rad2deg(angle))
+
+
+def angle_ticks(axes: Axes, degrees: Array) -> None:
+    """Let an axis hold angles, with ticks at whole parts of a turn."""
+    first, last = 45 * np.floor(degrees.min() / 45 - 0.3), 45 * np.ceil(degrees.max() / 45 + 0.3)
+    step = 45 if last - first <= 180 else 90 if last - first <= 720 else 180 * np.ceil((last - first) / 1440)
+    axes.set_ylim(first, last)
+    axes.set_yticks(np.arange(step * np.ceil(first / step), last + 1, step))
+
+
+def pole_region(axes: Axes, pole: Pole, color: str) -> None:
+    """Draw the 95 % region of a pole or zero; of a real one an interval."""
+    from matplotlib.patches import Ellipse
+
+    if pole.covariance is None:
+        return
+    if abs(pole.value.imag) == 0:
+        reach = NORMAL_95 * float(np.sqrt(pole.covariance[0, 0]))
+        axes.plot([pole.value.real - reach, pole.value.real + reach], [0, 0], color=color, linewidth=4, alpha=0.35)
+        return
+    size, direction = np.linalg.eigh(pole.covariance)
+    width, height = 2 * np.sqrt(_CHI2_95 * np.maximum(size, 0.0))
+    angle = float(np.rad2deg(np.arctan2(direction[1, 0], direction[0, 0])))
+    centre = (pole.value.real, pole.value.imag)
+    axes.add_patch(Ellipse(centre, width, height, angle=angle, facecolor=color, alpha=0.35, linewidth=0))
+
+
+def poles_panel(
+    figure: Figure | SubFigure,
+    poles: Sequence[Pole],
+    text: str,
+    title: str,
+    *,
+    zeros: Sequence[Pole] = (),
+    discrete: bool = False,
+) -> None:
+    """Draw poles and zeros with their 95 % regions and the border of stability, and beside them a text."""
+    axes, beside = figure.subplots(1, 2, width_ratios=(1, 1))
+    for pole in poles:
+        p = pole.value
+        color = BOUND if (abs(p) > 1 if discrete else p.real > 0) else PREDICTED
+        axes.plot(p.real, p.imag, "x", color=color, markersize=8, markeredgewidth=1.8)
+        pole_region(axes, pole, color)
+    for zero in zeros:
+        z = zero.value
+        axes.plot(z.real, z.imag, "o", color=MEASURED, markersize=7, markerfacecolor="none", markeredgewidth=1.4)
+        pole_region(axes, zero, MEASURED)
+    axes.axhline(0, color=MEASURED, linewidth=0.8)
+    if discrete:
+        angle = np.linspace(0, 2 * np.pi, 361)
+        axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.8)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("real part – outside the circle the plant is unstable")
+        axes.set_ylabel("imaginary part")
+    else:
+        axes.margins(0.15)
+        axes.axvline(0, color=MEASURED, linewidth=0.8)
+        low, high = axes.get_xlim()
+        axes.axvspan(0, max(high, 0.15 * -low), color="#fbe9e7", zorder=0)
+        axes.set_xlim(low, max(high, 0.15 * -low))
+        axes.set_xlabel("real part [rad/s] – right of zero the plant is unstable")
+        axes.set_ylabel("imaginary part [rad/s]")
+    axes.set_title(title, fontsize=10)
+    grid(axes)
+    beside.axis("off")
+    beside.text(0.0, 0.97, text, fontsize=9, va="top", family="monospace", transform=beside.transAxes)
+
+
+def note(axes: Axes, text: str) -> None:
+    """Write a short note in the upper right corner."""
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
+    axes.text(0.995, 0.97, text, transform=axes.transAxes, fontsize=8, ha="right", va="top", bbox=box)
+
+
+def grid(*axes: Axes) -> None:
+    """Draw a grid behind what is shown."""
+    for a in axes:
+        a.grid(True, color="#dddddd", linewidth=0.6)
+        a.set_axisbelow(True)  # bands of long records would have lines across
+        a.tick_params(labelsize=9)

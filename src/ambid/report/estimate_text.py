@@ -1,0 +1,216 @@
+"""Physical parameters as tables for the terminal: of a record, a nonlinear bearing, a black box, a response."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.bearing.magnet.result import Curve, NonlinearBearingEstimate
+from ambid.estimation.estimate import Estimate
+from ambid.physics.models import model
+from ambid.report.numbers import prefixed, sized
+from ambid.report.text import (
+    WIDTH,
+    Paint,
+    check_lines,
+    checks_of,
+    columns,
+    delay_line,
+    fit_rows,
+    fraction,
+    joined,
+    other_warnings,
+    parameter_lines,
+    plain,
+    status_words,
+    timing_lines,
+    title_line,
+    warning_lines,
+)
+
+if TYPE_CHECKING:
+    from ambid.bearing.physical import PhysicalFit
+    from ambid.blackbox.frequency.physical_estimate import FrequencyEstimate
+
+AnyEstimate = Estimate | NonlinearBearingEstimate
+
+_POSITIONS, _CURRENTS = 5, 3  # of the table of curves
+_UNITS = {"position": "m", "current": "A"}
+
+
+def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write an estimate, linear or of a nonlinear bearing, for people; colour does not change the layout."""
+    curves = curve_lines(estimate, width=width) if isinstance(estimate, NonlinearBearingEstimate) else []
+    warnings = warning_lines(other_warnings(estimate), width=width, paint=paint)
+    finished = estimate.status == "converged"
+    validation = estimate.validation
+    return joined(
+        [
+            header_lines(estimate, width=width, paint=paint),
+            warnings if curves else [],
+            parameter_lines(estimate.parameters, width=width, paint=paint, finished=finished),
+            curves,
+            delay_lines(estimate),
+            columns(output_rows(estimate)),
+            check_lines(estimate.checks, width=width, paint=paint),
+            [] if validation is None else validation_lines(validation, width=width, paint=paint),
+            [] if curves else warnings,
+            timing_lines(estimate.timing_s, paint=paint),
+        ]
+    )
+
+
+def header_lines(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+    """Say what was identified from what, and whether the search converged; of several records their names."""
+    if isinstance(estimate, Estimate):
+        samples, rate = int(str(estimate.record["samples"])), float(str(estimate.record["rate_hz"]))
+        name, what = estimate.record.get("file"), f"model {estimate.model}"
+        return [title_line(name, what, samples, rate, estimate.status, paint)]
+    names = list(estimate.noise)
+    law = ", ".join([str(estimate.law), *(["eddy pole"] * estimate.eddy), *(["drift"] * estimate.drift)])
+    verdict = status_words(estimate.status, paint)
+    lines = [f"{paint(names_words(names), 'strong')}: {law}, {seconds_of(estimate):.4g} s{verdict}"]
+    for words, held in (("moving", False), ("held", True)):
+        of = [n for n, r in zip(names, estimate.records, strict=True) if bool(r["held"]) == held]
+        if of and len(names) > 1:
+            lines += textwrap.wrap(f"{words}: {', '.join(of)}", width, subsequent_indent="  ", break_on_hyphens=False)
+    return lines
+
+
+def names_words(names: list[str]) -> str:
+    """Name one record, or say how many there are."""
+    return names[0] if len(names) == 1 else f"{len(names)} records"
+
+
+def seconds_of(estimate: NonlinearBearingEstimate) -> float:
+    """Return the length of all records in s."""
+    return sum(float(str(r["samples"])) / float(str(r["rate_hz"])) for r in estimate.records)
+
+
+def curve_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH) -> list[str]:
+    """Return tables of k_i, k_x and L over positions and currents where the free rotor usually was.
+
+    On a narrow terminal the middle current stands alone; * marks points that no record came to.
+    """
+    tables = curve_rows(estimate)
+    if max(len(line) for table in tables for line in columns(table)) > width:
+        tables = curve_rows(estimate, current=np.array([np.mean(estimate.usual["current"])]))
+    lines: list[str] = []
+    for table in tables:
+        lines += ["", *columns(table)] if lines else columns(table)
+    if any("*" in cell for table in tables for row in table for cell in row):
+        lines += ["* no record came there: the law extrapolates, which its deviation does not know"]
+    return lines
+
+
+def curve_rows(
+    estimate: NonlinearBearingEstimate, position: Array | None = None, current: Array | None = None
+) -> list[list[tuple[str, ...]]]:
+    """Return a table each of k_i, k_x and L over positions in m and currents in A, where the free rotor usually was."""
+    position = np.linspace(*estimate.usual["position"], _POSITIONS) if position is None else position
+    current = np.linspace(*estimate.usual["current"], _CURRENTS) if current is None else current
+    grid = np.meshgrid(position, current, indexing="ij")
+    found = estimate.curves(grid[0].ravel(), grid[1].ravel())
+    scale, unit = prefixed(float(np.max(np.abs(position))), "m")
+    heads = [f"at {c:.3g} A" for c in current]
+    tables = []
+    seen = {"k_i": found.inside, "k_x": found.inside, "L": found.coil_inside}
+    for name, inside in seen.items():
+        cells, shown = _cells(getattr(found, name), inside)
+        table = [(f"{name} [{shown}]", *heads)]
+        for k, x in enumerate(position.tolist()):
+            table.append((f"  {x / scale:.4g} {unit}", *cells[k * len(heads) : (k + 1) * len(heads)]))
+        tables.append(table)
+    return tables
+
+
+def _cells(curve: Curve, inside: NDArray[np.bool_]) -> tuple[list[str], str]:
+    """Values with standard deviations, all in the unit that suits the largest."""
+    scale, unit = prefixed(float(np.max(np.abs(curve.value))), curve.unit)
+    cells = []
+    for value, sd, seen in zip(curve.value / scale, curve.sd / scale, inside, strict=True):
+        digits = 1 - int(np.floor(np.log10(sd))) if sd > 0 else 4
+        digits = min(max(digits, 0), 6)
+        cells.append(f"{value:.{digits}f} ± {sd:.{digits}f}{'' if seen else ' *'}")
+    return cells, unit
+
+
+def delay_lines(estimate: AnyEstimate) -> list[str]:
+    """Say by how much each input is delayed; of a bearing the voltage, at each sampling rate."""
+    if isinstance(estimate, Estimate):
+        rate = float(str(estimate.record["rate_hz"]))
+        return [delay_line(role, d, rate) for role, d in estimate.delay.items()]
+    return [delay_line(f"voltage at {rate}", d, float(rate.removesuffix(" Hz"))) for rate, d in estimate.delay.items()]
+
+
+def output_rows(estimate: AnyEstimate) -> list[tuple[str, ...]]:
+    """Return a table of the fit of each output; of a bearing on each record, where of a held rotor the current."""
+    if isinstance(estimate, Estimate):
+        return fit_rows(estimate.fit, model(estimate.model).units, "unstable in open loop")
+    rows: list[tuple[str, ...]] = [("one-step fit", "position", "innovations", "current", "innovations")]
+    for name, fits in estimate.fit.items():
+        cells: list[str] = []
+        for role, unit in _UNITS.items():
+            f = fits.get(role)
+            cells += ["held", ""] if f is None else [f"{f.one_step:.4f}", f"{sized(f.innovation_sd, unit)} rms"]
+        rows.append((name, *cells))
+    return rows
+
+
+def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+    """Write how an estimate does on a second record: the fit of each output, then the checks."""
+    return [
+        paint(f"on the second record ({validation['samples']} samples)", "strong"),
+        *columns(validation_rows(validation)),
+        *check_lines(checks_of(validation), width=width, paint=paint),
+    ]
+
+
+def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of the fit of each output on a second record: some steps ahead, or beside identification."""
+    fits = validation["fit"]
+    first = next(iter(fits.values()))
+    if "k_step" in first:
+        horizons = list(first["k_step"])
+        rows = [("fit", *(f"{k} ahead" for k in horizons), "simulation")]
+        for role, f in fits.items():
+            free = "unstable in open loop" if f["simulation"] is None else fraction(f["simulation"])
+            rows.append((role, *(fraction(f["k_step"][k]) for k in horizons), free))
+        return rows
+    rows = [("fit", "one step", "innovations", "of those at identification")]
+    for role, f in fits.items():
+        rms = f"{sized(float(f['innovation_rms']), _UNITS[role])} rms"
+        rows.append((role, f"{f['one_step']:.4f}", rms, f"{100 * float(f['ratio']):.3g} %"))
+    return rows
+
+
+def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write the physical parameters that follow from a black-box fit, and whether it can be this physics."""
+    d = found.delay
+    total = d.samples + d.fraction
+    low, high = found.band_hz
+    lines = [
+        paint(f"physical parameters of model {found.model}, from {found.structure}", "strong"),
+        *parameter_lines(found.parameters, width=width, paint=paint),
+        f"delay {total:.3g} sample{'' if total == 1 else 's'}, {d.how}; from {sized(low, 'Hz')} to {sized(high, 'Hz')}",
+        *check_lines({"misfit": found.misfit}, width=width, paint=paint),
+        *warning_lines([w for w in found.warnings if w != found.misfit.detail], width=width, paint=paint),
+    ]
+    return "\n".join(lines)
+
+
+def frequency_lines(estimate: FrequencyEstimate, width: int, paint: Paint) -> list[str]:
+    """Write the physical parameters of a measured response."""
+    d = estimate.delay
+    spread = "" if d.sd is None else f" ± {d.sd:.2g}"
+    return [
+        f"{paint('physical parameters', 'strong')} of model {estimate.model}{status_words(estimate.status, paint)}",
+        *parameter_lines(estimate.parameters, width=width, paint=paint),
+        f"delay {d.samples + d.fraction:.4g}{spread} samples ({d.how})",
+        *check_lines(estimate.checks, width=width, paint=paint),
+    ]
