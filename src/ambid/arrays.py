@@ -1,4 +1,4 @@
-"""The one alias for numeric arrays: float64, C-ordered, time along axis 0 unless a name says otherwise."""
+"""Aliases for numeric arrays: C-ordered, time along axis 0 unless a name says otherwise."""
 
 from __future__ import annotations
 
@@ -6,3 +6,4 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]

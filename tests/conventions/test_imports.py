@@ -26,7 +26,7 @@ FABRICATED = {
     "upward, the room itself": ("ambid.record.record", "from ambid import rig", "upward"),
     "upward by two dots": ("ambid.record.csv_format", "from ..physics import models", "upward"),
     "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
-    "sideways": ("ambid.signals.filters", "from ambid.physics import models", "sideways"),
+    "sideways": ("ambid.signals.conditioning", "from ambid.physics import models", "sideways"),
     "sideways, top": ("ambid.fleet.many", "import ambid.cli", "sideways"),
     "inside a function": ("ambid.rig.load", "def f():\n    from ambid.bearing import greybox\n", "line 2: rig"),
     "for typing only": (

@@ -5,8 +5,7 @@ import pytest
 from scipy.signal import freqz, lfilter
 
 from ambid.errors import RecordError
-from ambid.signals.blackman_tukey import blackman_tukey
-from ambid.signals.spectra import power_spectrum
+from ambid.signals.spectra import blackman_tukey, power_spectrum
 
 
 def test_density_integrates_to_the_variance():

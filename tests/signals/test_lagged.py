@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.signals.lagged import lagged_triangle
+from ambid.signals.delay import lagged_triangle
 
 
 @pytest.mark.parametrize("n", [9, 500, 20_000])

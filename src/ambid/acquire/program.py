@@ -119,7 +119,7 @@ def _multisine(
     table_length: int,
 ) -> Program:
     """The longest table of which four periods fit into the record, held only as far as its lowest line needs it."""
-    from ambid.signals.multisine import multisine
+    from ambid.signals.excitation import multisine
 
     low, high = band if band is not None else (0.0, rate_hz / 5.0)
     hold = max(1, math.ceil(rate_hz / (table_length * low) - 1e-9)) if low > 0.0 else 1

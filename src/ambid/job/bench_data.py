@@ -11,7 +11,7 @@ from ambid.errors import EstimationError, RecordError
 from ambid.physics.models import model
 from ambid.record import Record, read_record
 from ambid.rig import Rig, bench_record, mat_variables
-from ambid.signals.samples import cut
+from ambid.signals.conditioning import cut
 from ambid.units import UNKNOWN
 
 

@@ -23,7 +23,7 @@ from ambid.job.bench_data import bench_data
 from ambid.physics.models import model
 from ambid.record import Record, read_record
 from ambid.rig import Rig, load_rig
-from ambid.signals.samples import cut
+from ambid.signals.conditioning import cut
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:

@@ -26,7 +26,8 @@ from ambid.job.blackbox import read_data
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig, load_rig
-from ambid.signals.frf import FrequencyResponse, Hold, Method, frequency_response, repeats
+from ambid.signals.frf import Method, frequency_response, repeats
+from ambid.signals.response import FrequencyResponse, Hold
 
 Delay = float | Literal["auto"]
 

@@ -18,7 +18,7 @@ from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
-from ambid.signals.samples import cut
+from ambid.signals.conditioning import cut
 
 if TYPE_CHECKING:
     from ambid.bearing.uncertainty import Uncertainty

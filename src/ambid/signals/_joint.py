@@ -10,9 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals.frf import Complex
 
 FEEDBACK = (
     "without a reference the response is biased towards -1/controller where feedback carries the noise to the input; "

@@ -6,6 +6,7 @@ as the loop holds a delay (Ljung 1999, sec. 13.4), where correlation of input an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import erf, sqrt
 
@@ -13,7 +14,67 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.signals._regression import fit_arx
+
+_ROWS = 8192  # of a block that fits the processor's cache
+
+
+def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
+    """Return R of the QR factorisation of [x(t - lag) of every column] for t >= first.
+
+    `columns`: (n_samples,), and int), signal x and its lag; a constant is a signal of ones without lag; `first`: first
+    row, at least the largest lag. Returns (n_columns, n_columns), rows of zeros at the end where there are fewer rows
+    than columns.
+    """
+    n, width = columns[0][0].size, len(columns)
+    R = np.zeros((0, width))
+    rows = max(_ROWS, 4 * width)
+    for start in range(first, n, rows):
+        stop = min(start + rows, n)
+        block = np.empty((R.shape[0] + stop - start, width), order="F")
+        block[: R.shape[0]] = R
+        for k, (x, lag) in enumerate(columns):
+            block[R.shape[0] :, k] = x[start - lag : stop - lag]
+        R = np.asarray(np.linalg.qr(block, mode="r"))
+    return np.vstack([R, np.zeros((width - R.shape[0], width))])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Regression:
+    """A least-squares fit: coefficients and their sd, shape (n_columns,), residual variance and the number of rows."""
+
+    coefficients: Array
+    sd: Array
+    variance: float
+    n_rows: int
+
+
+def fit_arx(y: Array, inputs: Sequence[Array], na: int, lags: Sequence[int]) -> Regression:
+    """Fit y(t) = -a·y(t-1…t-na) + b·u(t-lags) + constant by QR.
+
+    Columns: `na` of the output, then len(lags) of each input, then the constant. Coefficients hold +y weights (-a).
+    """
+    reach = max([na, *lags])
+    n_columns, n_rows = na + len(lags) * len(inputs) + 1, y.size - reach
+    if n_rows <= 2 * n_columns:
+        raise EstimationError(
+            f"{y.size} samples are too few for a regression on {n_columns} lagged values; it needs more than "
+            f"{2 * n_columns + reach}. Use a longer record, or a lower order"
+        )
+    signals = [y, *inputs]
+    sizes = [float(np.linalg.norm(x)) or 1.0 for x in signals]
+    past_y, *past = (x / size for x, size in zip(signals, sizes, strict=True))
+    columns = [(past_y, lag) for lag in range(1, na + 1)] + [(u, lag) for u in past for lag in lags]
+    norms = np.repeat([*sizes, np.sqrt(n_rows)], [na, *(len(lags) for _ in inputs), 1])
+    r = lagged_triangle([*columns, (np.full(y.size, 1.0 / norms[-1]), 0), (y, 0)], reach)
+    triangle, rhs = r[:n_columns, :n_columns], r[:n_columns, n_columns]
+    # A noise-free record makes lagged columns dependent: the smallest norm among all solutions predicts as well.
+    u, s, vt = np.linalg.svd(triangle)
+    kept = s > s[0] * 1e-12
+    inverse = (vt[kept].T / s[kept]) @ u[:, kept].T
+    variance = float(r[n_columns, n_columns] ** 2) / (n_rows - int(kept.sum()))
+    sd = np.sqrt(variance * np.sum(inverse**2, axis=1)) / norms
+    return Regression(coefficients=inverse @ rhs / norms, sd=sd, variance=variance, n_rows=n_rows)
+
 
 _SIGNIFICANT = 4.0  # standard deviations
 _RELATIVE = 0.2  # of the largest coefficient: under it a lag is the foot of a fraction of a sample, or model error
@@ -141,3 +202,103 @@ def _confidence(b: Array, sd: Array, threshold: float, first: int) -> float:
     for k in range(first):
         probability *= 1.0 - above(k)
     return float(np.clip(probability, 0.0, 1.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PersistentExcitation:
+    """Persistent excitation of a signal.
+
+    Attributes
+    ----------
+    order : int
+        Largest order, up to `asked`, at which the signal is persistently exciting; 0 for a constant signal.
+    asked : int
+        Order looked at.
+    smallest, largest : float
+        Singular values of the Hankel matrix of order `asked`, of the signal scaled to mean 0 and rms 1 and divided by
+        the square root of the number of rows: both are 1 for white noise.
+    """
+
+    order: int
+    asked: int
+    smallest: float
+    largest: float
+
+    @property
+    def condition(self) -> float:
+        """Ratio of the largest to the smallest singular value; inf if the smallest is 0."""
+        return self.largest / self.smallest if self.smallest > 0 else float("inf")
+
+    def __str__(self) -> str:
+        least = "at least " if self.order == self.asked else ""
+        values = f"singular values {self.smallest:.3g} to {self.largest:.3g}"
+        return f"persistently exciting of order {least}{self.order} ({values})"
+
+
+def persistent_excitation(u: Array, order: int, *, tolerance: float = 1e-9) -> PersistentExcitation:
+    """Measure the order of persistent excitation of a signal.
+
+    A signal is persistently exciting of order n if the Hankel matrix of its samples with n columns has full column rank
+    (Ljung 1999, def. 13.2). The mean is removed, because an identification that estimates an offset has no use of it:
+    a sum of k sines has order 2k.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_samples,), any unit
+        Signal.
+    order : int
+        Largest order to look at, at least 1; the record needs twice as many samples.
+    tolerance : float
+        Ratio of smallest to largest singular value under which the rank counts as lost. The default is for round-off; a
+        noise level in parts of the signal's rms tells what can be seen above that noise.
+
+    Returns
+    -------
+    PersistentExcitation
+        The order and the singular values.
+
+    Raises
+    ------
+    EstimationError
+        If the order does not fit the record or a sample is not finite.
+    """
+    from scipy.linalg import hankel
+
+    u = np.asarray(u, dtype=np.float64)
+    if order < 1 or u.ndim != 1 or u.size < 2 * order:
+        raise EstimationError(
+            f"persistent excitation of order {order} from samples of shape {u.shape}; the order must be at least 1 and "
+            "the samples (n_samples,) at least twice as many. Use a lower order or a longer record"
+        )
+    if not np.isfinite(u).all():
+        raise EstimationError("persistent excitation of a signal that is not finite everywhere. Repair or cut it first")
+    centred = u - u.mean()
+    rms = float(np.sqrt(np.mean(centred**2)))
+    if rms <= 1e-14 * float(np.max(np.abs(u), initial=0.0)):
+        return PersistentExcitation(order=0, asked=order, smallest=0.0, largest=0.0)
+    rows = u.size - order + 1
+    matrix = hankel(centred[:rows], centred[rows - 1 :]) / (rms * np.sqrt(rows))
+    # Each column has its own mean over its own samples: only their removal takes the constant out exactly.
+    matrix -= matrix.mean(axis=0)
+    # The leading n columns of the triangle are those of the Hankel matrix of order n: one QR serves all orders.
+    triangle: Array = np.asarray(np.linalg.qr(matrix, mode="r"))
+    values = np.linalg.svd(triangle, compute_uv=False)
+    return PersistentExcitation(
+        order=_full_rank(triangle, order, tolerance), asked=order, smallest=float(values[-1]), largest=float(values[0])
+    )
+
+
+def _full_rank(triangle: Array, order: int, tolerance: float) -> int:
+    """Largest n whose leading n columns have full rank, by bisection: a lost rank does not come back."""
+
+    def full(n: int) -> bool:
+        values = np.linalg.svd(triangle[:n, :n], compute_uv=False)
+        return bool(values[-1] > tolerance * values[0])
+
+    low, high = 1, order
+    if full(order):
+        return order
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if full(middle) else (low, middle)
+    return low

@@ -1,20 +1,444 @@
-"""The excitations by name, as ``ambid simulate --excitation NAME`` and ``ambid acquire`` ask for them."""
+"""Excitation waveforms, multisines among them, and their choice by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from inspect import signature
 from math import ceil, log2
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.signals.multisine import multisine
-from ambid.signals.waveforms import checked, checked_band, chirp, gaussian, prbs, steps
+
+AmplitudeIs = Literal["peak", "rms"]
+
+
+def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
+    """Scale samples so that their largest absolute value, or their rms, is `amplitude`.
+
+    `x`: (n_samples,), samples, not all zero; `amplitude`: wanted peak or rms, in the unit of the result; over 0;
+    `amplitude_is`: what `amplitude` means. Returns (n_samples,), unit of `amplitude`, scaled samples.
+    """
+    if not (np.isfinite(amplitude) and amplitude > 0):
+        raise AmbidError(f"excitation amplitude {amplitude}; it must be a positive number. Give another")
+    if amplitude_is not in ("peak", "rms"):
+        raise AmbidError(f"amplitude_is {amplitude_is!r}; it must be 'peak' or 'rms'. Give one of them")
+    size = np.max(np.abs(x)) if amplitude_is == "peak" else np.sqrt(np.mean(x**2))
+    return np.asarray(x * (amplitude / size), dtype=np.float64)
+
+
+def checked(n_samples: int, rate_hz: float) -> None:
+    """Refuse a length under two samples or a rate that is not positive.
+
+    `n_samples`: samples; `rate_hz`: sampling rate in Hz.
+    """
+    if n_samples < 2 or not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise AmbidError(
+            f"excitation of {n_samples} samples at {rate_hz} Hz; it needs at least 2 samples and a positive rate. "
+            f"Give others"
+        )
+
+
+def checked_band(band: tuple[float, float], rate_hz: float) -> tuple[float, float]:
+    """Return a band (low, high) in Hz after checking 0 <= low < high <= rate/2.
+
+    `band`: ends in Hz; `rate_hz`: sampling rate in Hz. Returns the same band in Hz.
+    """
+    low, high = float(band[0]), float(band[1])
+    if not 0.0 <= low < high <= rate_hz / 2:
+        raise AmbidError(
+            f"excitation band {low:g} to {high:g} Hz at a rate of {rate_hz:g} Hz; it must lie between 0 and half "
+            f"the rate "
+            f"({rate_hz / 2:g} Hz), low end first. Give another band or rate"
+        )
+    return low, high
+
+
+def steps(
+    n_samples: int,
+    rate_hz: float,
+    *,
+    amplitude: float,
+    hold_s: float,
+    levels: Sequence[float] = (0.0, 1.0, 0.0, -1.0),
+    amplitude_is: AmplitudeIs = "peak",
+) -> Array:
+    """Return steps that run through `levels`, holding each for `hold_s`, over and over.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples.
+    rate_hz : float
+        Sampling rate in Hz.
+    amplitude : float
+        Largest absolute value, or rms over the signal, in the unit of the result.
+    hold_s : float
+        Time in s for which a level is held, at least one sample; rounded to whole samples.
+    levels : sequence of float
+        Relative heights.
+    amplitude_is : {"peak", "rms"}
+        What `amplitude` means.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,), unit of `amplitude`
+        The steps.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range, or no step falls into the signal.
+    """
+    checked(n_samples, rate_hz)
+    hold = round(hold_s * rate_hz)
+    if hold < 1:
+        raise AmbidError(
+            f"steps held for {hold_s:g} s at {rate_hz:g} Hz are shorter than a sample. Give a longer hold_s"
+        )
+    heights = np.asarray(levels, dtype=np.float64)
+    x = heights[(np.arange(n_samples) // hold) % heights.size]
+    if np.ptp(x) == 0.0:
+        raise AmbidError(
+            f"steps held for {hold_s:g} s give no step in {n_samples / rate_hz:g} s. Give a shorter hold_s"
+        )
+    return scaled(x, amplitude, amplitude_is)
+
+
+def chirp(
+    n_samples: int,
+    rate_hz: float,
+    *,
+    amplitude: float,
+    band: tuple[float, float],
+    sweep: Literal["linear", "log"] = "linear",
+    amplitude_is: AmplitudeIs = "peak",
+) -> Array:
+    """Return a sine whose frequency runs once through the band, starting at phase 0.
+
+    Linear: φ = 2π (f0 t + (f1 - f0) t²/(2 T)); logarithmic: φ = 2π f0 T/ln(f1/f0) ((f1/f0)^(t/T) - 1).
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples.
+    rate_hz : float
+        Sampling rate in Hz.
+    amplitude : float
+        Largest absolute value, or rms, in the unit of the result.
+    band : (float, float)
+        First and last frequency in Hz; the first must be over 0 for a logarithmic sweep.
+    sweep : {"linear", "log"}
+        Frequency linear in time, or its logarithm.
+    amplitude_is : {"peak", "rms"}
+        What `amplitude` means.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,), unit of `amplitude`
+        The chirp.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range.
+    """
+    checked(n_samples, rate_hz)
+    low, high = checked_band(band, rate_hz)
+    t, duration = np.arange(n_samples) / rate_hz, n_samples / rate_hz
+    if sweep == "linear":
+        turns = low * t + (high - low) * t**2 / (2.0 * duration)
+    elif sweep == "log":
+        if low == 0.0:
+            raise AmbidError("a logarithmic chirp cannot start at 0 Hz. Give a low end over 0, or sweep='linear'")
+        turns = low * duration / np.log(high / low) * ((high / low) ** (t / duration) - 1.0)
+    else:
+        raise AmbidError(f"chirp sweep {sweep!r}; it must be 'linear' or 'log'. Give one of them")
+    return scaled(np.sin(2.0 * np.pi * turns), amplitude, amplitude_is)
+
+
+def prbs(
+    n_samples: int,
+    rate_hz: float,
+    *,
+    amplitude: float,
+    bits: int | None = None,
+    hold: int = 1,
+    seed: int | np.random.Generator = 0,
+    amplitude_is: AmplitudeIs = "peak",
+) -> Array:
+    """Return a maximum-length pseudo-random binary sequence of ±amplitude.
+
+    A shift register of `bits` bits gives a period of 2^bits - 1 clock ticks; its mean is amplitude/(2^bits - 1) and
+    its periodic autocorrelation has two values only (Ljung 1999, sec. 13.3). The spectrum falls to half at 0.44/tick
+    and to nothing at 1/tick.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples.
+    rate_hz : float
+        Sampling rate in Hz.
+    amplitude : float
+        Both peak and rms, which are equal here, in the unit of the result.
+    bits : int, optional
+        Length of the register, 2 to 31; by default the shortest (at least 4) whose period is as long as the signal.
+    hold : int
+        Samples of a clock tick.
+    seed : int or numpy.random.Generator
+        Chooses where in its period the sequence starts.
+    amplitude_is : {"peak", "rms"}
+        Accepted for uniformity.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,), unit of `amplitude`
+        The sequence.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range.
+    """
+    from scipy.signal import max_len_seq
+
+    checked(n_samples, rate_hz)
+    if hold < 1:
+        raise AmbidError(f"PRBS tick of {hold} samples; it must be at least 1. Give another hold")
+    ticks = -(-n_samples // hold)
+    if bits is None:
+        bits = max(4, int(ticks).bit_length())
+    if not 2 <= bits <= 31:
+        raise AmbidError(f"PRBS register of {bits} bits; it must have 2 to 31. Give another number of bits")
+    start = np.random.default_rng(seed).integers(1, 2**bits)
+    register = np.array([(int(start) >> k) & 1 for k in range(bits)], dtype=np.int8)
+    sequence = max_len_seq(bits, state=register, length=ticks)[0]
+    x = np.repeat(2.0 * sequence - 1.0, hold)[:n_samples]
+    return scaled(x, amplitude, amplitude_is)
+
+
+def gaussian(
+    n_samples: int,
+    rate_hz: float,
+    *,
+    amplitude: float,
+    band: tuple[float, float] | None = None,
+    seed: int | np.random.Generator = 0,
+    amplitude_is: AmplitudeIs = "rms",
+) -> Array:
+    """Return Gaussian noise, white or confined to a band.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples.
+    rate_hz : float
+        Sampling rate in Hz.
+    amplitude : float
+        Rms of these samples (default), or largest absolute value, in the unit of the result.
+    band : (float, float), optional
+        Band in Hz, cut out exactly in the discrete Fourier transform of the whole signal; white by default.
+    seed : int or numpy.random.Generator
+        Source of the noise.
+    amplitude_is : {"rms", "peak"}
+        What `amplitude` means.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,), unit of `amplitude`
+        The noise.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range, or no frequency of the signal falls into the band.
+    """
+    checked(n_samples, rate_hz)
+    x = np.random.default_rng(seed).standard_normal(n_samples)
+    if band is not None:
+        low, high = checked_band(band, rate_hz)
+        lines = np.fft.rfft(x)
+        frequency = np.fft.rfftfreq(n_samples, 1.0 / rate_hz)
+        inside = (frequency >= low) & (frequency <= high)
+        if not inside[1:].any():
+            raise AmbidError(
+                f"{n_samples / rate_hz:g} s of noise have no line between {low:g} and {high:g} Hz. Widen the band, "
+                f"or make it longer"
+            )
+        x = np.fft.irfft(np.where(inside, lines, 0.0), n_samples)
+    return scaled(x, amplitude, amplitude_is)
+
+
+def multisine(
+    n_samples: int,
+    rate_hz: float,
+    *,
+    amplitude: float,
+    band: tuple[float, float],
+    periods: int = 1,
+    phases: Literal["random", "schroeder"] = "random",
+    shape: Literal["flat", "pink"] = "flat",
+    lines: Literal["all", "odd"] = "all",
+    crest_iterations: int = 0,
+    seed: int | np.random.Generator = 0,
+    amplitude_is: AmplitudeIs = "peak",
+) -> Array:
+    """Return a whole number of periods of a multisine.
+
+    It has a line at each multiple of rate/(n_samples/periods) in the band (0 and half the rate left out). Schroeder
+    phases φ_k = -2π Σ_{j<k} (k - j) p_j, with p_j the share of line j in the power, give a crest factor of about 1.7
+    for a flat spectrum of many lines (Schroeder 1970). `crest_iterations` lowers it by clipping the peaks and putting
+    the amplitudes back, from the given phases (van der Ouderaa, Schoukens and Renneboog 1988); the best iteration is
+    kept.
+
+    Parameters
+    ----------
+    n_samples : int
+        Samples, a multiple of `periods`.
+    rate_hz : float
+        Sampling rate in Hz.
+    amplitude : float
+        Largest absolute value, or rms, in the unit of the result.
+    band : (float, float)
+        Band in Hz.
+    periods : int
+        Whole periods in the signal, at least 1.
+    phases : {"random", "schroeder"}
+        Phases of the lines.
+    shape : {"flat", "pink"}
+        Amplitude of the lines: all equal, or falling with 1/√f (equal power per octave).
+    lines : {"all", "odd"}
+        All multiples, or the odd ones only, whose even neighbours then show nonlinearity.
+    crest_iterations : int
+        Iterations that lower the crest factor; some 100 go far.
+    seed : int or numpy.random.Generator
+        Source of random phases.
+    amplitude_is : {"peak", "rms"}
+        What `amplitude` means.
+
+    Returns
+    -------
+    ndarray, shape (n_samples,), unit of `amplitude`
+        The multisine.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range, or no line falls into the band.
+    """
+    checked(n_samples, rate_hz)
+    low, high = checked_band(band, rate_hz)
+    if periods < 1 or n_samples % periods or crest_iterations < 0:
+        raise AmbidError(
+            f"multisine of {n_samples} samples in {periods} periods with {crest_iterations} iterations; periods "
+            f"must divide the samples and "
+            "iterations not be negative. Give other numbers"
+        )
+    period = n_samples // periods
+    numbers = _line_numbers(period, rate_hz, low, high, lines)
+    size = _amplitudes(numbers, shape)
+    if phases == "random":
+        angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, numbers.size)
+    elif phases == "schroeder":
+        angle = schroeder_phases(size)
+    else:
+        raise AmbidError(f"multisine phases {phases!r}; they must be 'random' or 'schroeder'. Give one of them")
+    x = _flattened(period, numbers, size, angle, crest_iterations)
+    return np.tile(scaled(x, amplitude, amplitude_is), periods)
+
+
+def schroeder_phases(size: Array) -> Array:
+    """Return Schroeder's phases for lines of the given amplitudes (equally spaced in frequency).
+
+    Parameters
+    ----------
+    size : ndarray, shape (n_lines,), any unit
+        Amplitudes of the lines, in order of frequency.
+
+    Returns
+    -------
+    ndarray, shape (n_lines,), rad
+        φ_k = -2π Σ_{j<k} (k - j) p_j with p_j = size_j²/Σ size² (Schroeder 1970).
+    """
+    share = size**2 / np.sum(size**2)
+    # Σ_{j<k} (k - j) p_j is the running sum of the running sum of p, one line late.
+    twice = np.cumsum(np.cumsum(share))
+    phases: Array = -2.0 * np.pi * np.concatenate(([0.0], twice[:-1]))
+    return phases
+
+
+def crest_factor(x: Array) -> float:
+    """Return the crest factor max|x|/rms(x).
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,), any unit
+        Samples, not all zero.
+
+    Returns
+    -------
+    float
+        Dimensionless, at least 1; √2 for a sine.
+
+    Raises
+    ------
+    AmbidError
+        If all samples are zero.
+    """
+    rms = float(np.sqrt(np.mean(np.square(x))))
+    if rms == 0.0:
+        raise AmbidError("the crest factor of a signal that is zero throughout does not exist. Pass an excitation")
+    return float(np.max(np.abs(x))) / rms
+
+
+def _line_numbers(period: int, rate_hz: float, low: float, high: float, lines: str) -> np.ndarray:
+    spacing = rate_hz / period
+    # A band end that is meant to be a line (1 Hz at 1 Hz spacing) must not miss it by round-off.
+    first = max(1, int(np.ceil(low / spacing - 1e-9)))
+    last = min((period - 1) // 2, int(np.floor(high / spacing + 1e-9)))
+    if lines not in ("all", "odd"):
+        raise AmbidError(f"multisine lines {lines!r}; they must be 'all' or 'odd'. Give one of them")
+    numbers = np.arange(first, last + 1)
+    numbers = numbers if lines == "all" else numbers[numbers % 2 == 1]
+    if not numbers.size:
+        raise AmbidError(
+            f"a multisine with lines every {spacing:g} Hz has none ({lines}) between {low:g} and {high:g} Hz. "
+            "Widen the band, or make the period longer"
+        )
+    return numbers
+
+
+def _amplitudes(numbers: np.ndarray, shape: str) -> Array:
+    if shape == "flat":
+        return np.ones(numbers.size)
+    if shape == "pink":
+        return 1.0 / np.sqrt(numbers.astype(np.float64))
+    raise AmbidError(f"multisine shape {shape!r}; it must be 'flat' or 'pink'. Give one of them")
+
+
+def _flattened(period: int, numbers: np.ndarray, size: Array, angle: Array, iterations: int) -> Array:
+    """Return one period with the phases `angle`, after `iterations` rounds of clipping that change the phases only."""
+
+    def wave(phases: Array) -> Array:
+        spectrum = np.zeros(period // 2 + 1, dtype=complex)
+        spectrum[numbers] = size * np.exp(1j * phases)
+        return np.asarray(np.fft.irfft(spectrum, period), dtype=np.float64)
+
+    x: Array = wave(angle)
+    best: Array = x
+    for k in range(iterations):
+        # Clip little at first and less later: hard clipping moves the phases too far to settle.
+        limit = (0.85 + 0.14 * k / iterations) * np.max(np.abs(x))
+        angle = np.angle(np.fft.rfft(np.clip(x, -limit, limit))[numbers])
+        x = wave(angle)
+        if np.max(np.abs(x)) < np.max(np.abs(best)):
+            best = x
+    return best
 
 
 def _prbs_in_band(

@@ -13,10 +13,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.signals._joint import FEEDBACK, checked, labels, ratio, weak_inputs
-from ambid.signals.frf import Complex, FrequencyResponse, Hold
+from ambid.signals.response import FrequencyResponse, Hold
 
 _CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
 _WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1

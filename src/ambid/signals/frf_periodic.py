@@ -8,18 +8,357 @@ excitation leaves out show it (`Distortions`). Inputs are as noisy as outputs he
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals._distortion import at_excited, detected, distortions
-from ambid.signals._joint import FEEDBACK, checked, labels, right_inverse
-from ambid.signals._periodicity import Lines, excited_lines, find_period, transient_ratio, without_strays
-from ambid.signals._realisations import Found, Spectra, over_realisations
-from ambid.signals.frf import Complex, FrequencyResponse, Hold
+from ambid.signals._joint import FEEDBACK, checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
+from ambid.signals.conditioning import runs
+from ambid.signals.response import FrequencyResponse, Hold
+
+Lines = NDArray[np.intp]
+_LARGEST_GAP_FROM = 1e-3  # of the largest line: no line under it counts as excited
+
+
+def find_period(x: Array) -> int:
+    """Find the period of an excitation: the smallest shift under which it comes back.
+
+    The mean square difference d(τ) between the signal and itself τ later, over that of unrelated stretches, is 0 at
+    the period (noise over total power with noise). The first local minimum that is nearly as deep as the deepest,
+    after d has once risen over a half, is taken.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,) or (n_samples, n_channels), any unit
+        Excitation, at least a period and a thirty-second of one.
+
+    Returns
+    -------
+    int
+        Period in samples.
+
+    Raises
+    ------
+    EstimationError
+        If nothing comes back.
+    """
+    x = x[:, None] if x.ndim == 1 else x
+    d = np.mean([_differences(column) for column in x.T], axis=0)
+    risen = int(np.argmax(d > 0.5)) if np.any(d > 0.5) else d.size
+    low = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] <= d[2:])) + 1 if d.size > 2 else np.zeros(0, dtype=np.intp)
+    low = low[low > risen]
+    if not low.size or d[low].min() > 0.3:
+        raise EstimationError(
+            f"no period found in {x.shape[0]} samples of the excitation; a period and a part of the next must be in "
+            "it. Give the period, or use the local or the random method (--method)"
+        )
+    deepest = float(d[low].min())
+    # A multiple of the period is as deep but for noise: the first that is not clearly shallower is the period.
+    return int(low[np.argmax(d[low] <= 2.0 * deepest + 1e-3)])
+
+
+def find_experiments(x: Array, *, quiet: int = 50, margin: int = 0) -> tuple[slice, ...]:
+    """Find the experiments of a record: stretches of excitation between rests, at least as long as a rest.
+
+    A rest is a stretch in which no channel leaves a band of 2 % of its largest deviation.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples,) or (n_samples, n_channels), any unit
+        Excitation.
+    quiet : int
+        Least samples of a rest.
+    margin : int
+        Samples left out at the end of each experiment, where the excitation fades through its filter and is no longer
+        periodic.
+
+    Returns
+    -------
+    tuple of slice
+        Samples of each experiment, in order.
+
+    Raises
+    ------
+    EstimationError
+        If the signal rests all the time.
+    """
+    x = x[:, None] if x.ndim == 1 else x
+    level = np.median(x, axis=0)
+    for _ in range(2):  # the median of an excitation is not its rest: refine on the quiet samples
+        size = np.max(np.abs(x - level), axis=0)
+        calm = np.all(np.abs(x - level) <= 0.02 * size, axis=1)
+        starts, lengths = runs(calm)
+        rests = [(s, s + n) for s, n in zip(starts, lengths, strict=True) if n >= quiet]
+        if rests:
+            level = np.median(np.concatenate([x[a:b] for a, b in rests]), axis=0)
+    if not np.all(size > 0) or sum(b - a for a, b in rests) == x.shape[0]:
+        raise EstimationError("the excitation rests all the time; there is no experiment in it. Pass the driven signal")
+    edges = [0, *(edge for rest in rests for edge in rest), x.shape[0]]
+    both = zip(edges[::2], edges[1::2], strict=True)
+    return tuple(slice(int(a), int(b) - margin) for a, b in both if b - a >= quiet + margin)
+
+
+def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
+    """Return the excited lines of spectra `mean` (n_experiments, n_lines, n_channels), and whether a gap shows them.
+
+    The lines are those over the largest gap in the sorted amplitudes, of 12 dB at least; without such a gap all that
+    are within 60 dB of the largest and 10 dB over their own noise power `noise` (n_lines,).
+    """
+    power = np.sum(np.abs(mean) ** 2, axis=(0, 2))
+    if not np.any(power > 0):
+        raise EstimationError("the excitation has no power at any line of the period. Check the period")
+    level = np.log(np.maximum(power, np.finfo(float).tiny))
+    order = np.argsort(level)[::-1]
+    high = int(np.sum(power > power.max() * _LARGEST_GAP_FROM**2))
+    falls = level[order[:-1]] - level[order[1:]]
+    last = int(np.argmax(falls[:high])) if falls.size else 0
+    clear = bool(falls.size and falls[:high].max() > np.log(10.0**1.2))
+    lines = np.sort(order[: last + 1]) if clear else np.sort(order[:high])
+    if not clear and noise is not None:
+        lines = lines[power[lines] > 10.0 * noise[lines]]
+        if not lines.size:
+            raise EstimationError("no line of the excitation stands 10 dB above its noise. Average more periods")
+    return lines, clear
+
+
+def without_strays(lines: Lines) -> tuple[Lines, Lines]:
+    """Return excited lines and strays: even lines among an odd excitation (under 5 % of all), such as mains hum."""
+    odd = (lines + 1) % 2 == 1
+    if 0 < np.sum(~odd) < 0.05 * lines.size:
+        return lines[odd], lines[~odd]
+    return lines, lines[:0]
+
+
+def transient_ratio(periods: Array) -> float:
+    """Return how many standard deviations the first of P >= 3 periods (P, n, n_z) differs more than noise allows.
+
+    Its mean square distance from the mean of the others is compared with theirs; the number of independent samples is
+    that of the noise spectrum, (Σ S)²/Σ S². The worst channel counts.
+    """
+    count = periods.shape[0]
+    rest = periods[1:]
+    noise = np.fft.rfft(rest - rest.mean(axis=0), axis=1)[:, 1:]
+    S = np.mean(np.abs(noise) ** 2, axis=0) * (count - 1) / (count - 2)
+    first = np.fft.rfft(periods[0] - rest.mean(axis=0), axis=0)[1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = np.sum(np.abs(first) ** 2, axis=0) / np.sum(S, axis=0) / (1.0 + 1.0 / (count - 1))
+        lines = np.sum(S, axis=0) ** 2 / np.sum(S**2, axis=0)
+        sd = np.sqrt((1.0 + 1.0 / (count - 2)) / np.maximum(lines, 1.0))
+    # Without noise, round-off is not a transient.
+    size = np.sqrt(np.mean(np.square(periods), axis=(0, 1)))
+    exact = np.sqrt(np.mean(np.square(periods[0] - rest.mean(axis=0)), axis=0)) < 1e-9 * size
+    return float(np.max(np.where(exact | ~np.isfinite(found), 0.0, (found - 1.0) / sd)))
+
+
+def _differences(x: Array) -> Array:
+    """Return d(τ), 0 for equal and 1 for unrelated stretches, 1 where too little is left to compare.
+
+    Enough is a whole τ, or a thirty-second of it that holds 16 independent samples, (Σ S)²/Σ S² in the whole record.
+    """
+    x = x - x.mean()
+    n = x.size
+    size = 1 << (2 * n - 1).bit_length()
+    F = np.fft.rfft(x, size)
+    products = np.fft.irfft(np.abs(F) ** 2, size)[:n]
+    energy = np.concatenate(([0.0], np.cumsum(x**2)))
+    shifts = np.arange(n)
+    both = energy[n - shifts] + energy[n] - energy[shifts]
+    d = np.divide(both - 2.0 * products, both, out=np.ones(n), where=both > 1e-12 * energy[n])
+    S = np.abs(F[1:]) ** 2
+    independent = float(np.sum(S) ** 2 / np.sum(S**2)) * 2.0 / size
+    left = n - shifts
+    enough = (left >= shifts) | ((left >= shifts / 32) & (left * independent >= 16))
+    return np.asarray(np.where(enough, d, 1.0))
+
+
+_POOLED = 6  # detection lines averaged around each excited line
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Distortions:
+    """Output levels at detection lines, each the rms of the sine at that line (mean over experiments).
+
+    Levels hold noise too; compare them with the noise beside them.
+
+    Attributes
+    ----------
+    even_hz : ndarray, shape (n_even,), Hz
+        Even lines without excitation, between the lowest and the highest excited line.
+    even : ndarray, shape (n_even, n_y), output units
+        Level there.
+    even_noise : ndarray, shape (n_even, n_y), or None
+        Part of it that differs between periods; None with one period.
+    odd_hz : ndarray, shape (n_odd,), Hz
+        Odd lines without excitation.
+    odd : ndarray, shape (n_odd, n_y), output units
+        Level there.
+    odd_noise : ndarray, shape (n_odd, n_y), or None
+        Part of it that differs between periods.
+    signal : ndarray, shape (n_f, n_y), output units
+        Level at the excited lines.
+    """
+
+    even_hz: Array
+    even: Array
+    even_noise: Array | None
+    odd_hz: Array
+    odd: Array
+    odd_noise: Array | None
+    signal: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Detection:
+    """Output power matrices at detection lines: `lines` (n_d,) from 0, `power` and `noise` (n_d, n_y, n_y)."""
+
+    lines: Lines
+    power: Complex
+    noise: Complex | None
+    n_experiments: int
+
+    def of_parity(self, odd: bool) -> Detection:
+        """Return the odd, or the even, multiples of the lowest line."""
+        keep = (self.lines + 1) % 2 == odd
+        noise = None if self.noise is None else self.noise[keep]
+        return Detection(lines=self.lines[keep], power=self.power[keep], noise=noise, n_experiments=self.n_experiments)
+
+
+def detected(Z: Complex, noise: Complex | None, G: Complex, excited: Lines) -> Detection:
+    """Return what the output does at lines without excitation, less the response to the input there.
+
+    `Z` (n_experiments, n_lines, n_y + 1) mean spectra, `noise` (n_experiments, n_lines, n_y + 1, n_y + 1) of them,
+    `G` (n_f, n_y, 1) at the lines `excited`.
+    """
+    n_y = G.shape[1]
+    inside = np.arange(excited[0], excited[-1] + 1)
+    lines = np.setdiff1d(inside, excited)
+    between = np.stack([np.interp(lines, excited, G[:, i, 0]) for i in range(n_y)], axis=1)
+    left = np.concatenate([np.broadcast_to(np.eye(n_y), (lines.size, n_y, n_y)), -between[:, :, None]], axis=2)
+    v = np.einsum("fyz,efz->efy", left, Z[:, lines])
+    power = np.einsum("efi,efj->fij", v, v.conj()) / Z.shape[0]
+    of_noise = None if noise is None else left @ noise[:, lines].mean(axis=0) @ np.conj(np.swapaxes(left, 1, 2))
+    return Detection(lines=lines, power=power, noise=of_noise, n_experiments=Z.shape[0])
+
+
+def distortions(detection: Detection, spacing_hz: float, signal: Complex) -> Distortions:
+    """Return the levels by parity; `signal` (n_experiments, n_f, n_y) are the outputs at the excited lines."""
+    even, odd = detection.of_parity(False), detection.of_parity(True)
+    return Distortions(
+        even_hz=np.asarray((even.lines + 1) * spacing_hz, dtype=np.float64),
+        even=_rms(even.power),
+        even_noise=None if even.noise is None else _rms(even.noise),
+        odd_hz=np.asarray((odd.lines + 1) * spacing_hz, dtype=np.float64),
+        odd=_rms(odd.power),
+        odd_noise=None if odd.noise is None else _rms(odd.noise),
+        signal=np.sqrt(2.0 * np.mean(np.abs(signal) ** 2, axis=0)),
+    )
+
+
+def at_excited(detection: Detection, excited: Lines) -> tuple[Complex, float] | None:
+    """Return the distortion's covariance of the output at the excited lines and its degrees of freedom.
+
+    The mean over the nearest detection lines that share the parity of the excitation, less the noise there, with
+    negative parts (noise that scatters) at 0. None where there are no such lines.
+    """
+    odd_only = bool(np.all((excited + 1) % 2 == 1))
+    used = detection.of_parity(True) if odd_only else detection
+    if not used.lines.size:
+        return None
+    pooled = min(_POOLED, used.lines.size)
+    found = used.power if used.noise is None else used.power - used.noise
+    first = np.searchsorted(used.lines, excited) - pooled // 2
+    nearest = np.clip(first, 0, used.lines.size - pooled)[:, None] + np.arange(pooled)
+    level, vectors = np.linalg.eigh(found[nearest].mean(axis=1))
+    covariance = (vectors * np.maximum(level, 0.0)[:, None, :]) @ np.conj(np.swapaxes(vectors, 1, 2))
+    return covariance, 2.0 * pooled * used.n_experiments
+
+
+def _rms(power: Complex) -> Array:
+    return np.asarray(np.sqrt(2.0 * np.maximum(np.real(np.diagonal(power, axis1=1, axis2=2)), 0.0)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spectra:
+    """Mean spectra at lines 1, 2, … under half the rate: `Z` = [Y; U] (n_lines, n_z) and `R`; covariance of `Z`."""
+
+    Z: Complex
+    R: Complex | None
+    noise: Complex | None
+    n_periods: int
+    dropped: int
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """G at the excited lines, its covariance by noise alone, and by the scatter of realisations (None with one)."""
+
+    G: Complex
+    noise: Complex | None
+    total: Complex | None
+    warnings: tuple[str, ...]
+
+
+def over_realisations(spectra: list[Spectra], excited: Lines, n_y: int, n_u: int) -> Found:
+    """Return G over all realisations: averaged as ratios, or with a reference as responses to it."""
+    groups = [spectra[m : m + n_u] for m in range(0, len(spectra), n_u)]
+    Z = np.stack([np.stack([s.Z[excited] for s in g], axis=2) for g in groups])
+    C = None if any(s.noise is None for s in spectra) else np.stack([_block_noise(g, excited) for g in groups])
+    R = [s.R[excited] for s in spectra if s.R is not None]
+    if not R:
+        return _mean_of_ratios(Z, C, n_y)
+    return _ratio_of_means(Z, C, np.stack(R).reshape(len(groups), n_u, *R[0].shape).transpose(0, 2, 3, 1), n_y)
+
+
+def _mean_of_ratios(Z: Complex, C: Complex | None, n_y: int) -> Found:
+    M, n_f = Z.shape[:2]
+    each = [ratio_map(z, n_y) for z in Z]
+    G = np.stack([g for g, _ in each])
+    weak: list[str] = []
+    noise = None
+    if C is not None:
+        noise = np.sum([transformed(c, T) for c, (_, T) in zip(C, each, strict=True)], axis=0) / M**2
+        weak = [w for z, c in zip(Z, C, strict=True) for w in weak_inputs(z, c, n_y)]
+    total = scatter(G.reshape(M, n_f, -1)) / M if M > 1 else None
+    return Found(G=G.mean(axis=0), noise=noise, total=total, warnings=tuple(weak[:1]))
+
+
+def _ratio_of_means(Z: Complex, C: Complex | None, R: Complex, n_y: int) -> Found:
+    """Return the ratio of the mean responses Z R⁻¹ to the reference; `Z` (M, n_f, n_z, n_u), `R` (M, n_f, n_u, n_u)."""
+    M, n_f, n_z, n_u = Z.shape
+    inverse = np.stack([right_inverse(x) for x in R])
+    responses = Z @ inverse
+    mean = responses.mean(axis=0)
+    G, T = ratio_map(mean, n_y)
+    of_noise = None
+    if C is not None:
+        by_r = np.eye(n_z)[:, None, :, None] * np.swapaxes(inverse, 2, 3)[:, :, None, :, None, :]
+        of_noise = transformed(C, by_r.reshape(M, n_f, n_z * n_u, n_z * n_u)).sum(axis=0) / M**2
+    of_all = scatter(responses.reshape(M, n_f, -1)) / M if M > 1 else None
+    known = of_noise if of_all is None else of_all
+    return Found(
+        G=G,
+        noise=None if of_noise is None else transformed(of_noise, T),
+        total=None if of_all is None else transformed(of_all, T),
+        warnings=() if known is None else weak_inputs(mean, known, n_y),
+    )
+
+
+def _block_noise(group: list[Spectra], excited: Lines) -> Complex:
+    """Return the covariance of vec(Z), Z (n_z, n_u) with a column of each experiment: noise is independent between."""
+    n_u = len(group)
+    C = [s.noise[excited] for s in group if s.noise is not None]
+    n_f, n_z = C[0].shape[:2]
+    blocks = np.zeros((n_f, n_z, n_u, n_z, n_u), dtype=complex)
+    for e, c in enumerate(C):
+        blocks[:, :, e, :, e] = c
+    return blocks.reshape(n_f, n_z * n_u, n_z * n_u)
+
 
 _TRANSIENT = 6.0  # standard deviations that the first period may differ from the others
 

@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.signals._joint import FEEDBACK, checked, labels, product_covariance, ratio, weak_inputs
-from ambid.signals.frf import Complex, FrequencyResponse, Hold
+from ambid.signals.response import FrequencyResponse, Hold
 from ambid.signals.spectra import CrossSpectra, cross_spectra
 
 Kind = Literal["h1", "h2", "hv"]

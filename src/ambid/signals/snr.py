@@ -10,8 +10,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.record import Record
-from ambid.signals._channels import finite
-from ambid.signals._regression import fit_arx
+from ambid.signals.conditioning import finite
+from ambid.signals.delay import fit_arx
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.signals.lagged import lagged_triangle
+from ambid.signals.delay import lagged_triangle
 
 Bounds = Mapping[str, tuple[int, int]]
 

@@ -12,9 +12,7 @@ from ambid.bearing.uncertainty import Uncertainty
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit
 from ambid.record import Record
-from ambid.signals.dropouts import find_dropouts
-from ambid.signals.outliers import find_outliers
-from ambid.signals.saturation import find_saturation
+from ambid.signals.faults import find_dropouts, find_outliers, find_saturation
 from ambid.validate.agreement import Agreement
 from ambid.validate.plausibility import implausible
 from ambid.validate.residuals import P_LEAST, ResidualTest, residuals_uncorrelated, residuals_white

@@ -22,7 +22,7 @@ from ambid.errors import EstimationError, nearest
 from ambid.estimation.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 MAX_DELAY = 6  # samples, searched when the delay is "auto"
 _KEPT = 6  # starts that are searched a little way

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 

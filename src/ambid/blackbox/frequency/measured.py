@@ -21,7 +21,7 @@ from ambid.blackbox.state_space import StateSpaceModel
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import StateSpace
 from ambid.physics.models import model as physical_model
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 

@@ -8,7 +8,7 @@ from typing import Any
 from ambid.blackbox.fit_file import fit_to_json
 from ambid.blackbox.frequency.measured import Measured
 from ambid.estimation.documents import covariance_together, fields_json, plain_json
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 SCHEMA = "ambid.frf/1"
 

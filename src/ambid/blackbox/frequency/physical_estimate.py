@@ -16,7 +16,7 @@ from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParamet
 from ambid.estimation.linear import directions
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.parameters import Parameter
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 _NORMAL_95 = 1.959963984540054
 

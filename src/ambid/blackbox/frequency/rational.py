@@ -25,7 +25,7 @@ from ambid.blackbox.response import Offsets
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.threads import one_thread
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 

@@ -13,7 +13,7 @@ from ambid.blackbox.model import BlackBoxModel
 from ambid.blackbox.orders import UsedOrders
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 
 def made_from_lines(

@@ -26,7 +26,7 @@ from ambid.blackbox.response import Offsets
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.errors import EstimationError
 from ambid.estimation.threads import one_thread
-from ambid.signals.frf import FrequencyResponse
+from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 

@@ -16,7 +16,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.kernels import state_scan
-from ambid.signals.lagged import lagged_triangle
+from ambid.signals.delay import lagged_triangle
 
 _HIGHEST = 16  # lags of the autoregression that are looked at
 _FORGOTTEN = 1e-6  # of an impulse response, where it is cut

@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.nonparametric.kernels import SHAPES, Kernel, kernel_matrix, kernel_root
-from ambid.signals.lagged import lagged_triangle
+from ambid.signals.delay import lagged_triangle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

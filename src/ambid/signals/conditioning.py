@@ -1,0 +1,420 @@
+"""Steps on a record before it is used: cut, scale, replace samples, remove offset and trend, filter, resample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import RecordError
+from ambid.record.record import Record, Step
+
+
+def chosen(record: Record, names: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Return the channels meant by `names` (all of them for None), each looked up."""
+    if names is None:
+        return record.names
+    listed = (names,) if isinstance(names, str) else tuple(names)
+    if not listed:
+        raise RecordError("the list of channels is empty; a step works on at least one. Name a channel, or pass None")
+    return tuple(record.channel(n).name for n in listed)
+
+
+def finite(record: Record, name: str) -> Array:
+    """Return the channel's values, refusing NaN and infinity: every filter would spread them over the record."""
+    values = record[name]
+    bad = ~np.isfinite(values)
+    if bad.any():
+        first = int(np.argmax(bad))
+        raise RecordError(
+            f"channel {name!r} is not finite at sample {first} ({values[first]}), {int(bad.sum())} samples in all; "
+            "numbers are needed. Repair them with replace_samples, or cut them off"
+        )
+    return values
+
+
+def mapped(record: Record, names: Sequence[str], step: Step, function: Callable[[Array], Array]) -> Record:
+    """Return the record with `function` applied to the named channels, and `step` in its history."""
+    channels = tuple(
+        replace(c, values=function(finite(record, c.name))) if c.name in names else c for c in record.channels
+    )
+    return record.with_step(step, channels=channels)
+
+
+def runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and lengths of the runs of True in a boolean array, shape (n_runs,) each."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
+    return edges[::2], edges[1::2] - edges[::2]
+
+
+def equal_runs(values: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts and lengths of the runs of exactly equal samples that make up `values`."""
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(values)) + 1))
+    return starts, np.diff(np.concatenate((starts, [values.size])))
+
+
+# Sampling instants that are given as decimals (2.0 s at 1 kHz) miss the grid by round-off; a thousandth of a sample is
+# none.
+_GRID_TOLERANCE = 1e-3
+
+
+def cut(record: Record, from_s: float | None = None, to_s: float | None = None) -> Record:
+    """Keep the samples with from_s <= t < to_s, on the record's own time axis.
+
+    Parameters
+    ----------
+    record : Record
+        The record to cut.
+    from_s, to_s : float, optional
+        Ends in s; the record's own by default.
+
+    Returns
+    -------
+    Record
+        A new record, whose `start_s` is the time of its first sample, with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If an end lies outside the record, or nothing would be left.
+    """
+    begin, end = record.start_s, record.start_s + record.duration_s
+    first_s = begin if from_s is None else float(from_s)
+    last_s = end if to_s is None else float(to_s)
+    slack = _GRID_TOLERANCE / record.rate_hz
+    for label, t in (("from", first_s), ("to", last_s)):
+        if not begin - slack <= t <= end + slack:
+            raise RecordError(f"cut {label} {t:g} s; the record spans {begin:g} to {end:g} s. Give a time inside it")
+    first = math.ceil((first_s - begin) * record.rate_hz - _GRID_TOLERANCE)
+    last = math.ceil((last_s - begin) * record.rate_hz - _GRID_TOLERANCE)
+    if last <= first:
+        raise RecordError(
+            f"cut from {first_s:g} to {last_s:g} s keeps no sample; from must lie before to. Swap or widen them"
+        )
+    first, last = max(first, 0), min(last, record.n_samples)
+    channels = tuple(replace(c, values=c.values[first:last].copy()) for c in record.channels)
+    step = Step(name="cut", settings={"from_s": first_s, "to_s": last_s, "samples": last - first})
+    return record.with_step(step, channels=channels, start_s=begin + first / record.rate_hz)
+
+
+def scale(record: Record, name: str, gain: float, *, offset: float = 0.0, unit: str | None = None) -> Record:
+    """Replace a channel's values by gain·values + offset.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    name : str
+        Channel.
+    gain : float
+        Factor, in new unit per old unit; not zero.
+    offset : float
+        Added after the factor, in the new unit.
+    unit : str, optional
+        SI unit of the result; unchanged by default.
+
+    Returns
+    -------
+    Record
+        A new record with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If the channel does not exist, or gain or offset is not a usable number.
+    """
+    old = record.channel(name)
+    if not (math.isfinite(gain) and gain != 0.0 and math.isfinite(offset)):
+        raise RecordError(
+            f"scale of channel {name!r} by gain {gain} and offset {offset}; both must be finite and the gain not "
+            f"0. Give other numbers"
+        )
+    new = replace(old, values=gain * old.values + offset, unit=old.unit if unit is None else unit)
+    settings = {"channel": name, "gain": float(gain), "offset": float(offset), "unit": new.unit}
+    return record.with_step(
+        Step(name="scale", settings=settings), channels=tuple(new if c is old else c for c in record.channels)
+    )
+
+
+def replace_samples(record: Record, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Record:
+    """Replace samples by linear interpolation between the nearest samples that are kept; the ends hold the nearest one.
+
+    Nothing calls this by itself: finding a bad sample and replacing it are separate decisions.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    name : str
+        Channel.
+    indices : sequence of int
+        Samples to replace, 0 to n_samples - 1, e.g. ``find_outliers(record, name).indices``. None of them leaves the
+        record as it is.
+
+    Returns
+    -------
+    Record
+        A new record; its history names the channel, the number of samples and the first one.
+
+    Raises
+    ------
+    RecordError
+        If an index is outside the record, all samples would be replaced, or a kept one is not finite.
+    """
+    old = record.channel(name)
+    which = np.unique(np.asarray(indices, dtype=np.intp))
+    if which.size == 0:
+        return record
+    if which[0] < 0 or which[-1] >= old.values.size:
+        outside = int(which[0] if which[0] < 0 else which[-1])
+        raise RecordError(
+            f"replace sample {outside} of channel {name!r}; samples run from 0 to {old.values.size - 1}. Give "
+            f"indices inside"
+        )
+    kept = np.setdiff1d(np.arange(old.values.size), which, assume_unique=True)
+    if kept.size == 0:
+        raise RecordError(
+            f"all samples of channel {name!r} would be replaced; none is left to interpolate from. Drop it"
+        )
+    if not np.isfinite(old.values[kept]).all():
+        bad = int(kept[~np.isfinite(old.values[kept])][0])
+        raise RecordError(f"sample {bad} of channel {name!r} is kept but not finite; add it to the samples to replace")
+    values = old.values.copy()
+    values[which] = np.interp(which, kept, old.values[kept])
+    settings = {
+        "channel": name,
+        "samples": int(which.size),
+        "first_s": record.start_s + int(which[0]) / record.rate_hz,
+        "method": "linear",
+    }
+    return record.with_step(
+        Step(name="replace_samples", settings=settings),
+        channels=tuple(replace(c, values=values) if c is old else c for c in record.channels),
+    )
+
+
+def remove_offset(record: Record, names: str | Sequence[str] | None = None) -> Record:
+    """Subtract each channel's mean.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    names : str or sequence of str, optional
+        Channels; all of them by default.
+
+    Returns
+    -------
+    Record
+        A new record; its history holds the removed means, in each channel's unit.
+
+    Raises
+    ------
+    RecordError
+        If a channel does not exist or holds a value that is not finite.
+    """
+    which = chosen(record, names)
+    means = {n: float(np.mean(finite(record, n))) for n in which}
+    return mapped(record, which, Step(name="remove_offset", settings=means), lambda x: x - np.mean(x))
+
+
+def remove_trend(
+    record: Record,
+    names: str | Sequence[str] | None = None,
+    *,
+    degree: int | None = None,
+    highpass_hz: float | None = None,
+) -> Record:
+    """Remove a low-frequency trend: a polynomial in time, or everything under a high-pass corner.
+
+    The same removal belongs on the input and the output of an identification: a high-pass on one of them only is read
+    as dynamics of the plant. A high-pass also removes the low frequencies that tell the displacement stiffness k_x.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    names : str or sequence of str, optional
+        Channels; all of them by default.
+    degree : int, optional
+        Degree of the least-squares polynomial; 1 (a straight line, with the offset) unless `highpass_hz` is given.
+    highpass_hz : float, optional
+        Corner in Hz of a zero-phase high-pass (second-order Butterworth, forwards and backwards, -6 dB at the corner).
+
+    Returns
+    -------
+    Record
+        A new record with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If both ways are asked for, the degree or corner is out of range, or a channel cannot be used.
+    """
+    which = chosen(record, names)
+    if highpass_hz is not None:
+        if degree is not None:
+            raise RecordError(
+                "remove_trend got degree and highpass_hz; it does one of the two. Give one, or call twice"
+            )
+        corner = float(highpass_hz)
+        step = Step(name="remove_trend", settings={"channels": list(which), "highpass_hz": corner})
+        return mapped(record, which, step, lambda x: zero_phase(x, record.rate_hz, corner, kind="highpass", order=2))
+    degree = 1 if degree is None else degree
+    if not 0 <= degree < min(20, record.n_samples):
+        raise RecordError(
+            f"remove_trend got degree {degree} for {record.n_samples} samples; it must be 0 to 19 and under the "
+            f"number of samples. "
+            "Give a lower degree, or highpass_hz"
+        )
+    step = Step(name="remove_trend", settings={"channels": list(which), "degree": degree})
+    return mapped(record, which, step, lambda x: x - polynomial_trend(x, degree))
+
+
+def polynomial_trend(x: Array, degree: int) -> Array:
+    """Return the least-squares polynomial through equally spaced samples.
+
+    `x`: (n_samples,), any unit, samples; `degree`: degree of the polynomial. Returns (n_samples,), unit of `x`, the
+    polynomial at the sampling instants.
+    """
+    # Legendre polynomials on [-1, 1]: nearly orthogonal, so that the problem stays well conditioned at any length.
+    basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, x.size), degree)
+    coefficients = np.linalg.lstsq(basis, x, rcond=None)[0]
+    trend: Array = basis @ coefficients
+    return trend
+
+
+def lowpass(record: Record, cutoff_hz: float, names: str | Sequence[str] | None = None, *, order: int = 4) -> Record:
+    """Low-pass channels forwards and backwards, so that nothing is delayed.
+
+    The same filter goes over all channels unless some are named. Filtering the input and the output of an
+    identification differently puts the ratio of the filters into the identified plant; filtering both alike leaves the
+    plant as it is and only weights the frequencies (Ljung 1999, sec. 14.4). A zero-phase filter looks ahead: it is for
+    records, not for control, and an estimator that models its noise (grey-box, ARMAX) is better fed the raw record.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    cutoff_hz : float
+        Frequency in Hz where the two passes together give -6 dB.
+    names : str or sequence of str, optional
+        Channels; all of them by default.
+    order : int
+        Order of the Butterworth filter of one pass, 1 to 12.
+
+    Returns
+    -------
+    Record
+        A new record with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If the cutoff is not between 0 and half the rate, the order is out of range or the record is too short.
+    """
+    which = chosen(record, names)
+    step = Step(name="lowpass", settings={"channels": list(which), "cutoff_hz": float(cutoff_hz), "order": order})
+    return mapped(
+        record, which, step, lambda x: zero_phase(x, record.rate_hz, float(cutoff_hz), kind="lowpass", order=order)
+    )
+
+
+def zero_phase(
+    x: Array, rate_hz: float, corner_hz: float, *, kind: Literal["lowpass", "highpass"], order: int
+) -> Array:
+    """Filter forwards and backwards with a Butterworth filter in second-order sections.
+
+    `x`: (n_samples,), any unit, samples; `rate_hz`: sampling rate in Hz; `corner_hz`: frequency in Hz where the two
+    passes together give -6 dB; `kind`: what passes; `order`: order of one pass, 1 to 12. Returns (n_samples,), unit of
+    `x`, filtered samples, not delayed.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    if not 0.0 < corner_hz < rate_hz / 2:
+        raise RecordError(
+            f"{kind} corner {corner_hz:g} Hz at a rate of {rate_hz:g} Hz; it must lie between 0 and half the rate "
+            f"({rate_hz / 2:g} Hz). Give another corner"
+        )
+    if not 1 <= order <= 12:
+        raise RecordError(f"{kind} order {order}; it must be 1 to 12. Give a lower order")
+    # The padding covers the filter's memory (about one period of the corner), or the ends would ring.
+    padding = max(6 * order, round(2 * rate_hz / corner_hz))
+    if kind == "highpass":
+        padding = min(padding, x.size - 1)
+    if x.size <= padding:
+        raise RecordError(
+            f"{x.size} samples are too few for a {kind} at {corner_hz:g} Hz and {rate_hz:g} Hz rate; it needs more "
+            f"than {padding}. "
+            "Use a longer record, or a higher corner"
+        )
+    sections = butter(order, corner_hz, btype=kind, fs=rate_hz, output="sos")
+    filtered: Array = np.ascontiguousarray(sosfiltfilt(sections, x, padlen=padding))
+    return filtered
+
+
+def resample(record: Record, rate_hz: float, *, allow_upsampling: bool = False) -> Record:
+    """Change the sampling rate of the whole record by a rational factor, with an anti-alias filter.
+
+    Polyphase linear-phase FIR (Kaiser window), compensated for its delay. A held input (steps, PRBS) is smeared over
+    the edges by the filter: identify at the measured rate where that matters.
+
+    Parameters
+    ----------
+    record : Record
+        The record to condition.
+    rate_hz : float
+        New rate in Hz; its ratio to the present one must be a fraction with terms up to 1000.
+    allow_upsampling : bool
+        A higher rate adds samples but no information and makes residuals coloured, so it has to be allowed explicitly.
+
+    Returns
+    -------
+    Record
+        A new record with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If the rate is not positive, higher without leave, or not a rational multiple.
+    """
+    if not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise RecordError(f"resample to {rate_hz} Hz; the rate must be a positive number of Hz. Give another rate")
+    if rate_hz > record.rate_hz and not allow_upsampling:
+        raise RecordError(
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz adds samples but no information. "
+            "Give a lower rate, or allow_upsampling=True"
+        )
+    ratio = Fraction(rate_hz / record.rate_hz).limit_denominator(1000)
+    if ratio == 0 or ratio.numerator > 1000 or abs(float(ratio) * record.rate_hz / rate_hz - 1.0) > 1e-9:
+        raise RecordError(
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz is no fraction with terms up to 1000. "
+            f"Give {float(ratio) * record.rate_hz:.10g} Hz or another multiple"
+        )
+    if record.n_samples * ratio < 2:
+        raise RecordError(f"resample to {rate_hz:g} Hz leaves less than two samples. Give a higher rate")
+    channels = tuple(replace(c, values=resampled(finite(record, c.name), ratio)) for c in record.channels)
+    step = Step(name="resample", settings={"from_hz": record.rate_hz, "to_hz": float(rate_hz), "ratio": str(ratio)})
+    return record.with_step(step, channels=channels, rate_hz=float(rate_hz))
+
+
+def resampled(x: Array, ratio: Fraction) -> Array:
+    """Change the rate of samples by a rational factor with a polyphase anti-alias filter.
+
+    `x`: (n_samples,), any unit, samples; `ratio`: new rate over old rate. Returns (ceil(n_samples * ratio), ), unit of
+    `x`, samples at the new rate, the first one at the same instant.
+    """
+    from scipy.signal import resample_poly
+
+    # Without the line through its ends the signal starts and ends at 0, as the filter assumes; and the line passes
+    # exactly.
+    slope = (x[-1] - x[0]) / max(x.size - 1, 1)
+    rest = resample_poly(x - (x[0] + slope * np.arange(x.size)), ratio.numerator, ratio.denominator)
+    values: Array = rest + x[0] + slope * np.arange(rest.size) / float(ratio)
+    return values

@@ -1,0 +1,594 @@
+"""What is wrong with samples: drop-outs, outliers, saturation, coarse quantisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import RecordError
+from ambid.record.record import Record
+from ambid.signals.conditioning import equal_runs, finite, runs
+from ambid.signals.delay import fit_arx
+
+_ZERO_JUMP = 8.0  # robust sd of the sample-to-sample change that a fall to zero has to exceed, going and coming
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dropouts:
+    """Stretches in which a channel stood still or fell to zero.
+
+    Attributes
+    ----------
+    channel : str
+        Channel looked at.
+    spans : tuple of (int, int)
+        First sample and number of samples of each stretch.
+    n_samples : int
+        Samples of the channel.
+    first_s : float or None
+        Time of the first one in s.
+    shortest : int
+        Number of equal samples in a row from which on quantisation and chance no longer explain them.
+    """
+
+    channel: str
+    spans: tuple[tuple[int, int], ...]
+    n_samples: int
+    first_s: float | None
+    shortest: int
+
+    @property
+    def count(self) -> int:
+        """Number of samples in all stretches."""
+        return sum(length for _, length in self.spans)
+
+    @property
+    def first_index(self) -> int | None:
+        """First sample of the first stretch, or None."""
+        return self.spans[0][0] if self.spans else None
+
+    @property
+    def fraction(self) -> float:
+        """Part of the channel's samples, 0 to 1."""
+        return self.count / self.n_samples
+
+    @property
+    def indices(self) -> np.ndarray:
+        """All samples concerned, for `replace_samples`, shape (count,)."""
+        return np.concatenate([np.arange(s, s + n) for s, n in self.spans] or [np.zeros(0, dtype=np.intp)])
+
+    def __str__(self) -> str:
+        if not self.spans:
+            return f"{self.channel}: no drop-outs"
+        if self.count == self.n_samples:
+            return f"{self.channel}: never changes over its {self.n_samples} samples (dead or unused)"
+        return (
+            f"{self.channel}: {self.count} samples ({100 * self.fraction:.2g} %) in {len(self.spans)} drop-out"
+            f"{'s' if len(self.spans) > 1 else ''}, the first at sample {self.first_index} ({self.first_s:.6g} s), "
+            f"the longest {max(n for _, n in self.spans)} samples"
+        )
+
+
+def find_dropouts(record: Record, name: str, *, false_alarm: float = 1e-4) -> Dropouts:
+    """Find stretches in which a channel stands still or falls to zero; nothing is replaced (see `replace_samples`).
+
+    Parameters
+    ----------
+    record : Record
+        The record to look at.
+    name : str
+        Channel.
+    false_alarm : float
+        Probability that a whole record without drop-outs gives one, if repeated samples came by chance at the
+        rate at which they come in this record. Steps and PRBS, which hold their levels all the time, therefore pass.
+
+    Returns
+    -------
+    Dropouts
+        The stretches, without those at a limit that `find_saturation` reports; all samples in one for a channel that
+        never changes. In a channel that moves without any noise (a simulated one) equal samples are taken as rest.
+
+    Raises
+    ------
+    RecordError
+        If the channel cannot be used or `false_alarm` is not between 0 and 1.
+    """
+    x = finite(record, name)
+    if not 0.0 < false_alarm < 1.0:
+        raise RecordError(f"find_dropouts got false_alarm {false_alarm}; it must lie between 0 and 1. Give e.g. 1e-4")
+    shortest = longest_chance_run(x, false_alarm) + 1
+    starts, lengths = equal_runs(x)
+    saturation = find_saturation(record, name)
+    limits = [limit.value for limit in (saturation.lower, saturation.upper) if limit]
+    still = _stands_still(x, starts, lengths, shortest) & ~np.isin(x[starts], limits)
+    marked = still | _falls_to_zero(x, starts)
+    spans = tuple((int(s), int(n)) for s, n in zip(starts[marked], lengths[marked], strict=True))
+    first = record.start_s + spans[0][0] / record.rate_hz if spans else None
+    return Dropouts(channel=name, spans=spans, n_samples=x.size, first_s=first, shortest=shortest)
+
+
+def longest_chance_run(x: Array, false_alarm: float = 1e-4) -> int:
+    """Return the longest run of equal samples that chance explains.
+
+    With p the probability that a sample repeats the one before it, a run of r samples begins at a given place with
+    probability p^(r-1); over n places it stays under `false_alarm` for r > 1 + log(false_alarm/n)/log(p).
+
+    `x`: (n_samples,), any unit, samples; `false_alarm`: probability over the whole record. Returns samples, at least 3;
+    n_samples - 1 at most, so that a channel that never changes is always one run too long.
+    """
+    p = 1.0 - equal_runs(x)[0].size / x.size
+    if p == 0.0 or x.size < 5:
+        return 3
+    return int(np.clip(np.ceil(1.0 + np.log(false_alarm / x.size) / np.log(p)), 3, x.size - 1))
+
+
+def _stands_still(x: Array, starts: np.ndarray, lengths: np.ndarray, shortest: int) -> np.ndarray:
+    """Runs too long for chance that are not the slow turning point of a quantised channel, nor rest without noise."""
+    if starts.size == 1:
+        return np.ones(1, dtype=bool)
+    if _without_noise(x):
+        return np.zeros(starts.size, dtype=bool)
+    changes = np.abs(np.diff(x[starts]))
+    jump = np.maximum(np.concatenate((changes, [0.0])), np.concatenate(([0.0], changes)))
+    # A turning point is entered and left by one quantum, and its neighbouring levels are held long as well.
+    padded = np.concatenate((np.full(2, np.nan), lengths.astype(np.float64), np.full(2, np.nan)))
+    around = np.nanmean(np.stack([padded[k : k + lengths.size] for k in (0, 1, 3, 4)]), axis=0)
+    abrupt = (jump > 1.5 * level_spacing(x)) | (lengths > 10.0 * around)
+    return np.asarray((lengths >= shortest) & abrupt)
+
+
+def _without_noise(x: Array) -> bool:
+    """Whether the channel moves smoothly, as only a simulated one does: then equal samples are rest."""
+    fourth = np.abs(np.diff(x, 4))
+    moving = np.diff(x)[:-3] != 0.0
+    return bool(moving.any() and np.median(fourth[moving]) < 1e-4 * np.std(x))
+
+
+def _falls_to_zero(x: Array, starts: np.ndarray) -> np.ndarray:
+    """Runs of exact zeros of any length that are entered and left by a jump far beyond the channel's usual change."""
+    levels = x[starts]
+    zero = levels == 0.0
+    zero[[0, -1]] = False  # an end has no other side to jump back to
+    changes = np.abs(np.diff(x))
+    usual = 1.4826 * float(np.median(changes))
+    rare = 0 < np.count_nonzero(x == 0.0) < 0.05 * x.size
+    if usual == 0.0 or not rare or not zero.any():
+        return np.zeros(starts.size, dtype=bool)
+    at = np.flatnonzero(zero)
+    jumps = np.minimum(np.abs(levels[at - 1]), np.abs(levels[at + 1]))
+    zero[at] = jumps > _ZERO_JUMP * usual
+    return np.asarray(zero)
+
+
+_ORDER = 4  # of the local predictor: enough for two sines, short enough to look past an outlier
+_BLOCK = 100  # samples over which the scale of the innovations is taken as constant
+_MAD_TO_SD = 1.4826  # of a Gaussian
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outliers:
+    """Samples that neither their past nor their future predicts.
+
+    Attributes
+    ----------
+    channel : str
+        Channel looked at.
+    indices : ndarray of int, shape (count,)
+        The samples.
+    first_s : float or None
+        Time of the first one in s.
+    largest_sd : float
+        Largest prediction error among them, in robust standard deviations of the innovations.
+    """
+
+    channel: str
+    indices: NDArray[np.intp]
+    first_s: float | None
+    largest_sd: float
+
+    @property
+    def count(self) -> int:
+        """Number of outliers."""
+        return int(self.indices.size)
+
+    @property
+    def first_index(self) -> int | None:
+        """First outlier, or None."""
+        return int(self.indices[0]) if self.indices.size else None
+
+    def __str__(self) -> str:
+        if not self.count:
+            return f"{self.channel}: no outliers"
+        return (
+            f"{self.channel}: {self.count} outlier{'s' if self.count > 1 else ''}, the first at sample "
+            f"{self.first_index} "
+            f"({self.first_s:.6g} s), up to {self.largest_sd:.3g} sd of the innovations"
+        )
+
+
+def find_outliers(record: Record, name: str, *, threshold: float = 6.0, width: int = 1) -> Outliers:
+    """Find outliers of a channel; nothing is replaced (see `replace_samples`).
+
+    Parameters
+    ----------
+    record : Record
+        The record to look at.
+    name : str
+        Channel.
+    threshold : float
+        Prediction error that makes an outlier, in local robust standard deviations of the innovations (Hampel
+        identifier: median absolute value times 1.4826). At 6, Gaussian noise gives less than one in 1e8 samples.
+    width : int
+        Longest group of neighbouring outliers that is looked for, 1 to 5 samples. Over 1, pulses of a real input
+        of that length are found too.
+
+    Returns
+    -------
+    Outliers
+        Their indices, in order. The first and last few samples, which have no past or future, are not judged.
+
+    Raises
+    ------
+    RecordError
+        If the channel cannot be used, threshold or width is out of range, or the record has under 50 samples.
+    """
+    x = finite(record, name)
+    if not (threshold >= 3.0 and 1 <= width <= 5):
+        raise RecordError(
+            f"find_outliers got threshold {threshold:g} and width {width}; threshold is at least 3 and width 1 to "
+            f"5. Give others"
+        )
+    if x.size < 50:
+        raise RecordError(f"channel {name!r} has {x.size} samples; outliers need at least 50. Use a longer record")
+    sizes = outlier_sizes(x, threshold, width)
+    indices = np.flatnonzero(sizes)
+    first = record.start_s + int(indices[0]) / record.rate_hz if indices.size else None
+    return Outliers(channel=name, indices=indices, first_s=first, largest_sd=float(sizes.max()))
+
+
+def outlier_sizes(x: Array, threshold: float = 6.0, width: int = 1) -> Array:
+    """Return the prediction error of each outlier in robust standard deviations, 0 for samples that are none.
+
+    `x`: (n_samples,), any unit, samples, finite; `threshold`: error that makes an outlier, in local robust standard
+    deviations; `width`: longest group of outliers in samples. Returns (n_samples,), dimensionless, sizes; 0 where there
+    is no outlier.
+    """
+    spread = float(np.std(x))
+    if spread == 0.0:
+        return np.zeros(x.size)
+    repeated = 1.0 - equal_runs(x)[0].size / x.size
+    common = _common_levels(x) if repeated > 0.5 else np.zeros(x.size, dtype=bool)
+    clean, sizes = x, np.zeros(x.size)
+    # An outlier spoils the predictor and the prediction of its neighbours: repeat with the found ones bridged.
+    for _ in range(5):
+        forward = _errors(x, clean, width, spread)
+        backward = [e[::-1] for e in _errors(x[::-1], clean[::-1], width, spread)]
+        found = _groups(x, forward, backward, threshold, width)
+        found[common] = 0.0
+        if np.array_equal(found > 0, sizes > 0):
+            return found
+        sizes = found
+        good = np.flatnonzero(sizes == 0)
+        clean = np.interp(np.arange(x.size), good, x[good])
+    return sizes
+
+
+def _common_levels(x: Array) -> NDArray[np.bool_]:
+    """Samples of a held signal (steps, PRBS) at a level that it visits often: a level is no outlier."""
+    _, inverse, counts = np.unique(x, return_inverse=True, return_counts=True)
+    common: NDArray[np.bool_] = counts[inverse] >= max(3, 0.001 * x.size)
+    return common
+
+
+def _errors(x: Array, clean: Array, width: int, spread: float) -> list[Array]:
+    """Errors of the 1 to `width` step predictions of x from the clean past, in local robust sd."""
+    weights = fit_arx(clean, (), _ORDER, ()).coefficients
+    errors = []
+    lagged = [np.concatenate((np.full(lag, clean[0]), clean[:-lag])) for lag in range(1, _ORDER + width)]
+    for horizon in range(1, width + 1):
+        past = lagged[horizon - 1 :]  # newest first: samples up to t - horizon, then the predictions on the way to t
+        for _ in range(horizon):
+            terms = zip(weights[:_ORDER], past, strict=False)
+            past = [sum((w * p for w, p in terms), np.full(x.size, weights[-1])), *past]
+        error = x - past[0]
+        errors.append(error / _local_scale(error, spread))
+    return errors
+
+
+def _local_scale(error: Array, spread: float) -> Array:
+    """Robust sd of errors around each sample: the largest of its own and the two neighbouring blocks."""
+    n_blocks = max(1, error.size // _BLOCK)
+    blocks = np.array([np.median(np.abs(b)) for b in np.array_split(error, n_blocks)])
+    wide = np.concatenate((blocks[:1], blocks, blocks[-1:]))
+    widest = np.maximum(np.maximum(wide[:-2], wide[1:-1]), wide[2:])
+    lengths = [b.size for b in np.array_split(error, n_blocks)]
+    # The floor keeps round-off of a noise-free record from being its own measure.
+    scale: Array = np.repeat(np.maximum(_MAD_TO_SD * widest, 1e-6 * spread), lengths)
+    return scale
+
+
+def _groups(x: Array, forward: list[Array], backward: list[Array], threshold: float, width: int) -> Array:
+    """Mark groups of up to `width` samples, all of which stand out from both sides and in the same direction."""
+    sizes = np.zeros(x.size)
+    reach = _ORDER + width
+    for length in range(1, width + 1):
+        starts = np.arange(reach, x.size - reach - length + 1)
+        for sign in (1.0, -1.0):
+            marked = np.ones(starts.size, dtype=bool)
+            least = np.full(starts.size, np.inf)
+            edge = np.maximum(sign * x[starts - 1], sign * x[starts + length])
+            for j in range(length):
+                error = np.minimum(sign * forward[j][starts + j], sign * backward[length - 1 - j][starts + j])
+                marked &= (error > threshold) & (sign * x[starts + j] > edge)
+                least = np.minimum(least, error)
+            for j in range(length):
+                at = starts[marked] + j
+                sizes[at] = np.maximum(sizes[at], least[marked])
+    return sizes
+
+
+_FEWEST = 5  # samples at a limit that count as evidence
+_PILE = 3.0  # how many times the fullest of the neighbouring levels a limit has to hold
+_NEIGHBOURS = 10  # levels beside the limit that tell how many samples a level holds there
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limit:
+    """One limit at which samples pile up.
+
+    Attributes
+    ----------
+    value : float
+        The limit in the channel's unit.
+    count, n_runs, longest : int
+        Samples at it, runs that they form, and samples of the longest run.
+    first_index : int
+        First sample at it.
+    """
+
+    value: float
+    count: int
+    n_runs: int
+    longest: int
+    first_index: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Saturation:
+    """Saturation of a channel.
+
+    Attributes
+    ----------
+    channel, unit : str
+        Channel looked at and its unit.
+    lower, upper : Limit or None
+        The limits that were reached.
+    n_samples : int
+        Samples of the channel.
+    first_s : float or None
+        Time of the first saturated sample in s.
+    """
+
+    channel: str
+    unit: str
+    lower: Limit | None
+    upper: Limit | None
+    n_samples: int
+    first_s: float | None
+
+    @property
+    def count(self) -> int:
+        """Number of saturated samples."""
+        return sum(limit.count for limit in (self.lower, self.upper) if limit)
+
+    @property
+    def first_index(self) -> int | None:
+        """First saturated sample, or None."""
+        return min((limit.first_index for limit in (self.lower, self.upper) if limit), default=None)
+
+    @property
+    def fraction(self) -> float:
+        """Part of the channel's samples, 0 to 1."""
+        return self.count / self.n_samples
+
+    def __str__(self) -> str:
+        if not self.count:
+            return f"{self.channel}: no saturation"
+        parts = [f"{limit.count} at {limit.value:.6g} {self.unit}" for limit in (self.lower, self.upper) if limit]
+        return (
+            f"{self.channel}: {100 * self.fraction:.2g} % of the samples saturated ({' and '.join(parts)}), "
+            f"the first at sample {self.first_index} ({self.first_s:.6g} s)"
+        )
+
+
+def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | None = None) -> Saturation:
+    """Find samples held at a limit of the channel's range.
+
+    Without `limits`, an extreme value is a limit where it holds at least 5 samples and over 3 times as many as any of
+    the 10 levels next to it. A quantised sine holds at most 2.4 times as many (its peaks dwell); steps and PRBS hold
+    all their levels. Not reported, because the samples alone do not tell it from design or rest: an input of two
+    levels, and an extreme value held only from the very start of the record (see `find_dropouts`). A sensor whose curve
+    flattens without an exact limit is not found either.
+
+    Parameters
+    ----------
+    record : Record
+        The record to look at.
+    name : str
+        Channel.
+    limits : (float, float), optional
+        Known lower and upper limit in the channel's unit; samples at or beyond them are then counted, whatever the
+        signal.
+
+    Returns
+    -------
+    Saturation
+        The limits reached, with counts.
+
+    Raises
+    ------
+    RecordError
+        If the channel cannot be used, or the lower limit is not under the upper one.
+    """
+    x = finite(record, name)
+    if limits is not None:
+        if not limits[0] < limits[1]:
+            raise RecordError(f"limits {limits} of channel {name!r}; the lower must be under the upper one. Swap them")
+        lower, upper = (_limit(limits[0], x <= limits[0]), _limit(limits[1], x >= limits[1]))
+    else:
+        lower, upper = _pile(x), _pile(-x)
+        upper = replace(upper, value=-upper.value) if upper else None
+    firsts = [limit.first_index for limit in (lower, upper) if limit]
+    return Saturation(
+        channel=name,
+        unit=record.channel(name).unit,
+        lower=lower,
+        upper=upper,
+        n_samples=x.size,
+        first_s=record.start_s + min(firsts) / record.rate_hz if firsts else None,
+    )
+
+
+def _limit(value: float, at: np.ndarray) -> Limit | None:
+    if not at.any():
+        return None
+    starts, lengths = runs(at)
+    return Limit(
+        value=value,
+        count=int(lengths.sum()),
+        n_runs=int(starts.size),
+        longest=int(lengths.max()),
+        first_index=int(starts[0]),
+    )
+
+
+def _pile(x: Array) -> Limit | None:
+    """Return the lower extreme of `x` as a limit if samples pile up at it."""
+    values, counts = np.unique(x, return_counts=True)
+    # Levels that only round-off keeps apart are one, as in a computed sine with a whole number of samples per period.
+    apart = np.diff(values) > 1e-9 * (values[-1] - values[0])
+    level_of = np.concatenate(([0], np.cumsum(apart)))
+    held = np.bincount(level_of, weights=counts)
+    if held.size < 3 or held[0] < max(_FEWEST, 1 + _PILE * held[1 : 1 + _NEIGHBOURS].max()):
+        return None
+    at = x <= values[np.flatnonzero(level_of == 0)[-1]]
+    starts, lengths = runs(at)
+    entered = starts[starts > 0]
+    # Rest before the first motion has no way in, and a transient that settles creeps in: neither is a limit.
+    if not np.any(x[entered - 1] - x[entered] > 1e-7 * (values[-1] - values[0])):
+        return None
+    if _held(x, float(np.mean(lengths))):
+        return None
+    return _limit(float(values[0]), at)
+
+
+def _held(x: Array, dwell: float) -> bool:
+    """Whether the signal holds its inner levels about as long as its extreme, as a staircase does by design."""
+    starts, lengths = equal_runs(x)
+    inside = (x[starts] > np.min(x)) & (x[starts] < np.max(x))
+    return bool(inside.any() and np.mean(lengths[inside]) > max(3.0, 0.3 * dwell))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Resolution:
+    """Quantisation of a channel.
+
+    Attributes
+    ----------
+    channel : str
+        Channel looked at.
+    unit : str
+        Its unit.
+    step : float
+        Typical smallest spacing of neighbouring levels, in `unit`; 0 for a channel with one level.
+    n_levels : int
+        Number of different values.
+    n_samples : int
+        Number of samples.
+    uniform : float
+        Part of the spacings that are whole multiples of `step` within 5 %; near 1 for a linear converter, less behind
+        a calibration curve.
+    """
+
+    channel: str
+    unit: str
+    step: float
+    n_levels: int
+    n_samples: int
+    uniform: float
+
+    @property
+    def quantised(self) -> bool:
+        """Whether values repeat enough (on average at least twice) for `step` to be a property of the converter."""
+        return 2 * self.n_levels <= self.n_samples
+
+    @property
+    def noise_sd(self) -> float:
+        """Standard deviation of rounding to `step`, step/√12, in `unit`; 0 if not quantised."""
+        return self.step / float(np.sqrt(12.0)) if self.quantised else 0.0
+
+    def __str__(self) -> str:
+        if self.n_levels == 1:
+            return f"{self.channel}: constant"
+        if not self.quantised:
+            return f"{self.channel}: not quantised ({self.n_levels} values in {self.n_samples} samples)"
+        shape = "" if self.uniform > 0.9 else ", unevenly spaced"
+        return f"{self.channel}: quantised in steps of {self.step:.3g} {self.unit} ({self.n_levels} levels{shape})"
+
+
+def resolution(record: Record, name: str) -> Resolution:
+    """Find the quantisation step of a channel.
+
+    Parameters
+    ----------
+    record : Record
+        The record to look at.
+    name : str
+        Channel.
+
+    Returns
+    -------
+    Resolution
+        Spacing and number of levels.
+
+    Raises
+    ------
+    RecordError
+        If the channel cannot be used.
+    """
+    x = finite(record, name)
+    spacings = _spacings(x)
+    step = level_spacing(x)
+    multiples = spacings / step if step else spacings
+    on_grid = float(np.mean(np.abs(multiples - np.round(multiples)) < 0.05)) if spacings.size else 1.0
+    return Resolution(
+        channel=name,
+        unit=record.channel(name).unit,
+        step=step,
+        n_levels=spacings.size + 1,
+        n_samples=x.size,
+        uniform=on_grid,
+    )
+
+
+def level_spacing(x: Array) -> float:
+    """Return the typical smallest spacing between neighbouring levels.
+
+    The median of the spacings up to 1.5 times their 10 % quantile, which neither a few odd pairs of levels
+    (calibration, clipping) nor missing levels move.
+
+    `x`: (n_samples,), any unit, samples. Returns spacing in the unit of `x`; 0 if all samples are equal.
+    """
+    spacings = _spacings(x)
+    if not spacings.size:
+        return 0.0
+    return float(np.median(spacings[spacings <= 1.5 * np.quantile(spacings, 0.1)]))
+
+
+def _spacings(x: Array) -> Array:
+    """Differences of neighbouring levels, without those that are only round-off of one level."""
+    spacings: Array = np.diff(np.unique(x))
+    return spacings[spacings > 1e-12 * max(float(np.max(np.abs(x))), 1e-300)]
