@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from timing import quantity
 
 Array = NDArray[np.float64]
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "benchmarks"
+DATA = Path(os.environ.get("AMBID_RECORDS") or Path(__file__).resolve().parents[2] / "shared" / "data") / "benchmarks"
 ENTRIES = ("a21", "a23", "a32", "a33", "b3")
 THESIS = {"a21": -6231.1, "a23": -3279.2, "a32": 5315.7, "a33": -18.9, "b3": 16.61}  # eq. 4.11
 HEAD = 50  # samples of a Silverbox test that begin the free run and do not count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from peers import Answer, Array, Bench, Way, bench, ways
 from table import Table
 from timing import quantity
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "benchmarks"
+DATA = Path(os.environ.get("AMBID_RECORDS") or Path(__file__).resolve().parents[2] / "shared" / "data") / "benchmarks"
 LIMIT_S = 20.0
 AHEAD = (1, 10)  # samples, where a plant cannot be simulated
 

@@ -1,7 +1,7 @@
 """Real records: a steel ball (60.54 g) under one magnet, closed loop, 1 kHz; least squares beside the likelihood.
 
-The records are not part of this repository; the example looks for them in ../shared/data/maglev beside it, or in the
-folder given. The check that uses no fit at all is gravity: the magnet's force is proportional to the current squared
+The records are public, from the student laboratory repository 062020-Lab-Mechatronics, and not part of this one; the
+example takes their folder, or ``maglev`` in the folder that AMBID_RECORDS names. The check that uses no fit at all is gravity: the magnet's force is proportional to the current squared
 and carries the ball, so k_i = df/di = -2 m g/i0 and k_i/m = -2 g/i0 at the mean current i0 (the position is the gap: it
 grows away from the magnet).
 
@@ -10,6 +10,7 @@ Run: python docs/examples/real_maglev.py [FOLDER]
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from ambid.record import Record
 from ambid.rig import load_rig
 from ambid.signals import lowpass
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
+DATA = Path(os.environ.get("AMBID_RECORDS") or Path(__file__).resolve().parents[3] / "shared" / "data") / "maglev"
 RECORDS = ("levitate_stairs_a", "levitate_stairs_b", "levitate_sine_e")
 CUTOFFS_HZ = (10.0, 20.0, 50.0)
 GRAVITY, MASS, MEASURED_OHM = 9.81, 0.06054, 4.17

@@ -5,16 +5,15 @@ of gravity and magnet, k_i/m = -2 g/i0.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.signal import butter, filtfilt
 
 from ambid.job import identify
+from tests.measured import ABSENT, MAGLEV
 
-MAGLEV = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
-pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")
+pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason=ABSENT)
 
 MASS, GRAVITY = 0.06054, 9.81
 RESISTANCE, INDUCTANCE = 4.17, 0.117  # ohm; H at 10 mm and 0.95 A

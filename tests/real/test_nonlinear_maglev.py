@@ -4,8 +4,6 @@ The balance uses no fit: where the ball stands, f = dL/dz i^2/2 = m g and k_i/m 
 the mean current of all samples near that position.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,9 +12,9 @@ from ambid.job.estimates import read_estimate
 from ambid.job.nonlinear_bearing import identify_nonlinear
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
+from tests.measured import ABSENT, MAGLEV
 
-MAGLEV = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
-pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")
+pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason=ABSENT)
 
 MASS, GRAVITY, RESISTANCE = 0.06054, 9.81, 4.17
 LEVITATION = ("stairs_a", "stairs_b", "updown_c", "sine_d", "sine_e")

@@ -1,14 +1,13 @@
 """Silverbox (electronic Duffing oscillator): best linear approximation, noise and distortion from the record alone."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.signals import find_experiments, find_period, frf_local, frf_periodic
+from tests.measured import ABSENT, BENCHMARKS
 
-SILVERBOX = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "benchmarks" / "silverbox.csv"
-pytestmark = pytest.mark.skipif(not SILVERBOX.is_file(), reason="the benchmark records are not beside this checkout")
+SILVERBOX = BENCHMARKS / "silverbox.csv"
+pytestmark = pytest.mark.skipif(not SILVERBOX.is_file(), reason=ABSENT)
 MULTISINES = 40_500  # the growing noise, the "arrow", ends before; the whole periods begin after
 
 

@@ -3,17 +3,15 @@
 A hair dryer in open loop, and a ball on a beam: unstable, held by a controller (DaISy).
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.response import one_step, simulation
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
+from tests.measured import ABSENT, BENCHMARKS
 
-BENCHMARKS = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.is_dir(), reason="the measured records are not beside this checkout")
+pytestmark = pytest.mark.skipif(not BENCHMARKS.is_dir(), reason=ABSENT)
 
 
 def halves(name: str, *, open_loop: bool) -> tuple[IOData, IOData]:

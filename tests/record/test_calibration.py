@@ -1,15 +1,14 @@
 """Calibration: a line is exact, a table passes through its points, and nothing is made up outside it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.errors import RecordError, UnitError
 from ambid.record import Channel, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
+from tests.measured import ABSENT, MAGLEV
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
+DATA = MAGLEV
 
 
 def channel(values, unit="1"):
@@ -98,7 +97,7 @@ def test_history_can_repeat_the_calibration(tmp_path):
     assert (line["gain"], line["offset"], line["channel"]) == (12.0, 0.5, "duty")
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="shared measured records are not beside the checkout")
+@pytest.mark.skipif(not DATA.exists(), reason=ABSENT)
 def test_measured_duty_becomes_the_voltage_that_drives_the_measured_current():
     c = read_calibration_table(DATA / "duty_to_voltage.csv")
     r = read_record(DATA / "levitate_stairs_a.csv")

@@ -2,7 +2,6 @@
 
 import gzip
 import hashlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +9,9 @@ import pytest
 from ambid.errors import RecordError
 from ambid.record import Channel, Record, read_record, write_record
 from ambid.record.csv_format import read_csv, write_csv
+from tests.measured import ABSENT, RECORDS
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+DATA = RECORDS
 COLUMNS = ("position", "current_upper", "current_lower", "duty_upper", "duty_lower")
 
 
@@ -138,7 +138,7 @@ def test_long_files_keep_their_order_and_name_a_late_fault(tmp_path):
     np.testing.assert_array_equal(np.column_stack([c.values for c in cut.channels]), values[:45_678])
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="shared measured records are not beside the checkout")
+@pytest.mark.skipif(not DATA.exists(), reason=ABSENT)
 @pytest.mark.parametrize(
     ("name", "rate", "n", "names"),
     [

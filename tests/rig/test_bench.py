@@ -1,16 +1,15 @@
 """A record through a rig: roles, units and calibration, and the refusals of what does not fit."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.errors import RecordError, UnitError
 from ambid.record import read_record
 from ambid.rig import bench_record, default_rig, draft_rig, load_rig, read_bench
+from tests.measured import ABSENT, MAGLEV
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
-measured = pytest.mark.skipif(not DATA.exists(), reason="shared measured records are not beside the checkout")
+DATA = MAGLEV
+measured = pytest.mark.skipif(not DATA.exists(), reason=ABSENT)
 N = 20
 COIL = 'schema = "ambid.rig/1"\nmodel = "coil"\n'
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ambid.record import Channel, Record, read_record
+from tests.measured import ABSENT, MAGLEV
 
-_MAGLEV = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "maglev"
+_MAGLEV = MAGLEV
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def maglev() -> Callable[[str], Record]:
     def read(name: str) -> Record:
         path = _MAGLEV / f"{name}.csv"
         if not path.exists():
-            pytest.skip("the measured maglev records are not beside this checkout")
+            pytest.skip(ABSENT)
         return read_record(path)
 
     return read
@@ -41,5 +41,5 @@ def duty_to_voltage() -> np.ndarray:
     """Measured table of coil voltage against duty, shape (n_points, 2)."""
     path = _MAGLEV / "duty_to_voltage.csv"
     if not path.exists():
-        pytest.skip("the measured maglev records are not beside this checkout")
+        pytest.skip(ABSENT)
     return np.loadtxt(path, delimiter=",", skiprows=1)

@@ -1,15 +1,14 @@
 """The hair dryer of Ljung 1999, sec. 17.3: a delay of three samples, read off the impulse response."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.nonparametric import correlation_analysis, impulse_response, step_response
+from tests.measured import ABSENT, BENCHMARKS
 
-DRYER = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "benchmarks" / "dryer.csv"
-pytestmark = pytest.mark.skipif(not DRYER.is_file(), reason="the measured records are not beside this checkout")
+DRYER = BENCHMARKS / "dryer.csv"
+pytestmark = pytest.mark.skipif(not DRYER.is_file(), reason=ABSENT)
 
 
 def test_delay_and_gain_of_the_dryer():

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.nonlinear.narmax import PolynomialNarmax, narmax
+from tests.measured import ABSENT, BENCHMARKS
 from tests.nonlinear.narmax.systems import record
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "benchmarks"
+DATA = BENCHMARKS
 
 
 def read(name: str) -> IOData:
     if not (DATA / name).exists():
-        pytest.skip(f"{name} is not here")
+        pytest.skip(ABSENT)
     found = np.loadtxt(DATA / name, delimiter=",", skiprows=1)
     return record(found[:, 1], found[:, 2])
 

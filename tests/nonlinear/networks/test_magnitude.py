@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,8 +12,9 @@ from ambid.nonlinear.networks.magnitude_model import MagnitudeNetwork
 from ambid.nonlinear.networks.magnitude_problem import FoldedLayout, slopes, states
 from ambid.nonlinear.networks.magnitude_start import folded_starts
 from ambid.nonlinear.networks.nn import nn
+from tests.measured import ABSENT, BENCHMARKS
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "benchmarks"
+DATA = BENCHMARKS
 
 
 def io(u: np.ndarray, y: np.ndarray) -> IOData:
@@ -165,7 +164,7 @@ def test_coupled_drives(k: int, limit: float) -> None:
     """Second half of the record, the run going on from the first: at or below 0.10 (linear: 0.17 and 0.10)."""
     path = DATA / f"coupled_drives_{k}.csv"
     if not path.exists():
-        pytest.skip(f"{path.name} is not here")
+        pytest.skip(ABSENT)
     table = np.loadtxt(path, delimiter=",", skiprows=1)
     whole = io(table[:, 1], table[:, 2])
     # number of units as the method itself chooses it (two and one; bench/nonlinear.py lets it), which takes longer

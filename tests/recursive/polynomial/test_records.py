@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,9 +9,9 @@ from ambid.blackbox import polynomial
 from ambid.blackbox.data import IOData
 from ambid.recursive.polynomial import RecursivePolynomial
 from tests.blackbox.polynomial.systems import record
+from tests.measured import ABSENT, MAGLEV
 
-MAGLEV = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "maglev"
-pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")
+pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason=ABSENT)
 
 RECORDS = ("stairs_a", "stairs_b", "updown_c", "sine_d", "sine_e")
 

@@ -1,0 +1,5 @@
+"""``python -m ambid`` is the command ``ambid``."""
+
+from ambid.cli import main
+
+main()
