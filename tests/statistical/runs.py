@@ -16,7 +16,7 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import weight_of
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.validate.residuals import residuals_uncorrelated, residuals_white
+from ambid.validate.residuals import residual_tests
 from tests.bearing.benches import parameters, problem_of, run
 
 NAMES = ("m", "k_x", "k_i", "R", "L")
@@ -56,11 +56,12 @@ def one_run(seed: int, *, n: int, auto: bool) -> Outcome:
     covariance = assemble(problem, vector, with_derivatives=False).innovations.S / 1.5**2
     at = linearise(problem, vector, weight_of(covariance))
     found = fit.problem.delay_samples(fit.vector)
+    own, inputs = residual_tests(fit, e)
     return Outcome(
         estimate=np.array([theta[k] for k in NAMES]) / truth,
         sd=known.standard_deviations(robust=False) / np.abs(truth),
-        white=residuals_white(fit, e).p,
-        uncorrelated=residuals_uncorrelated(fit, e).p,
+        white=own.p,
+        uncorrelated=inputs.p,
         converged=fit.status == "converged",
         delay_right=abs(found - bench.delay) < (4 * known.delay_sd if known.delay_sd else 1e-9),
         score=at.J.T @ at.r,

@@ -8,7 +8,7 @@ from scipy.stats import chi2, kstest
 
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import innovations
-from ambid.validate.residuals import residuals_uncorrelated, residuals_white
+from ambid.validate.residuals import residual_tests
 from tests.bearing.benches import problem_of, run
 from tests.validate.wrong import WithoutMotionalVoltage
 
@@ -26,6 +26,14 @@ def fitted(name, n, seed, *, change=lambda problem: problem, **bench):
     problem, vector = problem_of(run(name, n, seed, **bench), estimated=KNOWN[name])
     fit = search(change(problem), vector)
     return fit, innovations(fit.problem, fit.vector)
+
+
+def residuals_white(fit, e):
+    return residual_tests(fit, e)[0]
+
+
+def residuals_uncorrelated(fit, e):
+    return residual_tests(fit, e)[1]
 
 
 @pytest.mark.parametrize("name", KNOWN)

@@ -21,9 +21,10 @@ from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, start
 from ambid.bearing.rescue import EVALUATIONS, reason, rescued
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import stable
-from ambid.estimation.likelihood import Fit, score_statistic, search
+from ambid.estimation.likelihood import Fit, score_statistic, search, workspace_near
 from ambid.estimation.predictor import assemble
 from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.sensitivity import Workspace
 from ambid.estimation.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -139,13 +140,15 @@ def _followed(
 def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
     """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
     if not with_disturbances:
-        fit = _quiet(candidate.problem, candidate.vector, tick)
+        fit = _quiet(candidate.problem, candidate.vector, tick, candidate.work)
         if fit is not None and fit.status == "converged" and _gain_promise(fit) <= 0:
             return fit
-    return search(candidate.problem, candidate.vector, tick=tick)
+    return search(candidate.problem, candidate.vector, tick=tick, work=candidate.work)
 
 
-def _quiet(problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None) -> Fit | None:
+def _quiet(
+    problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None, work: Workspace | None
+) -> Fit | None:
     """Search with sensor noise alone; None for an unstable plant, which wants its states corrected."""
     at = assemble(problem, vector, with_derivatives=False)
     if at is None or not stable(at.A):
@@ -154,14 +157,14 @@ def _quiet(problem: PredictorProblem, vector: Array, tick: Callable[[], None] | 
     start = np.zeros(quiet.size)
     for group in ("physical", "fraction", "offset", "initial"):
         start[quiet.slices[group]] = vector[problem.slices[group]]
-    return search(quiet, start, tick=tick)
+    return search(quiet, start, tick=tick, work=work)
 
 
 def _without_disturbances(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     """Drop the disturbances again where a wrong delay was all that they stood for."""
     if fit.problem.noise != "levels":
         return fit
-    quiet = _quiet(fit.problem, fit.vector, tick)
+    quiet = _quiet(fit.problem, fit.vector, tick, fit.work)
     price = (fit.problem.size - (quiet.problem.size if quiet else 0)) * np.log(fit.problem.n_used)
     return quiet if quiet is not None and quiet.criterion - fit.criterion < price else fit
 
@@ -170,7 +173,7 @@ def _gain_promise(fit: Fit) -> float:
     """Fall of the criterion that a free gain promises, less what its numbers cost (BIC)."""
     free = replace(fit.problem, noise="gain")
     price = (free.size - fit.problem.size) * float(np.log(fit.problem.n_used))
-    return score_statistic(free, carry(fit, free), fit.covariance) - price
+    return score_statistic(fit, free, carry(fit, free)) - price
 
 
 def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> None:
@@ -223,18 +226,18 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
         delay = fit.problem.delay
         free = replace(fit.problem, fractional=True, lag=0.0, skip=max(fit.problem.skip, delay + 2))
         start = carry(fit, free)
-        promise = score_statistic(free, start, fit.covariance)
+        promise = score_statistic(fit, free, start)
         before = start.copy()
         if delay > 0:  # from the other side of the whole sample the slope differs
             before[free.slices["fraction"]] = -1e-9
-            promise = max(promise, score_statistic(free, before, fit.covariance))
+            promise = max(promise, score_statistic(fit, free, before))
         if promise < price:
             return fit
         neighbour = _better_neighbour(fit, tick)
         if neighbour is not None:
             fit = neighbour
             continue
-        found = search(free, start, tick=tick)
+        found = search(free, start, tick=tick, work=workspace_near(fit, free))
         total = free.delay_samples(found.vector)
         if found.status == "failed" or fit.criterion - found.criterion < price:
             return fit
@@ -262,7 +265,7 @@ def _better_neighbour(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
     for delay in (fit.problem.delay + 1, fit.problem.delay - 1):
         if delay >= 0:
             problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
-            found = search(problem, carry(fit, problem), tick=tick)
+            found = search(problem, carry(fit, problem), tick=tick, work=workspace_near(fit, problem))
             # compared per sample, because a longer delay may leave one sample less
             if found.criterion / found.problem.n_used < best.criterion / best.problem.n_used:
                 best = found
@@ -275,5 +278,5 @@ def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit
     price = (free.size - fit.problem.size) * np.log(fit.problem.n_used)
     if not force and (price <= 0 or _gain_promise(fit) <= 0):
         return fit
-    found = search(free, carry(fit, free), tick=tick)
+    found = search(free, carry(fit, free), tick=tick, work=workspace_near(fit, free))
     return found if force or fit.criterion - found.criterion > price else fit

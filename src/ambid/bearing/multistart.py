@@ -29,6 +29,7 @@ FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
+_SHORTLY, _NEARLY = 8, 0.1  # steps of such a search, and squared standard deviations to the end that do
 _KEPT = 6  # candidates scored on the whole record
 _RACE = 3  # candidates searched a little way
 _CLOSE = 0.5  # difference of the criterion per sample within which candidates race
@@ -51,6 +52,7 @@ class Candidate:
     criterion: float  # at `vector`, see `ambid.estimation.likelihood.criterion`
     problem: PredictorProblem
     vector: Array  # (size,)
+    work: Workspace | None = None  # of the problem
 
     def like(self, other: Candidate) -> bool:
         """Return whether a search from here would end where one from `other` does."""
@@ -99,15 +101,15 @@ def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
     problem, vector = candidate.problem, candidate.vector
     stretch = busiest(problem.u, _SHORT)
     part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-    fit = search(part, at_first_sample(part, vector), rounds=3, tick=tick)
+    fit = search(part, at_first_sample(part, vector), most=_SHORTLY, settled=_NEARLY, tick=tick)
     moved = at_first_sample(problem, fit.vector)
     # noise levels move slowly on a logarithmic scale: look again where they stand best
-    work = Workspace(problem)
+    work = candidate.work.of(problem) if candidate.work else Workspace(problem)
     both = (moved, with_linear_part(problem, moved, work), vector)
     vectors = [w for v in both for w in (v, *(_with_level(problem, v, level) for level in _LEVELS))]
     scored = [(evaluate(problem, v, work)[0], j) for j, v in enumerate(vectors)]
     value, best = min(scored)
-    return Candidate(criterion=value, problem=problem, vector=vectors[best])
+    return Candidate(criterion=value, problem=problem, vector=vectors[best], work=work)
 
 
 def _scored(
@@ -118,9 +120,9 @@ def _scored(
     columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u, centred.y]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
     coarse = _coarse(model, centred, parameters, moments, delays)
-    found = []
-    for _, problem, values in coarse[:_KEPT]:
-        work = Workspace(problem)
+    found, work = [], None
+    for _, problem, values in sorted(coarse[:_KEPT], key=lambda c: c[1].delay):
+        work = Workspace(problem) if work is None else work.of(problem)
         for level in _LEVELS:
             vector = _with_level(problem, _vector(problem, values), level)
             value, _ = evaluate(problem, vector, work)
@@ -140,9 +142,11 @@ def _coarse(
     stretch, floor, spread = busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
     noise = dict(zip(model.outputs, floor.tolist(), strict=True))
     found: list[tuple[float, PredictorProblem, dict[str, float]]] = []
+    motion: dict[tuple[float, bool], Array] = {}
     for d in delays:
         work: Workspace | None = None
-        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, fixed_values(parameters))
+        known = fixed_values(parameters)
+        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, known, motion)
         for values, sizes in _possible(model, list(from_data), parameters):
             scales = scales_for(model, values, spread, floor, centred.rate_hz)
             problem = candidate_problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)

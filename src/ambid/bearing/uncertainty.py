@@ -16,7 +16,7 @@ from ambid.estimation.innovations import stable
 from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
+from ambid.estimation.sensitivity import Workspace, linearise, products
 from ambid.estimation.uncertainty import WEAK
 
 _SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
@@ -147,7 +147,8 @@ def _left_open(fit: Fit) -> Array:
     memories = problem.n_used * (1.0 - slowest)
     if memories > _LONG:
         return extra
-    work, here = Workspace(problem), directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
+    work = Workspace(problem) if fit.work is None else fit.work.of(problem)
+    here = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
     for j in range(len(problem.model.disturbances)):
         upper = _upper_level(fit, j, work)
         _, covariance = evaluate(problem, upper, work)
@@ -191,18 +192,13 @@ def _gram(a: Array) -> Array:
 
 def _scores(fit: Fit) -> Array:
     """Scores of the stretches of the record, (n_stretches, size); their scatter is the middle of the sandwich."""
-    problem, work = fit.problem, Workspace(fit.problem)
-    p, n_used = problem.size, problem.n_used
-    length = max(1, n_used // _BATCHES)
-    scores = np.zeros((-(-n_used // length), p))
-    first = 0
-    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
-        m = rows.shape[0]
-        stretch = np.arange(first, first + m) // length
-        for b in range(stretch[0], stretch[-1] + 1):
-            part = rows[stretch == b].reshape(-1, p + 1)
-            scores[b] += part[:, :p].T @ part[:, p]
-        first += m
+    problem = fit.problem
+    work = Workspace(problem) if fit.work is None else fit.work.of(problem)
+    none = np.zeros((problem.n_used, 0))
+    found = products(problem, fit.vector, weight_of(fit.covariance), work, none, _BATCHES)
+    if found is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    scores = found.scores
     scores -= scores.mean(axis=0)
     count = scores.shape[0]
     return np.asarray(scores * np.sqrt(count / max(count - 1, 1)))

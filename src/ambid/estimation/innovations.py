@@ -1,7 +1,8 @@
 """From noise levels to the predictor: Kalman gain, innovation covariance and their exact derivatives.
 
-Solves the filter Riccati equation with SciPy and differentiates it implicitly: with F = A - K C,
-dP = F dP F^T + dA P F^T + F P dA^T + dQ + K dR K^T (a Lyapunov equation, because the gain is stationary in P).
+Solves the filter Riccati equation by Newton steps from a gain nearby, from the stable subspace of the symplectic matrix
+or from SciPy's solution, and differentiates it implicitly: with F = A - K C, dP = F dP F^T + dA P F^T + F P dA^T + dQ +
+K dR K^T (a Lyapunov equation, because the gain is stationary in P).
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
     K = near if near is not None and stable(A - near @ C) else None
     P = None if K is None else _newton(A, C, Q, R, K)
     if P is None:
+        start = _symplectic_gain(A, C, Q, R)
+        P = None if start is None or not stable(A - start @ C) else _newton(A, C, Q, R, start)
+    if P is None:
         from scipy.linalg import solve_discrete_are
 
         P = solve_discrete_are(A.T, C.T, Q, R)
@@ -42,6 +46,21 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
             raise np.linalg.LinAlgError("the Riccati equation has no stabilising solution")
     S = C @ P @ C.T + R
     return Innovations(K=_gain_of(A, C, P, R), P=P, S=S)
+
+
+def _symplectic_gain(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
+    """Gain from the stable eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd."""
+    n = A.shape[0]
+    try:
+        back = np.linalg.inv(A).T
+        left = back @ C.T @ np.linalg.solve(R, C)
+        values, vectors = np.linalg.eig(np.vstack([np.hstack([back, left]), np.hstack([Q @ back, A + Q @ left])]))
+        chosen = vectors[:, np.argsort(np.abs(values))[n:]]
+        P = np.real(np.linalg.solve(chosen[:n].T, chosen[n:].T).T)
+        gain = _gain_of(A, C, 0.5 * (P + P.T), R)
+    except np.linalg.LinAlgError:
+        return None
+    return gain if np.all(np.isfinite(gain)) else None
 
 
 def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array) -> Array | None:

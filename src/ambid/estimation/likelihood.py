@@ -1,29 +1,26 @@
 """Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2).
 
-The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given
-to SciPy's trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
+The determinant of the innovation covariance is minimised by damped Gauss-Newton steps with exact Jacobians; each is
+that of the least-squares problem weighted by the innovation covariance at the vector where it begins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import BLIND, directions, least_squares
+from ambid.estimation.linear import directions, least_squares, triangle_of
 from ambid.estimation.problem import PredictorProblem
-from ambid.estimation.sensitivity import Workspace, innovations, linearise
-
-Status = Literal["converged", "stalled", "failed"]
+from ambid.estimation.search import Status
+from ambid.estimation.search import search as damped_search
+from ambid.estimation.sensitivity import Linearisation, Workspace, innovations, linearise
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
-_ROUNDS = 20  # of reweighting by the innovation covariance
-_EVALUATIONS = 10  # of the residual in one round
-_SETTLED = 0.03  # Newton step of every physical parameter, in standard deviations, below which a search has converged
-_FLAT = 0.1  # fall of the criterion in one round below which a search has converged; a needless number earns one
+_MOST = 60  # steps of a search
+_SETTLED = 1e-3  # squared length of a step in standard deviations below which a search has converged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,6 +39,7 @@ class Fit:
     status: Status
     evaluations: int
     start_s: float = 0.0  # time that finding start values took before this search, s
+    work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
     # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue.rescued`
     global_search: Mapping[str, object] | None = None
 
@@ -95,16 +93,33 @@ def weight_of(covariance: Array) -> Array:
     return np.linalg.solve(np.linalg.cholesky(covariance), np.eye(covariance.shape[0]))
 
 
-def score_statistic(problem: PredictorProblem, vector: Array, covariance: Array) -> float:
+def workspace_near(fit: Fit, problem: PredictorProblem) -> Workspace:
+    """Return the workspace of a problem that shares most numbers with a fit, begun with its triangle."""
+    work = fit.work.of(problem) if fit.work is not None else Workspace(problem)
+    if work.turn is None:
+        old, columns, places = fit.problem, list[int](), list[int]()
+        for group, own in old.slices.items():
+            there = problem.slices[group]
+            shared = min(own.stop - own.start, there.stop - there.start)
+            if group != "noise" or old.noise == problem.noise:
+                columns += range(own.start, own.start + shared)
+                places += range(there.start, there.start + shared)
+        triangle = np.eye(problem.size)
+        triangle[np.ix_(places, places)] = triangle_of([fit.J[:, columns]])
+        work.near(triangle)
+    return work
+
+
+def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float:
     """Return the fall of the criterion that freeing all numbers of `problem` promises to second order.
 
     The score (Lagrange multiplier) test: one evaluation decides whether an extension is worth a search.
 
-    `problem`: the extended problem; `vector`: (size,), the optimum of the smaller problem, written in the extended one;
-    `covariance`: (n_outputs, n_outputs), innovation covariance there. Returns chi-squared with as many degrees of
-    freedom as numbers were added, if they are not needed; 0 where undefined.
+    `fit`: of the smaller problem; `problem`: the extended one; `vector`: (size,), the fit's numbers written in it.
+    Returns chi-squared with as many degrees of freedom as numbers were added, if they are not needed; 0 where
+    undefined.
     """
-    at = linearise(problem, vector, weight_of(covariance))
+    at = linearise(problem, vector, weight_of(fit.covariance), workspace_near(fit, problem))
     if at is None:
         return 0.0
     r, J = prior_rows(problem, vector)
@@ -132,7 +147,7 @@ def freed(fit: Fit, name: str) -> tuple[float, float]:
     )
     n = old.n_physical
     vector = np.insert(fit.vector, n, value / size)
-    at = linearise(problem, vector, weight_of(fit.covariance))
+    at = linearise(problem, vector, weight_of(fit.covariance), workspace_near(fit, problem))
     if at is None:
         return 0.0, value
     r, rows = prior_rows(problem, vector)
@@ -157,71 +172,40 @@ def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) 
     return out
 
 
-def _step_left(J: Array, r: Array, n_physical: int) -> float:
-    """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
-    found = directions(J)
-    half = found.root(BLIND)
-    ratio = np.abs(half @ (found.U.T @ r)) / np.linalg.norm(half, axis=1)
-    return float(np.max(ratio[: n_physical or None]))
-
-
 def search(
     problem: PredictorProblem,
     start: Array,
     *,
-    rounds: int = _ROUNDS,
-    evaluations: int = _EVALUATIONS,
+    most: int = _MOST,
+    settled: float = _SETTLED,
     tick: Callable[[], None] | None = None,
+    work: Workspace | None = None,
 ) -> Fit:
     """Minimise the likelihood criterion from `start`.
 
-    `start`: (size,); `rounds`, `evaluations`: bounds on reweightings, and on residual evaluations in each; `tick`:
-    called after each evaluation (progress, interruption). Returns with status ``"failed"`` where there is no predictor
-    at `start`.
+    `start`: (size,); `most`: steps, at most; `settled`: squared length of a step in standard deviations
+    below which it has converged; `tick`: called after each evaluation (progress, interruption); `work`: of
+    this problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor at `start`.
     """
-    from scipy.optimize import least_squares
-
-    work = Workspace(problem)
+    work = Workspace(problem) if work is None else work.of(problem)
     vector = with_linear_part(problem, start, work)
-    value, covariance = evaluate(problem, vector, work)
-    if covariance is None:
-        return _failed(problem, start)
-    target = _Weighted(problem, work, tick)
-    status: Status = "stalled"
-    count = 1
-    for _ in range(rounds):
-        target.reweigh(weight_of(covariance))
-        if not np.all(np.isfinite(target.residual(vector))):  # innovations exist, their sensitivities overflow
-            return _failed(problem, start)
-        # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
-        small = 4e-3 / (problem.n_used * problem.y.shape[1])
-        found = least_squares(
-            target.residual, vector, jac=target.jacobian, method="trf", x_scale="jac",
-            ftol=small, xtol=1e-12, gtol=1e-14, max_nfev=evaluations,
-        )  # fmt: skip
-        count += found.nfev
-        before, vector = value, found.x
-        J = target.jacobian(vector)
-        r, covariance = target.r, target.covariance
-        value = criterion(problem, vector, covariance)
-        # the covariance moved since r was weighted: that changes the step only to second order
-        if before - value < _FLAT and _step_left(J, r, problem.n_physical) < _SETTLED:
-            status = "converged"
-            break
-    at = linearise(problem, vector, weight_of(covariance), work)
+    target = _Likelihood(problem, work, tick)
+    found = damped_search(target, vector, most=most, tolerance=0.0, settled=settled, damping=1e-4)
+    at = target.linearisation(found.theta) if np.isfinite(found.cost) else None
     if at is None:
         return _failed(problem, start)
-    r_prior, J_prior = prior_rows(problem, vector)
+    r_prior, J_prior = prior_rows(problem, found.theta)
     return Fit(
         problem=problem,
-        vector=vector,
-        covariance=covariance,
+        vector=found.theta,
+        covariance=at.covariance,
         J=at.J,
         J_prior=J_prior,
         r_prior=r_prior,
-        criterion=value,
-        status=status,
-        evaluations=count,
+        criterion=found.cost,
+        status=found.status,
+        evaluations=target.evaluations,
+        work=work,
     )
 
 
@@ -233,34 +217,38 @@ def _failed(problem: PredictorProblem, start: Array) -> Fit:
     )  # fmt: skip
 
 
-class _Weighted:
-    """Residual and Jacobian as SciPy's optimiser asks for them: one evaluation serves both."""
+class _Likelihood:
+    """The criterion n log det S + priors and its triangle: J'J is the information matrix, -J'r half the gradient."""
 
     def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
         self.problem, self.work, self.tick = problem, work, tick
-        self.weight = np.eye(problem.y.shape[1])
-        self.at = np.full(self.problem.size, np.nan)
-        self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
+        self.evaluations = 0
+        self._at = np.full(problem.size, np.nan)  # where `_covariance` belongs to
+        self._covariance: Array | None = None
+        self._linear: tuple[Array, Linearisation | None] = (self._at, None)
 
-    def reweigh(self, weight: Array) -> None:
-        self.weight = weight
-        self.at = np.full(self.problem.size, np.nan)
-
-    def residual(self, vector: Array) -> Array:
-        if np.array_equal(self.at, vector):  # once more would begin from another gain, and may find no predictor
-            return self.r
-        prior, J_prior = prior_rows(self.problem, vector)
-        result = linearise(self.problem, vector, self.weight, self.work)
+    def cost(self, vector: Array) -> float:
+        self.evaluations += 1
         if self.tick is not None:
             self.tick()
-        if result is None:  # infinite: the trust region shrinks
-            return np.full(self.problem.size + 1 + prior.size, np.inf)
-        self.at = vector.copy()
-        self.r, self.J = np.concatenate([result.r, prior]), np.vstack([result.J, J_prior])
-        self.covariance = result.covariance
-        return self.r
+        value, covariance = evaluate(self.problem, vector, self.work)
+        self._at, self._covariance = vector.copy(), covariance
+        return value
 
-    def jacobian(self, vector: Array) -> Array:
-        if not np.array_equal(self.at, vector):
-            self.residual(vector)
-        return self.J
+    def triangle(self, vector: Array) -> Array:
+        at = self.linearisation(vector)
+        if at is None:
+            return np.full((1, vector.size + 1), np.inf)
+        r, J = prior_rows(self.problem, vector)
+        return np.vstack([np.column_stack([at.J, -at.r]), np.column_stack([J, -r])])
+
+    def linearisation(self, vector: Array) -> Linearisation | None:
+        """Innovations and Jacobian, weighted by the innovation covariance at the same vector; made once for each."""
+        if not np.array_equal(self._linear[0], vector):
+            if not np.array_equal(self._at, vector):
+                self.cost(vector)
+            at = None
+            if self._covariance is not None:
+                at = linearise(self.problem, vector, weight_of(self._covariance), self.work)
+            self._linear = (vector.copy(), at)
+        return self._linear[1]

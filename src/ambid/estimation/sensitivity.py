@@ -1,4 +1,8 @@
-"""Innovations of a record and their exact Jacobian, compressed by QR block after block."""
+"""Innovations of a record and their exact Jacobian, compressed to a triangle block after block.
+
+Away from everything known the blocks are reduced by QR. Near a place whose triangle T is known, sensitivities are taken
+along the columns of T^-1, which are nearly orthonormal: their Gram matrix then loses no digits, and costs a fifth.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.estimation.linear import column_sizes
 from ambid.estimation.predictor import assemble
 from ambid.estimation.problem import PredictorProblem
 
 _BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
 _QR_ROWS = 256  # rows of one small QR: below the size at which the linear algebra library starts threads
+_WELL = 1e-6  # least eigenvalue of a Gram matrix with unit diagonal that a triangle is taken from
+_TURNED = 1e-9  # least singular value, over the largest, of the scaled triangle that others are taken along
 
 
 class Workspace:
-    """What repeated evaluations of one problem share: scaled data, and the last gain to start the next Riccati
-    solve.
+    """What repeated evaluations of one problem share: scaled data, the last gain to start the next Riccati solve, and
+    the last triangle with its inverse, along whose columns the next Jacobian is taken.
 
     `y`: (n_used, n_outputs), scaled outputs; `w`: (n_used, n_states + n_lags n_inputs + n_outputs + 1), room for the
     states of the predictor, and what drives it: inputs at the problem's lags, y, 1; `z`: (n_used, n_lags n_inputs +
@@ -35,8 +42,27 @@ class Workspace:
         self.w = np.hstack([np.zeros((at.size, n)), *lagged, self.y, np.ones((at.size, 1))])
         self.z = self.w[:, n:]
         self.gain: Array | None = None
+        self.turn: tuple[Array, Array] | None = None
+        self._problem = problem
         self._weight, self._weighted = np.zeros((0, 0)), self.y
         self._buffers: tuple[Array, ...] = ()
+
+    def of(self, problem: PredictorProblem) -> Workspace:
+        """Return the workspace of a problem: this one, where the scaled data are the same."""
+        own, new = self._problem, problem
+        same = (
+            own.u is new.u and own.y is new.y and (own.delay, own.skip, own.stride) == (new.delay, new.skip, new.stride)
+        )
+        same = same and own.lags == new.lags and np.array_equal(own.scales.input, new.scales.input)
+        if not same or not np.array_equal(own.scales.output, new.scales.output):
+            return Workspace(problem)
+        if self.turn is not None and self.turn[0].shape[0] != problem.size:
+            self.turn = None
+        return self
+
+    def near(self, triangle: Array) -> None:
+        """Take note of a triangle that is about that of the next Jacobian."""
+        self.turn = _turn(triangle)
 
     def buffers(self, *shapes: tuple[int, ...]) -> tuple[Array, ...]:
         """Return scratch arrays, the same ones as long as the shapes stay the same: fresh pages cost more than sums.
@@ -119,18 +145,95 @@ def linearise(
     """
     work = work or Workspace(problem)
     p, moment = problem.size, np.zeros_like(weight)
-    blocks = []
-    for rows in residual_blocks(problem, vector, weight, work):
+    full = _near_triangle(problem, vector, weight, work, moment) if work.turn is not None else None
+    if full is None:
+        blocks, moment[:] = list[Array](), 0.0
+        for rows in residual_blocks(problem, vector, weight, work):
+            e = rows[:, :, p]
+            moment += e.T @ e
+            blocks.append(reduce_rows(rows.reshape(-1, p + 1)))
+        if not blocks or not np.all(np.isfinite(moment)):
+            return None
+        reduced = reduce_rows(np.vstack(blocks), last=True)
+        full = np.zeros((p + 1, p + 1))
+        full[: reduced.shape[0]] = reduced
+    work.turn = _turn(full[:p, :p])
+    back = np.linalg.inv(weight)
+    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=back @ moment @ back.T / problem.n_used)
+
+
+def _near_triangle(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace, moment: Array
+) -> Array | None:
+    """Triangle of [J | r] from the Gram matrix along the last triangle's directions, None where digits run short."""
+    assert work.turn is not None
+    (last, turn), p = work.turn, problem.size
+    gram = np.zeros((p + 1, p + 1))
+    for rows in residual_blocks(problem, vector, weight, work, turn):
         e = rows[:, :, p]
         moment += e.T @ e
-        blocks.append(reduce_rows(rows.reshape(-1, p + 1)))
-    if not blocks or not np.all(np.isfinite(moment)):
+        for o in range(rows.shape[1]):
+            gram += rows[:, o].T @ rows[:, o]
+    if not np.all(np.isfinite(gram)) or not np.all(np.diag(gram) > 0.0):
         return None
-    back = np.linalg.inv(weight)
-    reduced = reduce_rows(np.vstack(blocks), last=True)
-    full = np.zeros((p + 1, p + 1))
-    full[: reduced.shape[0]] = reduced
-    return Linearisation(r=full[:, p].copy(), J=full[:, :p].copy(), covariance=back @ moment @ back.T / problem.n_used)
+    size = np.sqrt(np.diag(gram))
+    gram /= np.outer(size, size)
+    if np.linalg.eigvalsh(gram)[0] < _WELL:
+        return None
+    full = np.linalg.cholesky(gram).T * size
+    full[:, :p] = full[:, :p] @ last
+    return np.asarray(full)
+
+
+def _turn(triangle: Array) -> tuple[Array, Array] | None:
+    """A triangle and its inverse, None where the data do not tell some directions apart."""
+    size = column_sizes(triangle)
+    scaled = triangle / size
+    s = np.linalg.svd(scaled, compute_uv=False)
+    if not s[-1] > _TURNED * s[0]:
+        return None
+    return triangle, np.linalg.inv(scaled) / size[:, None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Products:
+    """Scalar products over a whole record of J, e and further columns, J along the directions of `turn`."""
+
+    turn: Array  # (size, size)
+    rows: Array  # (size + 1, size + 1), of [J turn, e], summed over the outputs
+    cross: Array  # (n_outputs, size + 1, n_columns), of [J turn, e] of each output and the columns
+    scores: Array  # (n_stretches, size), J' e of stretches of the record, by each number
+
+
+def products(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace, columns: Array, stretches: int = 1
+) -> Products | None:
+    """Return all scalar products that checks and robust covariances are made of, from one pass of sensitivities.
+
+    `columns`: (n_used, n_columns); `stretches`: into about how many the record is cut. None where there is no
+    predictor, or the data do not tell all numbers apart.
+    """
+    p, n_used, n_y = problem.size, problem.n_used, work.y.shape[1]
+    if work.turn is None and linearise(problem, vector, weight, work) is None:
+        return None
+    turn = np.eye(p) if work.turn is None else work.turn[1]
+    length = max(1, n_used // stretches)
+    rows, cross = np.zeros((p + 1, p + 1)), np.zeros((n_y, p + 1, columns.shape[1]))
+    scores, first = np.zeros((-(-n_used // length), p)), 0
+    for block in residual_blocks(problem, vector, weight, work, turn):
+        m = block.shape[0]
+        for o in range(n_y):
+            own = block[:, o]
+            rows += own.T @ own
+            cross[o] += own.T @ columns[first : first + m]
+            for b in range(first // length, (first + m - 1) // length + 1):
+                part = own[max(b * length - first, 0) : (b + 1) * length - first]
+                scores[b] += part[:, :p].T @ part[:, p]
+        first += m
+    if not first or not np.all(np.isfinite(rows)):
+        return None
+    back = np.eye(p) if work.turn is None else work.turn[0]
+    return Products(turn=turn, rows=rows, cross=cross, scores=scores @ back)
 
 
 def reduce_rows(rows: Array, *, last: bool = False) -> Array:
@@ -148,10 +251,13 @@ def reduce_rows(rows: Array, *, last: bool = False) -> Array:
     return np.vstack([factors.reshape(-1, rows.shape[1]), rows[whole:]])
 
 
-def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, work: Workspace) -> Iterator[Array]:
+def residual_blocks(
+    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace, turn: Array | None = None
+) -> Iterator[Array]:
     """Yield rows [W de/dq, W e] block after block, so that memory does not grow with the record.
 
-    `vector`: (size,); `weight`: (n_outputs, n_outputs). Returns (block, n_outputs, size + 1), a view, overwritten by
+    `vector`: (size,); `weight`: (n_outputs, n_outputs); `turn`: (size, size), directions along whose columns the
+    derivatives are taken, instead of by each number. Returns (block, n_outputs, size + 1), a view, overwritten by
     the next block. Nothing is yielded where there is no predictor at `vector`.
     """
     from ambid.estimation.kernels import sensitivity_scan, state_scan
@@ -173,9 +279,13 @@ def residual_blocks(problem: PredictorProblem, vector: Array, weight: Array, wor
     forcing = np.zeros((n, M.shape[1], width))
     forcing[:, :, :p] = np.tensordot(basis, predictor.dM, axes=1)
     forcing[:, :n] = turned.T @ forcing[:, :n]
+    if turn is not None:
+        forcing[:, :, :p] = forcing[:, :, :p] @ turn
     rows, s = work.buffers((n, length, width), (n, width))
     s[:], x = 0.0, basis @ predictor.x0
     s[:, problem.slices["initial"]] = basis
+    if turn is not None:
+        s[:, :p] = s[:, :p] @ turn
     F, outputs = np.ascontiguousarray(M[:, :n]), work.weighted(weight)
     for a in range(0, n_used, _BLOCK):
         part = work.w[a : a + _BLOCK]

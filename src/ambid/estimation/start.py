@@ -41,11 +41,13 @@ def candidates(
     delay_samples: float,
     rate_hz: float,
     known: Mapping[str, float],
+    motion: dict[tuple[float, bool], Array] | None = None,
 ) -> Iterator[dict[str, float]]:
     """Yield start values for the named model, one set for each band.
 
     `model_name`: ``"one-axis"``, ``"coil"`` or ``"rotor"``; `delay_samples`: delay of the input; `known`: fixed values,
-    SI; they are used, and returned unchanged. Returns all parameters of the model, SI.
+    SI; they are used, and returned unchanged; `motion`: keeps what does not depend on the delay, for the next call.
+    Returns all parameters of the model, SI.
     """
     for part, errors_in_variables in _BANDS:
         lines = slice(_LOWEST_LINE, int(part * m.omega.size))
@@ -68,13 +70,18 @@ def candidates(
             x0, x1, x2 = s["position"]
             damping = known.get("c", 0.0)
             rate = damping / found.get("m", np.inf) if damping else 0.0
-            force = s["current"][0] * (lag if model_name == "rotor" else 1.0)
-            terms = [
-                ("position", jw**2 + rate * jw, x2 + rate * x1),
-                ("position", -1 + 0 * jw, -x0),
-                ("current", 1 + 0 * jw, force),
-            ]
-            stiffness, current = regress(terms, 1.0 / np.abs(jw + corner) ** 2, level)
+            kept = None if motion is None or model_name == "rotor" or rate else motion.get((part, errors_in_variables))
+            if kept is None:
+                force = s["current"][0] * (lag if model_name == "rotor" else 1.0)
+                terms = [
+                    ("position", jw**2 + rate * jw, x2 + rate * x1),
+                    ("position", -1 + 0 * jw, -x0),
+                    ("current", 1 + 0 * jw, force),
+                ]
+                kept = regress(terms, 1.0 / np.abs(jw + corner) ** 2, level)
+                if motion is not None:
+                    motion[part, errors_in_variables] = kept
+            stiffness, current = kept
             if "m" not in known:  # its sign may come out wrong where the motional voltage is lost in the noise
                 found["m"] = abs(found["k_i"] / current) if "k_i" in found and current != 0 else 1.0
             found = {**found, "k_x": stiffness * found["m"], "k_i": current * found["m"], "c": damping, **known}
@@ -94,9 +101,9 @@ def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: M
     a = np.vstack([a.real, a.imag])
     norm = np.linalg.norm(a, axis=0)
     norm[norm == 0] = 1.0
-    a = a / norm
+    short = np.asarray(np.linalg.qr(a / norm, mode="r"))
     if not noise:
-        found = np.linalg.lstsq(a[:, 1:], a[:, 0], rcond=None)[0]
+        found = np.linalg.lstsq(short[:, 1:], short[:, 0], rcond=None)[0]
         return np.asarray(found / norm[1:] * norm[0], dtype=np.float64)
     spread = np.full((len(terms), len(terms)), 0.0)
     for role, sd in noise.items():
@@ -106,7 +113,7 @@ def regress(terms: list[tuple[str, Spectrum, Spectrum]], weight: Array, noise: M
     if not spread[0, 0] > 0:
         return np.full(len(terms) - 1, np.nan)
     # smallest generalised singular vector of a against the noise: exact columns get a tiny one
-    factor, short = np.linalg.cholesky(spread), np.asarray(np.linalg.qr(a, mode="r"))
+    factor = np.linalg.cholesky(spread)
     _, _, vt = np.linalg.svd(np.linalg.solve(factor, short.T).T)
     v = np.linalg.solve(factor.T, vt[-1]) / norm
     return -v[1:] / v[0] if v[0] != 0 else np.full(len(terms) - 1, np.nan)

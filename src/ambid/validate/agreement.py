@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.greybox import carry
-from ambid.estimation.likelihood import Fit, search
+from ambid.estimation.likelihood import Fit, search, workspace_near
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
 
@@ -66,7 +66,7 @@ def agreement(fit: Fit) -> Agreement:
     for stride in STRIDES:
         sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
         start = carry(fit, sparse)
-        again = search(sparse, start, rounds=6, evaluations=10)
+        again = search(sparse, start, most=20, work=workspace_near(fit, sparse))
         if again.status != "converged":
             continue
         spread = directions(np.vstack([again.J, again.J_prior])).inverse()[:n, :n]

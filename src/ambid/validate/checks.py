@@ -15,7 +15,7 @@ from ambid.record import Record
 from ambid.signals.faults import find_dropouts, find_outliers, find_saturation
 from ambid.validate.agreement import Agreement
 from ambid.validate.plausibility import implausible
-from ambid.validate.residuals import P_LEAST, ResidualTest, residuals_uncorrelated, residuals_white
+from ambid.validate.residuals import P_LEAST, ResidualTest, residual_tests
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
@@ -29,9 +29,10 @@ def residual_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) ->
     ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
     the robust standard deviations are to be used.
     """
+    own, inputs = residual_tests(fit, e)
     return {
-        "residuals_white": residual_check(residuals_white(fit, e), "innovations against their own past"),
-        "residuals_uncorrelated": residual_check(residuals_uncorrelated(fit, e), "innovations against past inputs"),
+        "residuals_white": residual_check(own, "innovations against their own past"),
+        "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
         "uncertainty_consistent": Check(
             passed=known.inflation < _INFLATION,
             values={"inflation": known.inflation},

@@ -15,10 +15,13 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.likelihood import Fit, weight_of
-from ambid.estimation.sensitivity import Workspace, reduce_rows, residual_blocks
+from ambid.estimation.linear import column_sizes
+from ambid.estimation.sensitivity import Products, Workspace, products
 
 P_LEAST = 1e-3  # 99.9 % bounds
 _WHITE_LAGS = (1, 2, 3, 5, 8, 13)
+_BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither record nor priors see
+_SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,57 +40,46 @@ class ResidualTest:
         return self.p >= P_LEAST
 
 
-def residuals_white(fit: Fit, e: Array) -> ResidualTest:
-    """Test the innovations against their own past.
+def residual_tests(fit: Fit, e: Array) -> tuple[ResidualTest, ResidualTest]:
+    """Test the innovations against their own past, and against past inputs.
 
     `e`: (n_used, n_outputs), innovations at the fit, scaled.
     """
-    white = e @ weight_of(fit.covariance).T
-    lags = tuple(k for k in _WHITE_LAGS if k < len(e) // 10)
-    return _score_test(fit, white, white, lags)
-
-
-def residuals_uncorrelated(fit: Fit, e: Array) -> ResidualTest:
-    """Test the innovations against past inputs.
-
-    `e`: (n_used, n_outputs), innovations at the fit, scaled.
-    """
-    problem = fit.problem
+    problem, weight = fit.problem, weight_of(fit.covariance)
+    white, n = e @ weight.T, len(e)
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input
-    longest = max(2, len(e) // 20)
-    lags = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
-    white = e @ weight_of(fit.covariance).T
-    return _score_test(fit, white, u, lags)
+    longest = max(2, n // 20)
+    own = tuple(k for k in _WHITE_LAGS if k < n // 10)
+    inputs = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
+    lagged = np.hstack([_lagged(white, own), _lagged(u, inputs)])
+    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
+    work = fit.work if fit.work is not None else Workspace(problem)
+    found = products(problem, fit.vector, weight, work.of(problem), lagged)
+    if found is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    first = len(own) * white.shape[1]
+    return (
+        _score_test(fit, found, white, lagged, own, slice(0, first)),
+        _score_test(fit, found, white, lagged, inputs, slice(first, None)),
+    )
 
 
-def _score_test(fit: Fit, white: Array, signals: Array, lags: tuple[int, ...]) -> ResidualTest:
-    """Score test of lagged `signals` as further regressors of every whitened innovation."""
+def _score_test(
+    fit: Fit, found: Products, white: Array, lagged: Array, lags: tuple[int, ...], which: slice
+) -> ResidualTest:
+    """Score test of some lagged columns as further regressors of every whitened innovation."""
     from scipy.special import chdtrc
 
-    problem, n_y = fit.problem, white.shape[1]
-    p, per_output = problem.size, len(lags) * signals.shape[1]
-    lagged = _lagged(signals, lags)
-    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
-    first, work, blocks = 0, Workspace(problem), list[Array]()
-    for rows in residual_blocks(problem, fit.vector, weight_of(fit.covariance), work):
-        m = rows.shape[0]
-        wide = np.zeros((m, n_y, p + n_y * per_output + 1))
-        wide[:, :, :p] = rows[:, :, :p]
-        wide[:, :, -1] = rows[:, :, p]
-        for o in range(n_y):
-            wide[:, o, p + o * per_output : p + (o + 1) * per_output] = lagged[first : first + m]
-        blocks.append(reduce_rows(wide.reshape(m * n_y, -1)))
-        first += m
-    R = reduce_rows(np.vstack(blocks), last=True)
-    statistic, degrees = _explained(R, p, fit)
-    correlation = (white.T @ lagged) / np.linalg.norm(white, axis=0)[:, None]
+    columns = lagged[:, which]
+    statistic, degrees = _explained(fit, found, columns.T @ columns, which)
+    correlation = (white.T @ columns) / np.linalg.norm(white, axis=0)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     return ResidualTest(
         p=float(chdtrc(max(degrees, 1), statistic)),
         statistic=statistic,
         degrees=degrees,
         largest=float(np.abs(correlation[place])),
-        largest_lag=lags[int(place[1]) // signals.shape[1]],
+        largest_lag=lags[int(place[1]) // (columns.shape[1] // len(lags))],
     )
 
 
@@ -99,18 +91,24 @@ def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
     return out
 
 
-def _explained(R: Array, p: int, fit: Fit) -> tuple[float, int]:
-    """Sum of squares that the added columns explain beyond the Jacobian's, and their rank beyond it."""
-    prior = np.zeros((fit.J_prior.shape[0], R.shape[1]))
-    prior[:, :p], prior[:, -1] = fit.J_prior, fit.r_prior
-    a = np.vstack([R, prior])
-    norm = np.linalg.norm(a[:, :-1], axis=0)
-    norm[norm == 0] = 1.0
-    a[:, :-1] /= norm
-    base, s, _ = np.linalg.svd(a[:, :p], full_matrices=False)
-    base = base[:, s > 1e-10 * s[0]]
-    rest = a[:, p:] - base @ (base.T @ a[:, p:])
-    u, s, _ = np.linalg.svd(rest[:, :-1], full_matrices=False)
-    u = u[:, s > 1e-6]  # lags of a slow input are nearly the same column
-    inside = u.T @ rest[:, -1]
-    return float(inside @ inside), int(u.shape[1])
+def _explained(fit: Fit, found: Products, inner: Array, which: slice) -> tuple[float, int]:
+    """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
+
+    What the Jacobian and the priors explain is taken off by the Schur complement of their products, which lose no
+    digits because the Jacobian is nearly orthonormal there.
+    """
+    p, (n_y, _, _) = fit.problem.size, found.cross.shape
+    prior = fit.J_prior @ found.turn
+    own = found.rows[:p, :p] + prior.T @ prior
+    pull = found.rows[:p, p] + prior.T @ fit.r_prior
+    cross = np.hstack([found.cross[o, :p, which] for o in range(n_y)])
+    size = column_sizes(np.sqrt(np.diag(own))[None, :])
+    values, vectors = np.linalg.eigh(own / np.outer(size, size))
+    seen = values > _BLIND * values[-1]
+    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([cross, pull]) / size[:, None])
+    rest = np.kron(np.eye(n_y), inner) - factor[:, :-1].T @ factor[:, :-1]
+    left = np.concatenate([found.cross[o, p, which] for o in range(n_y)]) - factor[:, :-1].T @ factor[:, -1]
+    values, vectors = np.linalg.eigh(rest)
+    kept = values > _SAME**2
+    inside = (vectors[:, kept].T @ left) / np.sqrt(values[kept])
+    return float(inside @ inside), int(np.count_nonzero(kept))

@@ -18,7 +18,7 @@ from ambid.estimation.threads import one_thread
 from ambid.physics.models import model
 from ambid.validate.checks import residual_check
 from ambid.validate.prediction import expected_prediction_sd, fit_of, prediction_error, simulation_error
-from ambid.validate.residuals import residuals_uncorrelated, residuals_white
+from ambid.validate.residuals import residual_tests
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _HORIZONS = (1, 10, 100)  # samples ahead
@@ -182,9 +182,10 @@ def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[i
 def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
     e = run.innovations / run.fit.problem.scales.output
     worst = max(ratios, key=lambda role: abs(np.log(ratios[role])))
+    own, inputs = residual_tests(run.fit, e)
     return {
-        "residuals_white": residual_check(residuals_white(run.fit, e), "innovations against their own past"),
-        "residuals_uncorrelated": residual_check(residuals_uncorrelated(run.fit, e), "innovations against past inputs"),
+        "residuals_white": residual_check(own, "innovations against their own past"),
+        "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
         "innovations_consistent": Check(
             passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
             values={f"{role}_ratio": r for role, r in ratios.items()},
