@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 from ambid.arrays import Array
 
@@ -127,26 +127,5 @@ class NonlinearModel(Protocol):
         ...
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `from_json` needs, as JSON-able values; numbers survive bit by bit."""
-        ...
-
-    @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
-        """Read it back.
-
-        Parameters
-        ----------
-        found : dict
-            That `as_json` made.
-
-        Returns
-        -------
-        NonlinearModel
-            Equal to the one that was written.
-
-        Raises
-        ------
-        EstimationError
-            If something is missing or of another shape.
-        """
+        """Return all that `nonlinear.model_file` needs to read it back; numbers survive bit by bit."""
         ...

@@ -1,9 +1,10 @@
-"""Nonlinear models as JSON: which class reads which kind. Numbers survive bit by bit."""
+"""Nonlinear models as JSON: who reads which kind. Numbers survive bit by bit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
+from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -12,16 +13,16 @@ from ambid.nonlinear.model import NonlinearModel
 
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
-        "narmax": "ambid.nonlinear.narmax.model:PolynomialNarmax",
-        "hybrid": "ambid.nonlinear.hybrid.model:HybridNarmax",
-        "rbf": "ambid.nonlinear.rbf.model:RbfNetwork",
-        "nn": "ambid.nonlinear.networks.state_model:StateNetwork",
-        "nn-magnitude": "ambid.nonlinear.networks.magnitude_model:MagnitudeNetwork",
-        "narx": "ambid.nonlinear.networks.narx_model:NeuralNarx",
-        "lpv": "ambid.nonlinear.lpv.model:LpvModel",
+        "narmax": "ambid.nonlinear.narmax.model:PolynomialNarmax.from_json",
+        "hybrid": "ambid.nonlinear.hybrid.model:HybridNarmax.from_json",
+        "rbf": "ambid.nonlinear.rbf_network:read_model",
+        "nn": "ambid.nonlinear.networks.state_model:StateNetwork.from_json",
+        "nn-magnitude": "ambid.nonlinear.networks.magnitude_model:MagnitudeNetwork.from_json",
+        "narx": "ambid.nonlinear.narx:read_model",
+        "lpv": "ambid.nonlinear.lpv.model:LpvModel.from_json",
     }
 )
-"""``module:class`` by `NonlinearModel.kind`; imported only when a model of that kind is read."""
+"""Who reads a model, ``module:function`` by `NonlinearModel.kind`; imported only when one of that kind is read."""
 
 
 def model_to_json(model: NonlinearModel) -> dict[str, Any]:
@@ -41,10 +42,8 @@ def model_from_json(found: Mapping[str, Any]) -> NonlinearModel:
     if not isinstance(found, Mapping) or not isinstance(found.get("kind"), str):
         raise EstimationError("the model has no kind; a file of a nonlinear fit names it. Write the file again")
     module, name = _home(found["kind"]).split(":")
-    model: NonlinearModel = getattr(import_module(module), name).from_json(
-        {k: v for k, v in found.items() if k != "kind"}
-    )
-    return model
+    read: Callable[[dict[str, Any]], NonlinearModel] = attrgetter(name)(import_module(module))
+    return read({k: v for k, v in found.items() if k != "kind"})
 
 
 def _home(kind: str) -> str:

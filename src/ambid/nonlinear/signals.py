@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -62,3 +62,11 @@ def with_head(model: ScaledModel, u: Array, y: Array) -> tuple[Array, int]:
     whole = np.zeros((u.shape[0], y.shape[1]))
     whole[:head] = y[:head]
     return whole, head
+
+
+def finite(value: Any, n: int, what: str) -> Array:
+    """Return `n` stored numbers, shape (n,); raises ValueError about `what` where they are not finite."""
+    out = np.array(value, dtype=np.float64).reshape(n)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{what} is not finite")
+    return out

@@ -14,10 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Literal
+from typing import Any, Literal
 
 from ambid.errors import EstimationError, nearest
 from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.settings import rules
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,8 +27,8 @@ class NonlinearStructure:
 
     name: str  # for lists
     summary: str
-    # what it may be told, each with a line that says what it is and what is chosen without it
-    settings: Mapping[str, str]
+    # settings by name, each with a line that says what it is and what is chosen without it; or their dataclass
+    options: Mapping[str, str] | str
     home: str  # ``module:function`` of its estimator
     # what feedback does to it: nothing; bias; nothing as long as its noise model holds the true one
     feedback: Literal["consistent", "biased", "with noise model"]
@@ -35,16 +36,28 @@ class NonlinearStructure:
     @property
     def estimator(self) -> Callable[..., NonlinearFit]:
         """The function that fits it."""
-        module, function = self.home.split(":")
-        found: Callable[..., NonlinearFit] = getattr(import_module(module), function)
+        found: Callable[..., NonlinearFit] = _load(self.home)
         return found
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Settings by name, each with a line that says what it is and what is chosen without it."""
+        if isinstance(self.options, str):
+            return {name: rule.says for name, rule in rules(_load(self.options)).items()}
+        return self.options
+
+
+def _load(home: str) -> Any:
+    """What ``module:name`` says."""
+    module, name = home.split(":")
+    return getattr(import_module(module), name)
 
 
 _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="narmax",
         summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
-        settings={
+        options={
             "ny": "largest lag of the outputs; 2",
             "nu": "number of lags of each input; 2",
             "nk": "smallest lag of the inputs; 1",
@@ -69,7 +82,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="nn",
         summary="state-space network whose weights are A and B (thesis fig. 5.9), beside a network G(x, u)",
-        settings={
+        options={
             "form": "one-axis (entries of thesis eq. 4.8), free, auto (one-axis where units are V, m, A); auto",
             "states": "of the form free; chosen by Bayes' criterion. one-axis has 3",
             "delay": "samples by which inputs act late; auto (0 to 20, by the errors of short trainings)",
@@ -92,25 +105,14 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="narx",
         summary="neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
-        settings={
-            "ny": "lags of the outputs; chosen by held-out error",
-            "nu": "lags of each input; chosen by held-out error",
-            "nk": "smallest lag of the inputs; 1",
-            "neurons": "hidden units; chosen by held-out error",
-            "starts": "random starts; 3",
-            "held_out": "part at the end of each record that training is watched on; 0.2",
-            "prior": "standard deviation of the hidden layer's weights before the data, scaled signals; 10",
-            "iterations": "of each training, at most; 60",
-            "focus": "prediction or simulation: which errors are made small at last; prediction",
-            "uncertainty": "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich for simulation); auto",
-        },
-        home="ambid.nonlinear.networks.narx:narx",
+        options="ambid.nonlinear.narx:NarxSettings",
+        home="ambid.nonlinear.narx:narx",
         feedback="with noise model",
     ),
     NonlinearStructure(
         name="lpv",
         summary="linear model whose coefficients follow a scheduling signal such as the set point; error model",
-        settings={
+        options={
             "schedule": "scheduling signal: an input, the output, or level (set point: output, low-passed); level",
             "time_constant": "of the low-pass of level, in s; chosen, at least five of the plant's own",
             "exciting": "yes where the scheduling input acts on the output as well; no",
@@ -132,7 +134,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="hybrid",
         summary="polynomial, network for what it leaves, noise model C (thesis eqs 3.23-3.24)",
-        settings={
+        options={
             "ny": "largest lag of the outputs; 2",
             "nu": "number of lags of each input; 2",
             "nk": "smallest lag of the inputs; 1",
@@ -157,31 +159,8 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="rbf",
         summary="radial basis functions of lagged outputs and inputs, beside a linear part (thesis eqs 1.13-1.14)",
-        settings={
-            "ny": "lags of the outputs; chosen by held-out error",
-            "nu": "lags of each input; chosen by held-out error",
-            "nk": "smallest lag of the inputs; 1",
-            "linear": "1 for a linear part beside the units, 0 for none; 1",
-            "neurons": "units; chosen",
-            "unit": "gaussian, inverse-multiquadric, thin-plate; gaussian",
-            "seen": "regressors that the units see: all, outputs, inputs; chosen",
-            "metric": "of the distance from a centre: scaled, whitened (all directions of the data alike); scaled",
-            "centres": "ols (orthogonal least squares among the data) or kmeans; ols",
-            "widths": "common, or by the distance of neighbours; common for ols, neighbours for kmeans",
-            "width": "in sizes of the data, or in distances of neighbours; chosen",
-            "choice": "what chooses number and width of the units: held_out, bic, aicc, aic; held_out",
-            "held_out": "part at the end of each record that is held out for it; 0.2",
-            "prior": "standard deviation of the units' weights before the data, scaled; by restricted likelihood",
-            "training": "linear (least squares), recursive (Gauss-Newton by sample), descent (3.18-3.22); linear",
-            "trained": "weights, or all (centres, widths too; by Levenberg-Marquardt if training is linear); weights",
-            "rate": "descent: of the steps, 0.02; recursive: least gain, 0 to count all samples alike",
-            "bounded": "1 to bound the rate so that no sample's error grows, 0 as in the thesis; 1",
-            "passes": "over the records, recursive or descent; 1 for the weights recursively, otherwise 20",
-            "iterations": "of Levenberg-Marquardt, at most; 60",
-            "focus": "prediction or simulation: which errors are made small at last; prediction",
-            "uncertainty": "laplace, sandwich (errors not taken as white), none; auto: sandwich for simulation errors",
-        },
-        home="ambid.nonlinear.rbf.estimate:rbf",
+        options="ambid.nonlinear.rbf:RbfSettings",
+        home="ambid.nonlinear.rbf:rbf",
         feedback="with noise model",
     ),
 )

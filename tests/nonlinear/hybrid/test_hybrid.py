@@ -16,7 +16,7 @@ from ambid.nonlinear.hybrid.function import HybridShape
 from ambid.nonlinear.hybrid.result import laplace
 from ambid.nonlinear.hybrid.train import HybridProblem, problem_at
 from ambid.nonlinear.narmax import Factor, narmax
-from ambid.nonlinear.networks.narx import narx
+from ambid.nonlinear.narx import narx
 from ambid.nonlinear.networks.narx_function import NarxShape
 from tests.nonlinear.narmax.systems import coefficients, polynomial, record
 

@@ -10,12 +10,12 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.estimation.uncertainty import bootstrapped, sandwich, score_covariance
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.networks.narx import narx
+from ambid.nonlinear.narx import narx
 from ambid.nonlinear.networks.nn import nn
 from ambid.nonlinear.networks.nn_spread import disagreement
 from ambid.nonlinear.networks.nn_train import State
-from tests.nonlinear.networks.test_narx_network import data
 from tests.nonlinear.networks.test_state_network import one_axis, sampled
+from tests.nonlinear.test_narx import data
 
 
 def coloured(n: int, seed: int, size: float, pole: float = 0.9) -> np.ndarray:

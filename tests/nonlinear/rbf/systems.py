@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.networks.narx_function import NarxShape
-from ambid.nonlinear.rbf.shape import RbfShape
+from ambid.nonlinear.rbf_network import RbfFunction
 
 Array = NDArray[np.float64]
 
@@ -19,13 +18,13 @@ def data(u: Array, y: Array, *, open_loop: bool = True) -> IOData:
     return IOData(u=u, y=y, dt=0.01, inputs=names[0], outputs=names[1], units=units, open_loop=open_loop)
 
 
-def shape(
+def network(
     p: int = 1, m: int = 1, *, ny: int = 1, nu: int = 1, nk: int = 1, neurons: int = 3, unit: str = "gaussian",
     linear: bool = True, metric: Array | None = None,
-) -> RbfShape:  # fmt: skip
-    lags = NarxShape(n_outputs=p, n_inputs=m, ny=ny, nu=nu if m else 0, nk=nk, neurons=0)
-    M = np.eye(lags.n_regressors) if metric is None else metric
-    return RbfShape(lags=lags, metric=M, linear=linear, neurons=neurons, unit=unit)
+) -> RbfFunction:  # fmt: skip
+    nu = nu if m else 0
+    M = np.eye(p * ny + m * nu) if metric is None else metric
+    return RbfFunction(p=p, m=m, ny=ny, nu=nu, nk=nk, linear=linear, neurons=neurons, unit_name=unit, metric=M)
 
 
 CENTRES = np.array([[-1.0, 0.8], [1.2, 1.0], [0.2, -1.2]])

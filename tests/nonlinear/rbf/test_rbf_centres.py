@@ -7,7 +7,7 @@ import pytest
 
 from ambid.nonlinear.narmax.candidates import MatrixCandidates
 from ambid.nonlinear.narmax.selection import select_terms
-from ambid.nonlinear.rbf.centres import k_means, neighbour_widths, ols_order, typical_size
+from ambid.nonlinear.rbf_network import k_means, neighbour_widths, ols_order, typical_size
 
 
 def left(columns: np.ndarray, y: np.ndarray) -> float:

@@ -14,8 +14,7 @@ from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.hybrid.function import HybridShape
 from ambid.nonlinear.narmax.terms import term_from_json, term_to_json
 from ambid.nonlinear.networks.narx_function import NarxShape
-from ambid.nonlinear.networks.narx_model import finite
-from ambid.nonlinear.signals import scaled, with_head
+from ambid.nonlinear.signals import finite, scaled, with_head
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

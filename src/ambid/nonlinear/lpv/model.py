@@ -16,8 +16,7 @@ from ambid.nonlinear.lpv.beginning import beginning, looks_back, settling
 from ambid.nonlinear.lpv.frozen import Frozen, frozen
 from ambid.nonlinear.lpv.schedule import BASES, Schedule, basis_values
 from ambid.nonlinear.lpv.shape import LpvShape, Part, errors, part_of
-from ambid.nonlinear.networks.narx_model import finite
-from ambid.nonlinear.signals import scaled, with_head
+from ambid.nonlinear.signals import finite, scaled, with_head
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ from ambid.nonlinear.lpv.shape import LpvShape, Part, errors, sound
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LpvProblem:
-    """What is searched in (a `nonlinear.search.Problem`)."""
+    """What is searched in (a `estimation.search.Problem`)."""
 
     shape: LpvShape
     parts: tuple[Part, ...]  # by record

@@ -11,8 +11,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.networks.magnitude_problem import FoldedLayout, slopes, states
-from ambid.nonlinear.networks.narx_model import finite
-from ambid.nonlinear.signals import scaled, with_head
+from ambid.nonlinear.signals import finite, scaled, with_head
 
 _ITERATIONS = 30  # of the search for the first state
 _SIGNS = (0.0, 1.0, -1.0)  # of the state that the search begins at, in sizes of the first output

@@ -11,9 +11,8 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.networks.layout import Layout, Matrices
-from ambid.nonlinear.networks.narx_model import finite
 from ambid.nonlinear.networks.segments import Shot, run, slopes
-from ambid.nonlinear.signals import scaled, with_head
+from ambid.nonlinear.signals import finite, scaled, with_head
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,107 +1,12 @@
-"""Compiled loops over samples: free run of a radial basis network with its slopes, and its two recursive trainings."""
+"""Compiled loops over samples: the two recursive trainings of a radial basis network."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-
-Table = NDArray[np.int64]
-
-_FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
-_NONE = 1e-300  # as in units.py
-
-
-@compiled(error_model="numpy")
-def _units(x: Array, C: Array, s: Array, unit: int, phi: Array, by_q: Array, q: Array) -> None:
-    """Write value, slope by the squared distance, and squared distance of every unit."""
-    for k in range(s.size):
-        r = 0.0
-        for j in range(x.size):
-            r += (x[j] - C[k, j]) ** 2
-        r *= np.exp(-2.0 * s[k])
-        q[k] = r
-        if unit == 0:
-            phi[k] = np.exp(-0.5 * r)
-            by_q[k] = -0.5 * phi[k]
-        elif unit == 1:
-            phi[k] = 1.0 / np.sqrt(1.0 + r)
-            by_q[k] = -0.5 * phi[k] ** 3
-        elif r > _NONE:
-            phi[k] = 0.5 * r * np.log(r)
-            by_q[k] = 0.5 * (np.log(r) + 1.0)
-        else:
-            phi[k], by_q[k] = 0.0, 0.0
-
-
-@compiled(error_model="numpy")
-def run_rbf(
-    L: Array, c: Array, W: Array, C: Array, s: Array, M: Array, unit: int, column: Table, back: Table, lag: int,
-    z: Array,
-) -> None:  # fmt: skip
-    """Run freely: z (n_samples, p + m) holds outputs, then inputs; outputs from `lag` on are written.
-
-    Regressor d is column `column[d]` of z, `back[d]` samples ago. NaN from a divergence on.
-    """
-    N, p, h, D, Q = z.shape[0], c.size, s.size, column.size, M.shape[0]
-    r, x, phi, by_q, q = np.zeros(D), np.zeros(Q), np.zeros(h), np.zeros(h), np.zeros(h)
-    for t in range(lag, N):
-        for d in range(D):
-            r[d] = z[t - back[d], column[d]]
-        for j in range(Q):
-            x[j] = 0.0
-            for d in range(D):
-                x[j] += M[j, d] * r[d]
-        _units(x, C, s, unit, phi, by_q, q)
-        for o in range(p):
-            f = c[o]
-            for d in range(D):
-                f += L[o, d] * r[d]
-            for k in range(h):
-                f += W[o, k] * phi[k]
-            z[t, o] = f
-        for o in range(p):
-            if not abs(z[t, o]) < _FAR:
-                z[t:, :p] = np.nan
-                return
-
-
-@compiled(error_model="numpy")
-def slope_rbf(
-    L: Array, c: Array, W: Array, C: Array, s: Array, M: Array, unit: int, linear: int, column: Table, back: Table,
-    lag: int, z: Array, out: Array,
-) -> None:  # fmt: skip
-    """Write the slopes of a free run, out (n_samples, p, P), by the first P numbers; z as `run_rbf` left it."""
-    N, p, h, D, Q, P = z.shape[0], c.size, s.size, column.size, M.shape[0], out.shape[2]
-    r, x, phi, by_q, q = np.zeros(D), np.zeros(Q), np.zeros(h), np.zeros(h), np.zeros(h)
-    J, G = np.zeros((p, D)), np.zeros((p, Q))
-    out[:lag] = 0.0
-    for t in range(lag, N):
-        for d in range(D):
-            r[d] = z[t - back[d], column[d]]
-        for j in range(Q):
-            x[j] = 0.0
-            for d in range(D):
-                x[j] += M[j, d] * r[d]
-        _units(x, C, s, unit, phi, by_q, q)
-        for o in range(p):
-            _gradient(o, r, x, W, C, s, phi, by_q, q, p, linear, out[t, o])
-            for j in range(Q):
-                G[o, j] = 0.0
-                for k in range(h):
-                    G[o, j] += W[o, k] * by_q[k] * 2.0 * (x[j] - C[k, j]) * np.exp(-2.0 * s[k])
-            for d in range(D):
-                J[o, d] = L[o, d]
-                for j in range(Q):
-                    J[o, d] += G[o, j] * M[j, d]
-        for d in range(D):
-            if column[d] < p:
-                for o in range(p):
-                    w = J[o, d]
-                    for i in range(P):
-                        out[t, o, i] += w * out[t - back[d], column[d], i]
+from ambid.nonlinear.lagged_kernels import radial_units
 
 
 @compiled(error_model="numpy")
@@ -137,7 +42,7 @@ def _predicted(
 ) -> float:  # fmt: skip
     D, h = r.size, s.size
     c0 = p * D if linear == 1 else 0
-    _units(x, C, s, unit, phi, by_q, q)
+    radial_units(x, C, s, unit, phi, by_q, q)
     f = float(theta[c0 + o])
     if linear == 1:
         for d in range(D):

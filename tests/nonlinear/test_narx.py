@@ -1,15 +1,16 @@
-"""Neural NARX: exact slopes, sizes, early stopping, simulation errors, spread of what it predicts."""
+"""Neural NARX: sizes, early stopping, simulation errors, spread of what it predicts."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.networks.narx import narx
-from ambid.nonlinear.networks.narx_function import NarxShape
-from ambid.nonlinear.networks.narx_train import NarxProblem
+from ambid.nonlinear.lagged_problem import problem_at
+from ambid.nonlinear.narx import NarxFunction, narx, solve_linear
 
 
 def data(u: np.ndarray, y: np.ndarray) -> IOData:
@@ -33,27 +34,13 @@ def lagged(n: int, seed: int, noise: float) -> tuple[IOData, np.ndarray]:
     return data(u, y), clean
 
 
-@pytest.mark.parametrize(("p", "m", "nk"), [(1, 1, 1), (2, 1, 0), (1, 2, 3), (2, 0, 1)])
-def test_slopes_are_those_of_a_complex_step(p: int, m: int, nk: int) -> None:
-    shape = NarxShape(n_outputs=p, n_inputs=m, ny=2, nu=2 if m else 0, nk=nk, neurons=3)
-    rng = np.random.default_rng(0)
-    theta = rng.standard_normal(shape.n_theta)
-    z = shape.regressors(rng.standard_normal((20, p)), rng.standard_normal((20, m)))
-    J = shape.slopes(theta, z)
-    assert len(shape.names) == len(set(shape.names)) == shape.n_theta
-    for k in range(shape.n_theta):
-        moved = theta.astype(complex)
-        moved[k] += 1e-30j
-        np.testing.assert_allclose(J[:, :, k], shape.values(moved, z).imag / 1e-30, rtol=1e-12, atol=1e-14)
-
-
 def test_the_linear_numbers_are_at_their_best_for_the_units() -> None:
-    shape = NarxShape(n_outputs=2, n_inputs=1, ny=2, nu=1, nk=1, neurons=3)
+    function = NarxFunction(p=2, m=1, ny=2, nu=1, nk=1, neurons=3)
     rng = np.random.default_rng(2)
     parts = tuple((rng.standard_normal((n, 2)), rng.standard_normal((n, 1))) for n in (50, 5000))
-    problem = NarxProblem(shape=shape, parts=parts, weight=np.array([1.5, 0.3]), prior=0.2)
-    theta = rng.standard_normal(shape.n_theta)
-    best, n = problem.solved(theta), problem.n_linear
+    theta = rng.standard_normal(function.n_theta)
+    problem = replace(problem_at(function, parts, theta, function.precision(0.2)), weight=np.diag([1.5, 0.3]))
+    best, n = solve_linear(problem, theta), function.n_linear
     np.testing.assert_array_equal(best[n:], theta[n:])
     R = problem.triangle(best)
     slope = R[:, :-1].T @ R[:, -1]
@@ -74,18 +61,6 @@ def test_training_does_not_creep_along_valleys() -> None:
         assert np.sqrt(fit.noise_covariance[0, 0]) < 2.1e-3
         ended.append(fit.status)
     assert ended.count("converged") >= 2
-
-
-def test_slopes_of_the_free_run() -> None:
-    shape = NarxShape(n_outputs=2, n_inputs=1, ny=2, nu=2, nk=1, neurons=3)
-    rng = np.random.default_rng(1)
-    theta, y, u = 0.2 * rng.standard_normal(shape.n_theta), rng.standard_normal((60, 2)), rng.standard_normal((60, 1))
-    J = shape.free_slopes(theta, shape.free_run(theta, y, u))
-    for k in range(shape.n_theta):
-        step = np.zeros(theta.size)
-        step[k] = 1e-6
-        both = [shape.free_run(theta + s * step, y, u)[:, :2] for s in (1, -1)]
-        np.testing.assert_allclose(J[:, :, k], (both[0] - both[1]) / 2e-6, atol=1e-8)
 
 
 def test_sizes_are_found_and_noise_as_well() -> None:

@@ -23,36 +23,41 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick
 from ambid.nonlinear.fit import LearningCurve
-from ambid.nonlinear.rbf.problem import RbfProblem
-from ambid.nonlinear.rbf.shape import RbfShape
+from ambid.nonlinear.lagged import UNITS
+from ambid.nonlinear.lagged_problem import LaggedProblem
+from ambid.nonlinear.rbf_network import RbfFunction
 
 _CHUNKS = 8  # of a pass, after each of which the error is looked at
 
 
+GAUSS_NEWTON = "recursive Gauss-Newton"
+DESCENT = "steepest descent"
+
+
 class Recursion:
-    """One of the two trainings, over the rows of a problem.
+    """One of the two trainings, `GAUSS_NEWTON` or `DESCENT`, over the rows of a problem, so many passes long.
 
-    `theta`: (n_theta,), start; `method`: `GAUSS_NEWTON` or `DESCENT`; `rate`: of the steps of the descent; least gain
-    mu of Gauss-Newton; `bounded`: whether the rate is bounded; `passes`: over all samples.
-
-    `theta`: (n_theta,), as far as it has come; `seconds`: learning curve; `errors`: learning curve.
+    `rate` is that of the steps of the descent, or the least gain mu of Gauss-Newton. `theta` (n_theta,) is as far as it
+    has come, `seconds` and `errors` are its learning curve.
     """
 
     def __init__(
-        self, problem: RbfProblem, theta: Array, *, method: str, rate: float, bounded: bool, passes: int
+        self, problem: LaggedProblem, theta: Array, *, method: str, rate: float, bounded: bool, passes: int
     ) -> None:
-        self.problem, self.method, self.rate, self.bounded, self.passes = problem, method, rate, bounded, passes
-        self.theta = theta.copy()
+        assert isinstance(problem.function, RbfFunction)
+        self.problem, self.function, self.theta = problem, problem.function, theta.copy()
+        self.method, self.rate, self.bounded, self.passes = method, rate, bounded, passes
+        self.n_active = int(np.count_nonzero(problem.live))
         rows = problem.rows()
-        self.z = np.ascontiguousarray(np.concatenate([z for z, _ in rows]))
-        self.y = np.ascontiguousarray(np.concatenate([y for _, y in rows]))
-        self.x = np.ascontiguousarray(self.z @ problem.shape.metric.T)
+        self.z = np.ascontiguousarray(np.concatenate([r.x for r in rows]))
+        self.y = np.ascontiguousarray(np.concatenate([r.y for r in rows]))
+        self.x = np.ascontiguousarray(self.z @ self.function.metric.T)
         self.seconds: list[float] = [0.0]
         self.errors: list[float] = [self._rms()]
 
     def run(self, tick: Tick | None) -> None:
         """Go through all samples as often as told."""
-        S, N = np.diag(self.problem.precision[: self.problem.n_active]), self.z.shape[0]
+        S, N = np.diag(self.problem.precision[: self.n_active]), self.z.shape[0]
         self._stretch(slice(0, 0), 0, S)  # loads the compiled loop, which is no part of the training
         began = perf_counter()
         edges = np.unique(np.linspace(0, N, _CHUNKS + 1).astype(np.int64))
@@ -77,52 +82,38 @@ class Recursion:
         )
 
     def _stretch(self, part: slice, done: int, S: Array) -> int:
-        from ambid.nonlinear.rbf._kernels import descent_pass, recursive_pass
-        from ambid.nonlinear.rbf.units import UNITS
+        from ambid.nonlinear.rbf_kernels import descent_pass, recursive_pass
 
-        p, N = self.problem, self.z.shape[0]
-        s = p.shape
+        p, of, n, N = self.problem, self.function, self.n_active, self.z.shape[0]
         signals = self.z[part], self.x[part], self.y[part]
-        kind = UNITS.index(s.unit), int(s.linear), s.neurons
+        kind = UNITS.index(of.unit_name), int(of.linear), of.neurons
         if self.method == DESCENT:
-            return int(descent_pass(*signals, self.rate, int(self.bounded), *kind, p.n_active, self.theta))
+            return int(descent_pass(*signals, self.rate, int(self.bounded), *kind, n, self.theta))
         t = done + np.arange(part.stop - part.start) + 1.0
-        if p.n_active > s.n_weights:
+        if n > of.n_weights:
             # slopes change on the way: for half of the passes the memory is as long as the record, so that old ones
             # are forgotten; then it grows again, and what is left of the noise is averaged out
             t = np.minimum(t, N) + np.maximum(t - N * max(self.passes // 2, 1), 0.0)
         gain = np.maximum(1.0 / (t + 1.0), self.rate)
-        prior = slice(0, p.n_active if done >= N else 0)  # in the first pass it is in the triangle already
-        mean, precision = p.mean[prior], p.precision[prior] * np.sqrt(p.n_active / N)
+        prior = slice(0, n if done >= N else 0)  # in the first pass it is in the triangle already
+        mean, precision = p.mean[prior], p.precision[prior] * np.sqrt(n / N)
+        weight = np.ascontiguousarray(np.diag(p.weight))
         return int(
-            recursive_pass(*signals, p.weight, gain, int(self.bounded), *kind, mean, precision, done, self.theta, S)
+            recursive_pass(*signals, weight, gain, int(self.bounded), *kind, mean, precision, done, self.theta, S)
         )
 
     def _rms(self) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            found = float(np.sqrt(np.mean((self.y - self.problem.shape.values(self.theta, self.z)) ** 2)))
-        return found
+            off = [r.y - self.function.values(self.theta, r) for r in self.problem.rows()]
+            return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
 
-GAUSS_NEWTON = "recursive Gauss-Newton"
-DESCENT = "steepest descent"
-
-
-def without_weights(shape: RbfShape, theta: Array) -> Array:
-    """Return the start of a recursion: centres and widths stand, weights are zero.
-
-    `theta`: (n_theta,). Returns (n_theta,).
-    """
-    return np.concatenate([np.zeros(shape.n_weights), theta[shape.n_weights :]])
-
-
-def left_to_gain(problem: RbfProblem, theta: Array) -> float:
+def left_to_gain(problem: LaggedProblem, theta: Array) -> float:
     """Return by how much one batch Gauss-Newton step would still lower the sum of squares.
 
-    `theta`: (n_theta,). Returns in squares of unit variance: the squared distance from the optimum, in standard
-    deviations of what is trained.
+    In squares of unit variance it is the squared distance from the optimum, in standard deviations of what is trained.
     """
-    R = problem.triangle(theta[: problem.n_active])
+    R = problem.triangle(theta)
     if not np.all(np.isfinite(R)):
         return np.inf
     Q, _ = np.linalg.qr(R[:, :-1])

@@ -1,0 +1,760 @@
+"""One model for every difference equation whose right side is a function of past signals.
+
+yhat(t) = f(x(t), theta): x(t) are regressors, outputs, inputs and innovations some samples ago (`Regressors`), and f is
+a sum of blocks, each with parameters of its own: `Linear`, `Terms` (a polynomial or rational function), `Tanh` (one
+hidden layer), `Radial` (units about centres). A block gives values, and slopes by its parameters and by regressors, of
+many rows at once. The rest is written once: one-step predictions, free runs, and the exact derivatives of both. These
+are slopes of the function plus what own outputs (free run) or innovations (prediction) pass on,
+D(t) = df/dtheta + sum of (df/dx_k) D(t - k), a loop that all families share (`lagged_kernels.propagate`).
+
+A family is a subclass of `LaggedFunction`: sizes, regressors, blocks, names, document. `LaggedModel` gives it scaling,
+units and the cloud of its training; `lagged_problem` searches for its parameters. Coefficients that follow a schedule
+are `Terms` with basis functions as further inputs. All signals in here are scaled; time is axis 0.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.nonlinear.cloud import Cloud
+from ambid.nonlinear.signals import finite, scaled, with_head
+
+Table = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
+_NONE = 1e-300  # squared distance below which a thin plate is at its centre
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Regressors:
+    """Past signals that a model looks at: column in [outputs, inputs, innovations] and lag of each."""
+
+    n_outputs: int
+    n_inputs: int
+    column: Table
+    back: Table
+
+    @cached_property
+    def lag(self) -> int:
+        """Largest lag."""
+        return int(self.back.max(initial=0))
+
+    @cached_property
+    def noisy(self) -> Table:
+        """Places of the innovations among the regressors."""
+        return np.flatnonzero(self.column >= self.n_outputs + self.n_inputs)
+
+    @cached_property
+    def own(self) -> Table:
+        """Places of the outputs among the regressors."""
+        return np.flatnonzero(self.column < self.n_outputs)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """How each is written, such as ``y(t-1)``; with several channels a signal carries its number, from 1."""
+        channels = channel_names("y", self.n_outputs) + channel_names("u", self.n_inputs)
+        channels += channel_names("e", self.n_outputs)
+        return tuple(
+            f"{channels[c]}(t-{b})" if b else f"{channels[c]}(t)" for c, b in zip(self.column, self.back, strict=True)
+        )
+
+    def signals(self, y: Array, u: Array) -> Array:
+        """Return all signals beside each other, innovations of zero last, if the model looks at any."""
+        return np.hstack([y, u, np.zeros_like(y)] if self.noisy.size else [y, u])
+
+    def rows(self, z: Array, lag: int) -> Array:
+        """Return the regressors of every sample of `signals` from `lag` on, shape (n_samples - lag, n_regressors)."""
+        n = z.shape[0]
+        out = np.empty((max(n - lag, 0), self.column.size))
+        for d, (c, b) in enumerate(zip(self.column, self.back, strict=True)):
+            out[:, d] = z[lag - b : max(n - b, lag - b), c]
+        return out
+
+
+def channel_names(letter: str, n: int) -> list[str]:
+    """Return ``y`` for one channel, ``y1``, ``y2``, ... for several."""
+    return [f"{letter}{k + 1}" if n > 1 else letter for k in range(n)]
+
+
+def lags(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int = 0) -> Regressors:
+    """Return `ny` lags of every output, `nu` of every input from `nk` on, then `ne` of the innovations, lag by lag."""
+    of = [(o, k) for o in range(n_outputs) for k in range(1, ny + 1)]
+    of += [(n_outputs + i, nk + k) for i in range(n_inputs) for k in range(nu)]
+    of += [(n_outputs + n_inputs + o, k) for k in range(1, ne + 1) for o in range(n_outputs)]
+    table = np.array(of, dtype=np.int64).reshape(-1, 2)
+    column, back = (np.ascontiguousarray(x) for x in table.T)
+    return Regressors(n_outputs=n_outputs, n_inputs=n_inputs, column=column, back=back)
+
+
+class Block(Protocol):
+    """One summand of a lagged function, with `n_theta` parameters; `x` (n, n_regressors) stands for the rows."""
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        ...
+
+    def bends(self, at: Table) -> bool:
+        """Whether it is anything but affine in the regressors at some places, the others fixed."""
+        ...
+
+    def uses(self, at: Table) -> bool:
+        """Whether it looks at any of the regressors at some places."""
+        ...
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """Return what it needs of the rows whatever its parameters, each with rows along axis 0."""
+        ...
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """Return its values, shape (n, n_outputs)."""
+        ...
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """Return slopes by the parameters where `live` and by the regressors at some places.
+
+        Of shapes (n, n_outputs, n_live) and (n or 1, n_outputs, at.size); one row stands for all.
+        """
+        ...
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """Put its parameters into those that the compiled run takes."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linear:
+    """L x + c over some of the regressors, shape by output: L (p, d), then c (p,) if there is a constant."""
+
+    n_outputs: int
+    at: slice
+    constant: bool
+
+    @property
+    def width(self) -> int:
+        """Regressors that it looks at."""
+        return int(self.at.stop - self.at.start)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return self.n_outputs * (self.width + self.constant)
+
+    def parts(self, theta: Array) -> tuple[Array, Array]:
+        """Return L and c."""
+        n = self.n_outputs * self.width
+        return theta[:n].reshape(self.n_outputs, self.width), theta[n:] if self.constant else np.zeros(self.n_outputs)
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return bool(np.any((at >= self.at.start) & (at < self.at.stop)))
+
+    def bends(self, at: Table) -> bool:
+        """As `Block.bends`."""
+        del at
+        return False
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x[:, self.at],)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        L, c = self.parts(theta)
+        return np.asarray(rows[0] @ L.T + c)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        x, p, d = rows[0], self.n_outputs, self.width
+        out = np.zeros((x.shape[0], p, self.n_theta))
+        for o in range(p):
+            out[:, o, o * d : (o + 1) * d] = x
+            if self.constant:
+                out[:, o, p * d + o] = 1.0
+        by_x = np.zeros((1, p, at.size))
+        inside = (at >= self.at.start) & (at < self.at.stop)
+        by_x[0][:, inside] = self.parts(theta)[0][:, at[inside] - self.at.start]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        L, c = self.parts(theta)
+        if numbers["L"].shape[1] < self.at.stop:
+            more = self.at.stop - numbers["L"].shape[1]
+            numbers["L"] = np.hstack([numbers["L"], np.zeros((self.n_outputs, more))])
+        numbers["L"][:, self.at] += L
+        numbers["c"] += c
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terms:
+    """Sums of coefficient times product of regressors: numerators, over 1 + denominators where there are any.
+
+    Terms stand output by output, numerator before denominator.
+    """
+
+    n_outputs: int
+    terms: Table  # (n_terms, most factors), places of regressors, -1 behind the last
+    place: Table  # (n_terms, 2), output, and 1 for the denominator
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return int(self.place.shape[0])
+
+    @cached_property
+    def _slices(self) -> tuple[tuple[slice, slice], ...]:
+        """Numerator and denominator of each output in theta."""
+        out, first = [], 0
+        for o in range(self.n_outputs):
+            own = self.place[self.place[:, 0] == o, 1]
+            middle, last = first + int(np.count_nonzero(own == 0)), first + own.size
+            out.append((slice(first, middle), slice(middle, last)))
+            first = last
+        return tuple(out)
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return bool(np.any(np.isin(self.terms, at)))
+
+    def bends(self, at: Table) -> bool:
+        """As `Block.bends`."""
+        inside = np.isin(self.terms, at)
+        return bool(np.any(inside.sum(axis=1) > 1) or np.any(inside[self.place[:, 1] == 1]))
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        out = np.ones((self.n_theta, x.shape[0]))
+        columns = np.ascontiguousarray(x.T)
+        for row, term in zip(out, self.terms, strict=True):
+            for v in term[term >= 0]:
+                row *= columns[v]
+        return np.ascontiguousarray(out.T), x
+
+    def _sums(self, theta: Array, T: Array) -> tuple[Array, Array]:
+        num, den = np.zeros((T.shape[0], self.n_outputs)), np.ones((T.shape[0], self.n_outputs))
+        for o, (up, down) in enumerate(self._slices):
+            num[:, o] = T[:, up] @ theta[up]
+            if down.stop > down.start:
+                den[:, o] += T[:, down] @ theta[down]
+        return num, den
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        num, den = self._sums(theta, rows[0])
+        return num / den
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        T, x = rows
+        num, den = self._sums(theta, T)
+        out = np.zeros((T.shape[0], self.n_outputs, self.n_theta))
+        by_value = np.stack([1.0 / den, -num / den**2], axis=2)  # by numerator and denominator
+        for o, both in enumerate(self._slices):
+            for below, own in enumerate(both):
+                out[:, o, own] = T[:, own] * by_value[:, o, below, None]
+        by_x = np.zeros((T.shape[0], self.n_outputs, at.size))
+        where = {int(v): k for k, v in enumerate(at)}
+        for k, (term, (o, below)) in enumerate(zip(self.terms, self.place, strict=True)):
+            factors = [int(v) for v in term if v >= 0]
+            for v in sorted(set(factors) & where.keys()):
+                rest = list(factors)
+                rest.remove(v)
+                slope = theta[k] * factors.count(v) * np.prod(x[:, rest], axis=1)
+                by_x[:, o, where[v]] += slope * by_value[:, o, below]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(terms=self.terms, place=self.place, theta=theta)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tanh:
+    """W2 tanh(W1 x + b1), one hidden layer over the first regressors: W2 (p, h), W1 (h, d), b1 (h,)."""
+
+    n_outputs: int
+    width: int  # regressors that it looks at
+    neurons: int
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in W2, W1 and b1."""
+        return self.n_outputs * self.neurons, self.neurons * self.width, self.neurons
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return sum(self.sizes)
+
+    def parts(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Return W2, W1 and b1."""
+        a, b, _ = np.cumsum(self.sizes)
+        return theta[:a].reshape(self.n_outputs, -1), theta[a:b].reshape(self.neurons, self.width), theta[b:]
+
+    def hidden(self, theta: Array, x: Array) -> Array:
+        """Return what the units give, shape (n, neurons)."""
+        _, W1, b1 = self.parts(theta)
+        return np.asarray(np.tanh(x @ W1.T + b1))
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return self.neurons > 0 and bool(np.any(at < self.width))
+
+    bends = uses
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x[:, : self.width],)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        return np.asarray(self.hidden(theta, rows[0]) @ self.parts(theta)[0].T)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        (x,), p, h = rows, self.n_outputs, self.neurons
+        W2, W1, _ = self.parts(theta)
+        T = self.hidden(theta, x)
+        n, inside = x.shape[0], at < self.width
+        out = np.zeros((n, p, self.n_theta))
+        bends = h > 0 and bool(np.any(inside))
+        by_x = np.zeros((n if bends else 1, p, at.size))
+        a, b, _ = np.cumsum(self.sizes)
+        for o in range(p):
+            back = (1.0 - T**2) * W2[o]
+            out[:, o, o * h : (o + 1) * h] = T
+            out[:, o, a:b] = (back[:, :, None] * x[:, None, :]).reshape(n, -1)
+            out[:, o, b:] = back
+            if bends:
+                by_x[:, o, inside] = back @ W1[:, at[inside]]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(zip(("W2", "W1", "b1"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
+
+
+UNITS: tuple[str, ...] = ("gaussian", "inverse-multiquadric", "thin-plate")
+"""exp(-q/2), 1/sqrt(1 + q), (q log q)/2 = r^2 log r; the place of a name is its number in the compiled loops."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Radial:
+    """W phi, phi_k = unit(|M x - C_k|^2 / width_k^2): W (p, h), C (h, n_seen), logarithms of the widths (h,).
+
+    M, no parameter, says which regressors the units see, and in which metric.
+    """
+
+    n_outputs: int
+    metric: Array  # (n_seen, n_regressors), M
+    neurons: int
+    unit: str  # one of `UNITS`
+
+    @property
+    def n_seen(self) -> int:
+        """Length of M x."""
+        return int(self.metric.shape[0])
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in W, C and the logarithms of the widths."""
+        return self.n_outputs * self.neurons, self.neurons * self.n_seen, self.neurons
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return sum(self.sizes)
+
+    def parts(self, theta: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """Return W, C and the logarithms of the widths."""
+        a, b, _ = np.cumsum(self.sizes)
+        return theta[:a].reshape(self.n_outputs, -1), theta[a:b].reshape(self.neurons, self.n_seen), theta[b:]
+
+    def squared(self, theta: NDArray[Any], seen: Array) -> NDArray[Any]:
+        """Return squared distances of M x from the centres, in widths, shape (n, neurons)."""
+        _, C, s = self.parts(theta)
+        q = np.zeros((seen.shape[0], self.neurons), dtype=C.dtype)
+        for j in range(self.n_seen):
+            q += (seen[:, j, None] - C[:, j]) ** 2
+        found: NDArray[Any] = q * np.exp(-2.0 * s)
+        return found
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return self.neurons > 0 and bool(np.any(self.metric[:, at]))
+
+    bends = uses
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x @ self.metric.T,)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        return np.asarray(unit_values(self.unit, self.squared(theta, rows[0])) @ self.parts(theta)[0].T)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        (seen,), p, h = rows, self.n_outputs, self.neurons
+        W, C, s = self.parts(theta)
+        n, (a, b, _) = seen.shape[0], np.cumsum(self.sizes)
+        q = self.squared(theta, seen)
+        phi, by_q = unit_values(self.unit, q), unit_slopes(self.unit, q)
+        geometry, bends = bool(np.any(live[a:])), self.bends(at)
+        out = np.zeros((n, p, self.n_theta if geometry else a))
+        by_x = np.zeros((n if bends else 1, p, at.size))
+        if geometry or bends:
+            by_seen = 2.0 * (by_q * np.exp(-2.0 * s))[:, :, None] * (seen[:, None, :] - C)
+        for o in range(p):
+            out[:, o, o * h : (o + 1) * h] = phi
+            if geometry:
+                out[:, o, a:b] = (-W[o, :, None] * by_seen).reshape(n, -1)
+                out[:, o, b:] = -2.0 * W[o] * by_q * q
+            if bends:
+                by_x[:, o] = np.einsum("k,nkj->nj", W[o], by_seen) @ self.metric[:, at]
+        return out if np.all(live) else out[:, :, live[: out.shape[2]]], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(zip(("W", "C", "s"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
+        numbers.update(M=np.ascontiguousarray(self.metric), unit=UNITS.index(self.unit))
+
+
+def unit_values(unit: str, q: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of radial units at squared distances, in widths, from their centres."""
+    if unit == "gaussian":
+        return np.exp(-0.5 * q)
+    if unit == "inverse-multiquadric":
+        return 1.0 / np.sqrt(1.0 + q)
+    safe = np.where(q.real > _NONE, q, 1.0)
+    return 0.5 * safe * np.log(safe)
+
+
+def unit_slopes(unit: str, q: NDArray[Any]) -> NDArray[Any]:
+    """Return their derivatives by the squared distance; zero at the centre of a thin plate.
+
+    There it is infinite, but multiplies a distance of zero.
+    """
+    if unit == "gaussian":
+        return -0.5 * np.exp(-0.5 * q)
+    if unit == "inverse-multiquadric":
+        return -0.5 * (1.0 + q) ** -1.5
+    inside = q.real > _NONE
+    return np.where(inside, 0.5 * (np.log(np.where(inside, q, 1.0)) + 1.0), 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """A record, or part of it, as a function sees it, from sample `lag` on."""
+
+    z: Array  # (n_samples, n_columns), all signals, those before included
+    x: Array  # (n, n_regressors)
+    y: Array  # (n, n_outputs), measured
+    prepared: tuple[tuple[Array, ...], ...]  # by block
+
+    def part(self, of: slice) -> Rows:
+        """Return some of the rows."""
+        prepared = tuple(tuple(a[of] for a in one) for one in self.prepared)
+        return Rows(z=self.z, x=self.x[of], y=self.y[of], prepared=prepared)
+
+
+class LaggedFunction(ABC):
+    """The function of a family, in scaled signals."""
+
+    kind: ClassVar[str]
+    folded: int = 0  # 1 or 2 where the sign of the output is not measured, see `lagged_kernels.run`
+
+    @property
+    @abstractmethod
+    def regressors(self) -> Regressors:
+        """What it looks at."""
+
+    @property
+    @abstractmethod
+    def blocks(self) -> tuple[Block, ...]:
+        """What it is the sum of; parameters stand in this order."""
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+
+    @abstractmethod
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields by which files know it."""
+
+    @classmethod
+    @abstractmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back."""
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.regressors.n_outputs
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.regressors.n_inputs
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return max(self.regressors.lag, 1)
+
+    @property
+    def in_cloud(self) -> slice | Table:
+        """Regressors whose cloud says where the model was trained: all but innovations."""
+        x = self.regressors
+        return np.flatnonzero(x.column < x.n_outputs + x.n_inputs) if x.noisy.size else slice(None)
+
+    def unit(self, y_scale: Array, u_scale: Array) -> Array | float:
+        """Return what a scaled parameter of 1 is in the model's `theta`."""
+        del y_scale, u_scale
+        return 1.0
+
+    def is_stable(self, theta: Array) -> bool:
+        """Whether the predictor forgets how it began, as far as its parameters say so."""
+        del theta
+        return True
+
+    @cached_property
+    def edges(self) -> Table:
+        """Where the parameters of each block begin, and where the last ones end."""
+        return np.cumsum([0, *(b.n_theta for b in self.blocks)])
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return int(self.edges[-1])
+
+    def split(self, theta: Array) -> list[Array]:
+        """Return the parameters of each block."""
+        return np.split(np.ascontiguousarray(theta), self.edges[1:-1])
+
+    def rows(self, y: Array, u: Array) -> Rows:
+        """Return a measured record as rows, innovations zero."""
+        return self.rows_of(self.regressors.signals(y, u), y)
+
+    def rows_of(self, z: Array, y: Array, earlier: Rows | None = None) -> Rows:
+        """Return signals as rows beside measured outputs; with `earlier`, only innovations have changed since."""
+        x, noisy = self.regressors.rows(z, self.lag), self.regressors.noisy
+        prepared = tuple(
+            block.prepare(x) if earlier is None or block.uses(noisy) else earlier.prepared[k]
+            for k, block in enumerate(self.blocks)
+        )
+        return Rows(z=z, x=x, y=y[self.lag :], prepared=prepared)
+
+    def values(self, theta: Array, rows: Rows) -> Array:
+        """Return the function, shape (n, n_outputs)."""
+        found = [b.values(t, r) for b, t, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True)]
+        return np.asarray(sum(found[1:], found[0]))
+
+    def derivatives(self, theta: Array, rows: Rows, at: Table, live: Mask | None = None) -> tuple[Array, Array]:
+        """Return slopes of the function by the live parameters, and by the regressors at some places."""
+        live = np.ones(self.n_theta, dtype=np.bool_) if live is None else live
+        own = np.split(live, self.edges[1:-1])
+        found = [
+            b.derivatives(t, r, m, at)
+            for b, t, r, m in zip(self.blocks, self.split(theta), rows.prepared, own, strict=True)
+        ]
+        by_x = found[0][1]
+        for _, more in found[1:]:
+            by_x = by_x + more
+        return np.concatenate([d for d, _ in found], axis=2), by_x
+
+    @cached_property
+    def affine(self) -> bool:
+        """Whether innovations enter without bends: then they follow from errors without them by a linear filter."""
+        return not self.folded and not any(b.bends(self.regressors.noisy) for b in self.blocks)
+
+    def predict(self, theta: Array, rows: Rows) -> tuple[Array, Rows]:
+        """Return one-step predictions, shape (n, n_outputs), and the rows with the innovations that they go with.
+
+        NaN from where innovations diverge on.
+        """
+        x = self.regressors
+        if not x.noisy.size and not self.folded:
+            return self.values(theta, rows), rows
+        z, lag, p = rows.z.copy(), self.lag, self.n_outputs
+        if self.affine:
+            from ambid.nonlinear.lagged_kernels import propagate
+
+            E = rows.y - self.values(theta, rows)
+            gain = -self.derivatives(theta, rows, x.noisy, np.zeros(self.n_theta, np.bool_))[1]
+            propagate(E[:, :, None], np.ascontiguousarray(gain), *self._recurrence(x.noisy), 0)
+            far = np.flatnonzero(~np.all(np.abs(E) < _FAR, axis=1))
+            if far.size:
+                E[far[0] :] = np.nan
+            z[lag:, p + x.n_inputs :] = E
+            found = rows.y - E
+        else:
+            found = self._run(theta, z, free=False)[lag:]
+        return found, self.rows_of(z, np.concatenate([z[:lag, :p], rows.y]), None if self.folded else rows)
+
+    def free_run(self, theta: Array, y: Array, u: Array) -> Array:
+        """Return a run on own outputs from sample `lag` on, shape (n_samples, n_outputs); NaN where it has diverged."""
+        z = self.regressors.signals(y, u)
+        out = self._run(theta, z, free=True)
+        out[: self.lag] = y[: self.lag]
+        return out
+
+    def _run(self, theta: Array, z: Array, *, free: bool) -> Array:
+        from ambid.nonlinear.lagged_kernels import run
+
+        p, none = self.n_outputs, np.zeros((0, 0))
+        numbers: dict[str, Any] = {
+            "L": np.zeros((p, 0)), "c": np.zeros(p), "terms": np.zeros((0, 0), dtype=np.int64),
+            "place": np.zeros((0, 2), dtype=np.int64), "theta": np.zeros(0), "W2": none, "W1": none, "b1": np.zeros(0),
+            "W": none, "M": none, "C": none, "s": np.zeros(0), "unit": 0,
+        }  # fmt: skip
+        for block, own in zip(self.blocks, self.split(theta), strict=True):
+            block.fill(own, numbers)
+        out, x = np.empty((z.shape[0], p)), self.regressors
+        shape = np.array([self.lag, p, p + x.n_inputs, int(free), self.folded], dtype=np.int64)
+        run(z, x.column, x.back, shape, out, *numbers.values())
+        return out
+
+    def _recurrence(self, at: Table) -> tuple[Table, Table]:
+        """Output and lag that the regressors at some places come from."""
+        x = self.regressors
+        column = x.column[at]
+        return np.where(column < x.n_outputs, column, column - x.n_outputs - x.n_inputs), x.back[at]
+
+    def slopes(
+        self, theta: Array, rows: Rows, *, free: bool, live: Mask | None = None, before: Array | None = None
+    ) -> Array:
+        """Return the exact derivative of predictions, or of a free run, by the live parameters.
+
+        `rows` are those of the prediction or of the run; `before` the derivative at rows right before, none where
+        `rows` begin with the first. Returns (n, n_outputs, n_live).
+        """
+        x = self.regressors
+        at = x.own if free else x.noisy
+        G, by_x = self.derivatives(theta, rows, at, live)
+        if not at.size:
+            return G
+        from ambid.nonlinear.lagged_kernels import propagate
+
+        first = 0 if before is None else before.shape[0]
+        out = G if before is None else np.concatenate([before, G])
+        propagate(out, np.ascontiguousarray(by_x if free else -by_x), *self._recurrence(at), first)
+        return out[first:]
+
+    def model_from_json(self, found: dict[str, Any]) -> LaggedModel:
+        """Return the model whose function this is."""
+        n_cloud = np.arange(self.regressors.column.size)[self.in_cloud].size
+        sizes = {"theta": self.n_theta, "u_level": self.n_inputs, "u_scale": self.n_inputs}
+        sizes |= {"y_level": self.n_outputs, "y_scale": self.n_outputs}
+        arrays: dict[str, Any] = {k: finite(found[k], n, k) for k, n in sizes.items()}
+        cloud = Cloud.from_json(found["cloud"], n_cloud)
+        return LaggedModel(dt=float(found["dt_s"]), function=self, cloud=cloud, **arrays)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LaggedModel:
+    """A lagged function with its parameters, scaling and training cloud.
+
+    The predictor takes innovations before its first prediction as zero. Implements
+    `ambid.nonlinear.model.NonlinearModel`.
+    """
+
+    dt: float  # s
+    function: LaggedFunction
+    # (n_theta,), parameters for signals in deviations from `*_level`, in units of `*_scale` times `function.unit`
+    theta: Array
+    u_level: Array  # (n_inputs,), SI
+    u_scale: Array
+    y_level: Array  # (n_outputs,), SI
+    y_scale: Array
+    cloud: Cloud  # of the training regressors
+
+    @property
+    def kind(self) -> str:
+        """Under which files know it."""
+        return self.function.kind
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.function.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.function.n_outputs
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.function.lag
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        return self.function.names
+
+    @cached_property
+    def unit(self) -> Array | float:
+        """What a scaled parameter of 1 is in `theta`."""
+        return self.function.unit(self.y_scale, self.u_scale)
+
+    @property
+    def scaled_theta(self) -> Array:
+        """Parameters for scaled signals."""
+        return self.theta / self.unit
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other parameters."""
+        return replace(self, theta=theta)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.predict`; past innovations are its own. NaN from where they diverge on."""
+        ys, us = scaled(self, u, y)
+        out = np.full(ys.shape, np.nan)
+        if ys.shape[0] > self.lag:
+            out[self.lag :] = self.function.predict(self.scaled_theta, self.function.rows(ys, us))[0]
+        found: Array = self.y_level + self.y_scale * out
+        return found
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.jacobian`, past innovations included."""
+        ys, us = scaled(self, u, y)
+        out = np.zeros((*ys.shape, self.theta.size))
+        if ys.shape[0] > self.lag:
+            of, theta = self.function, self.scaled_theta
+            _, rows = of.predict(theta, of.rows(ys, us))
+            out[self.lag :] = of.slopes(theta, rows, free=False)
+        return out * (self.y_scale[:, None] / self.unit)
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.simulate`, innovations zero."""
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
+        out: Array = self.y_level + self.y_scale * self.function.free_run(self.scaled_theta, ys, us)
+        out[:head] = whole[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.novelty`, of the regressors (see `nonlinear.cloud`)."""
+        ys, us = scaled(self, u, y)
+        of, out = self.function, np.full(ys.shape[0], np.nan)
+        if ys.shape[0] > self.lag:
+            x = of.regressors.rows(of.regressors.signals(ys, us), of.lag)
+            out[self.lag :] = self.cloud.novelty(x[:, of.in_cloud])
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """As `NonlinearModel.as_json`."""
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        return {"dt_s": self.dt, **self.function.as_json(), **arrays, "cloud": self.cloud.as_json()}

@@ -1,0 +1,137 @@
+"""Compiled loops of the lagged model: a run sample by sample, and what earlier samples pass on to later ones."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+
+Table = NDArray[np.int64]
+
+_FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
+_NONE = 1e-300  # squared distance below which a thin plate is at its centre
+
+
+@compiled(error_model="numpy")
+def propagate(out: Array, gain: Array, source: Table, back: Table, first: int) -> None:
+    """Add to each row of `out` (first + n, p, k) from `first` on what earlier rows pass on to it.
+
+    out[t, o] += sum over d of gain[t - first, o, d] out[t - back[d], source[d]]; rows before the array are zero. One
+    row of `gain` stands for all.
+    """
+    last, p, k = gain.shape[0] - 1, out.shape[1], out.shape[2]
+    for t in range(first, out.shape[0]):
+        now = min(t - first, last)
+        for d in range(source.size):
+            before = t - back[d]
+            if before < 0:
+                continue
+            for o in range(p):
+                w = gain[now, o, d]
+                if w != 0.0:
+                    for q in range(k):
+                        out[t, o, q] += w * out[before, source[d], q]
+
+
+@compiled(error_model="numpy")
+def radial_units(x: Array, C: Array, s: Array, unit: int, phi: Array, by_q: Array, q: Array) -> None:
+    """Write value, slope by the squared distance, and squared distance (in widths) of every radial unit."""
+    for k in range(s.size):
+        r = 0.0
+        for j in range(x.size):
+            r += (x[j] - C[k, j]) ** 2
+        r *= np.exp(-2.0 * s[k])
+        q[k] = r
+        if unit == 0:
+            phi[k] = np.exp(-0.5 * r)
+            by_q[k] = -0.5 * phi[k]
+        elif unit == 1:
+            phi[k] = 1.0 / np.sqrt(1.0 + r)
+            by_q[k] = -0.5 * phi[k] ** 3
+        elif r > _NONE:
+            phi[k] = 0.5 * r * np.log(r)
+            by_q[k] = 0.5 * (np.log(r) + 1.0)
+        else:
+            phi[k], by_q[k] = 0.0, 0.0
+
+
+@compiled(error_model="numpy")
+def run(
+    z: Array, column: Table, back: Table, shape: Table, out: Array,
+    L: Array, c: Array, terms: Table, place: Table, theta: Array, W2: Array, W1: Array, b1: Array,
+    W: Array, M: Array, C: Array, s: Array, unit: int,
+) -> None:  # fmt: skip
+    """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on.
+
+    `shape` = (lag, n_outputs, first column of the innovations, free, folded). A block that is not there has arrays of
+    length zero. A row of `terms` names regressors, -1 behind the last; `place` its output, and 1 for a denominator.
+    Predicts from measured outputs and writes innovations into z, or with `free` its own outputs. `out` (n, n_outputs)
+    is NaN where nothing is computed, and from a divergence on. With `folded` the sign of the output is not measured: it
+    gets that of the prediction, and `out` is its magnitude (2: the mean of those now and one sample ago).
+    """
+    lag, p, n_e, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
+    n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
+    x, f, num, den = np.zeros(D), np.zeros(p), np.zeros(p), np.ones(p)
+    seen, phi, by_q, q = np.zeros(Q), np.zeros(s.size), np.zeros(s.size), np.zeros(s.size)
+    innovations = z.shape[1] > n_e
+    recursive = free == 1
+    for d in range(D):
+        recursive = recursive or column[d] >= n_e
+    out[:] = np.nan
+    for t in range(lag, n):
+        for d in range(D):
+            x[d] = z[t - back[d], column[d]]
+        for o in range(p):
+            f[o] = c[o]
+            for d in range(L.shape[1]):
+                f[o] += L[o, d] * x[d]
+        if place.shape[0] > 0:
+            num[:] = 0.0
+            den[:] = 1.0
+            for k in range(place.shape[0]):
+                v = theta[k]
+                for j in range(terms.shape[1]):
+                    if terms[k, j] < 0:
+                        break
+                    v *= x[terms[k, j]]
+                if place[k, 1] == 1:
+                    den[place[k, 0]] += v
+                else:
+                    num[place[k, 0]] += v
+            for o in range(p):
+                f[o] += num[o] / den[o]
+        for i in range(h):
+            v = b1[i]
+            for d in range(W1.shape[1]):
+                v += W1[i, d] * x[d]
+            v = np.tanh(v)
+            for o in range(p):
+                f[o] += W2[o, i] * v
+        if s.size > 0:
+            for j in range(Q):
+                seen[j] = 0.0
+                for d in range(D):
+                    seen[j] += M[j, d] * x[d]
+            radial_units(seen, C, s, unit, phi, by_q, q)
+            for o in range(p):
+                for k in range(s.size):
+                    f[o] += W[o, k] * phi[k]
+        for o in range(p):
+            if recursive and not abs(f[o]) < _FAR:
+                out[t:] = np.nan
+                return
+        for o in range(p):
+            out[t, o] = f[o]
+            if folded == 1:
+                out[t, o] = abs(f[o])
+            elif folded == 2:
+                out[t, o] = 0.5 * (abs(f[o]) + abs(z[t - 1, o]))
+            if free == 1:
+                z[t, o] = f[o]
+            else:
+                if folded > 0:
+                    z[t, o] = np.copysign(z[t, o], f[o])
+                if innovations:
+                    z[t, n_e + o] = z[t, o] - f[o]

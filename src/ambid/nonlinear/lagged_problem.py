@@ -1,0 +1,414 @@
+"""Least squares for every lagged model: one-step or simulation errors over records, priors, and what a fit ends with.
+
+Errors are weighted to unit variance; the rows of a normal prior stand beside them. Triangles of [J | r] are made block
+by block, slopes going on from block to block, so that a long record needs no more memory than a short one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Literal, Self
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.estimation.linear import information_inverse, triangle_of
+from ambid.estimation.progress import Tick, portions
+from ambid.estimation.search import Found, search
+from ambid.estimation.uncertainty import sandwich
+from ambid.nonlinear.cloud import cloud_of
+from ambid.nonlinear.failed import provenance
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Mask, Rows
+from ambid.nonlinear.records import Parts, Scaled
+
+_BLOCK = 4096
+_LEAST = 1e-7  # standard deviation of errors, scaled
+_APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
+_CROWDED = 0.8  # part of the errors that numbers may take up
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LaggedProblem:
+    """Weighted errors of a lagged function and the rows of its prior; what is searched is `theta` where `live`."""
+
+    function: LaggedFunction
+    parts: Parts
+    weight: Array  # (n_outputs, n_outputs), by which errors are multiplied
+    base: Array  # (n_theta,), all parameters; those that are not searched stay as they are here
+    live: Mask  # (n_theta,), what is searched
+    mean: Array  # (n_theta,), of the prior; one over its standard deviation, 0 for none
+    precision: Array
+    free: bool = False  # errors of the free run instead of the predictions
+    joint: bool = False  # whether weights take correlation of the outputs' errors into account
+    counted: tuple[Mask, ...] | None = None  # (n_samples,), samples of each record whose errors count; all without
+    _rows: list[Rows] = field(default_factory=list)
+
+    def rows(self) -> list[Rows]:
+        """Return the measured regressors of each record, made once."""
+        if not self._rows:
+            self._rows.extend(self.function.rows(y, u) for y, u in self.parts)
+        return self._rows
+
+    def counts(self, record: int) -> Mask | slice:
+        """Return which rows of a record count."""
+        return slice(None) if self.counted is None else self.counted[record][self.function.lag :]
+
+    @property
+    def n_errors(self) -> int:
+        """Errors in all."""
+        return sum(r.y[self.counts(k)].size for k, r in enumerate(self.rows()))
+
+    def whole(self, v: Array) -> Array:
+        """Return all parameters."""
+        if v.size == self.base.size:
+            return v
+        out = self.base.copy()
+        out[self.live] = v
+        return out
+
+    def errors(self, v: Array) -> list[Array]:
+        """Return the errors of each record that count, scaled, shape (n, n_outputs); NaN from a divergence on."""
+        return [e[self.counts(k)] for k, e in enumerate(self._all_errors(self.whole(v)))]
+
+    def _all_errors(self, theta: Array) -> Iterator[Array]:
+        of = self.function
+        for rows, (y, u) in zip(self.rows(), self.parts, strict=True):
+            if self.free:
+                yield rows.y - of.free_run(theta, y, u)[of.lag :]
+            else:
+                yield rows.y - of.predict(theta, rows)[0]
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squared weighted errors and of the prior's rows; infinite where the model diverges."""
+        whole = self.whole(theta)
+        if not self.free and not self.function.is_stable(whole):
+            return np.inf
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = float(np.sum(self._prior(whole)[self.live] ** 2))
+            found += sum(float(np.sum((e @ self.weight.T) ** 2)) for e in self.errors(whole))
+        return found if np.isfinite(found) else np.inf
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | r], the prior's rows included."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = [triangle_of([b.reshape(-1, b.shape[2])]) for _, b in self.blocks(theta) if b.size]
+        found.append(self.prior_rows(theta))
+        return triangle_of([np.concatenate(found)])
+
+    def blocks(self, v: Array) -> Iterator[tuple[int, Array]]:
+        """Yield record number and weighted slopes and errors of some of its rows, (n, n_outputs, n_live + 1)."""
+        of, theta = self.function, self.whole(v)
+        at = of.regressors.own if self.free else of.regressors.noisy
+        reach = int(of.regressors.back[at].max(initial=0))
+        for k, (y, u) in enumerate(self.parts):
+            rows = self.rows()[k]
+            if self.free:
+                run = of.free_run(theta, y, u)
+                left, rows = rows.y - run[of.lag :], of.rows_of(of.regressors.signals(run, u), y)
+            else:
+                predicted, rows = of.predict(theta, rows)
+                left = rows.y - predicted
+            counts, before = self.counts(k), None
+            counts = np.ones(left.shape[0], dtype=np.bool_) if isinstance(counts, slice) else counts
+            for first in range(0, left.shape[0], _BLOCK):
+                part = slice(first, first + _BLOCK)
+                J = of.slopes(theta, rows.part(part), free=self.free, live=self.live, before=before)
+                if reach:
+                    before = J[-reach:].copy() if before is None else np.concatenate([before, J])[-reach:]
+                both = np.concatenate([J, left[part, :, None]], axis=2)[counts[part]]
+                yield k, np.matmul(self.weight, both)
+
+    def sample_rows(self, v: Array) -> list[Array]:
+        """Return slopes and errors of every sample, of unit variance, (n_samples - lag, n_outputs, n_live + 1)."""
+        found: list[list[Array]] = [[] for _ in self.parts]
+        for k, block in self.blocks(v):
+            found[k].append(block)
+        return [np.concatenate(x) for x in found]
+
+    def prior_rows(self, v: Array) -> Array:
+        """Return slopes and rows of the prior, (n_priors, n_live + 1)."""
+        held = self.live & (self.precision > 0)
+        out = np.zeros((np.count_nonzero(held), np.count_nonzero(self.live) + 1))
+        out[np.arange(out.shape[0]), np.flatnonzero(held[self.live])] = self.precision[held]
+        out[:, -1] = self._prior(self.whole(v))[held]
+        return out
+
+    def _prior(self, theta: Array) -> Array:
+        return np.asarray(self.precision * (self.mean - theta))
+
+    def across(self, v: Array, noise: Array) -> Array:
+        """Return the information that scores have beyond that of the slopes where outputs' errors are correlated.
+
+        `noise` (n_outputs, n_outputs) is their covariance, scaled. Returns (n_live, n_live).
+        """
+        extra = self.weight @ noise @ self.weight.T
+        np.fill_diagonal(extra, 0.0)
+        n = int(np.count_nonzero(self.live))
+        out = np.zeros((n, n))
+        for _, block in self.blocks(v) if np.any(extra) else ():
+            J = block[:, :, :-1]
+            out += np.tensordot(J, np.matmul(extra, J), axes=([0, 1], [0, 1]))
+        return (out + out.T) / 2.0
+
+    def at(self, theta: Array, live: Mask | None = None) -> Self:
+        """Return the problem around other parameters, its errors there of unit variance."""
+        live = self.live if live is None else live
+        moved = replace(self, base=theta, live=live)
+        return replace(moved, weight=moved.weight_for(np.concatenate(moved.errors(theta))))
+
+    def weight_for(self, errors: Array) -> Array:
+        """Return what gives errors unit variance; 1 for outputs whose errors are not finite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            noise = errors.T @ errors / max(errors.shape[0], 1)
+        return self.weight_of(np.where(np.isfinite(noise), noise, np.eye(noise.shape[0])))
+
+    def weight_of(self, noise: Array) -> Array:
+        """Return what gives errors of some covariance unit variance, and, if `joint`, makes them uncorrelated."""
+        return whitening(noise) if self.joint else np.diag(1.0 / np.maximum(np.sqrt(np.diag(noise)), _LEAST))
+
+
+def problem_at(
+    function: LaggedFunction,
+    parts: Parts,
+    theta: Array,
+    precision: Array,
+    *,
+    mean: Array | None = None,
+    live: Mask | None = None,
+    free: bool = False,
+    joint: bool = False,
+    counted: tuple[Mask, ...] | None = None,
+) -> LaggedProblem:
+    """Return the problem whose errors have unit variance at given parameters, of which the live ones are searched."""
+    one = _unweighted(function, parts, theta, precision, free=free)
+    mean = one.mean if mean is None else mean
+    return replace(one, mean=mean, joint=joint, counted=counted).at(theta, live)
+
+
+def _unweighted(function: LaggedFunction, parts: Parts, theta: Array, precision: Array, *, free: bool) -> LaggedProblem:
+    n = function.n_theta
+    return LaggedProblem(
+        function=function, parts=parts, weight=np.eye(function.n_outputs), base=theta,
+        live=np.ones(n, dtype=np.bool_), mean=np.zeros(n), precision=precision, free=free,
+    )  # fmt: skip
+
+
+def whitening(noise: Array) -> Array:
+    """Return W, lower triangular, with W noise W' = 1; finite also where errors vanish, or are alike in two outputs."""
+    size = np.maximum(np.sqrt(np.diag(noise)), _LEAST)
+    alike = (1.0 - _APART) * noise / size[:, None] / size
+    np.fill_diagonal(alike, 1.0)
+    out: Array = np.linalg.inv(np.linalg.cholesky(alike)) / size
+    return out
+
+
+def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
+    """Cut the end off each record: training, and what is held out, with `lag` samples before it as its past."""
+    if not share > 0:
+        return parts, ()
+    cuts = [max(round(y.shape[0] * (1.0 - share)), lag + 1) for y, _ in parts]
+    training = tuple((y[:c], u[:c]) for c, (y, u) in zip(cuts, parts, strict=True))
+    held = tuple((y[c - lag :], u[c - lag :]) for c, (y, u) in zip(cuts, parts, strict=True))
+    return training, held
+
+
+def rms_error(function: LaggedFunction, theta: Array, parts: Parts, *, free: bool = False) -> float:
+    """Return the root mean square error in deviations of the outputs; infinite where the model diverges."""
+    problem = _unweighted(function, parts, theta, np.zeros(theta.size), free=free)
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
+    return found if np.isfinite(found) else np.inf
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Laplace:
+    """Laplace's approximation at the most probable parameters (MacKay 1992)."""
+
+    covariance: Array | None  # (n_live, n_live); None where data and prior leave a direction open
+    noise: Array  # (n_outputs, n_outputs), scaled, covariance of the errors
+    effective: float  # numbers that the data determine: those searched less what the prior alone does
+    condition: float  # of the scaled Jacobian, the prior's rows included
+    triangle: Array  # of the slopes, the prior's included
+
+
+def laplace(problem: LaggedProblem, theta: Array) -> Laplace:
+    """Return the inverse of the information, the prior's included; correlation of the outputs' errors counts."""
+    v = problem.whole(theta)[problem.live]
+    errors = np.concatenate(problem.errors(v))
+    n, p = errors.shape
+    noise, effective = errors.T @ errors / n, float(v.size)
+    for _ in range(2):  # the degrees of freedom are those that the prior leaves
+        at = replace(problem, weight=problem.weight_of(noise))
+        R = at.triangle(v)[:, :-1]
+        P, condition = information_inverse(R)
+        if P is None:
+            break
+        effective = float(v.size - np.sum(np.diag(P) * problem.precision[problem.live] ** 2))
+        noise = errors.T @ errors / max(n - effective / p, 1.0)
+    if P is not None and p > 1 and not problem.joint:
+        P = P + P @ replace(problem, weight=problem.weight_of(noise)).across(v, noise) @ P
+    return Laplace(covariance=P, noise=noise, effective=effective, condition=condition, triangle=R)
+
+
+def sandwiched(problem: LaggedProblem, theta: Array) -> Array | None:
+    """Return the covariance that does not take errors as white; None where data and prior leave a direction open."""
+    v = problem.whole(theta)[problem.live]
+    rows = problem.sample_rows(v)
+    scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
+    prior = np.diag(problem.precision[problem.live] ** 2)
+    return sandwich(problem.triangle(v)[:, :-1], scores, prior, [r[:, :, :-1] for r in rows])[0]
+
+
+@dataclass(slots=True, kw_only=True)
+class Draft:
+    """What a fit has come to, so that an interruption loses nothing."""
+
+    function: LaggedFunction
+    theta: Array  # (n_theta,), scaled
+    free: bool = False  # whether `theta` is that of simulation errors
+    status: Literal["converged", "stalled"] = "converged"
+    stopped_early: bool = False
+    held_out: float = float("nan")  # error on held-out data; NaN without
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+    details: dict[str, object] = field(default_factory=dict)
+
+    def keep(self, theta: Array) -> None:
+        """Take over other parameters."""
+        self.theta = theta
+
+    def note(self, found: Found, problem: LaggedProblem, method: str) -> None:
+        """Add the learning curve of a search, and say whether it ended."""
+        noise = np.linalg.inv(problem.weight) if np.isfinite(found.cost) else np.eye(problem.weight.shape[0])
+        size = float(np.sqrt(np.sum(noise**2) / noise.shape[0]))
+        curve = LearningCurve(
+            method=method,
+            seconds=np.array(found.seconds),
+            training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) * size,
+            held_out=np.array(found.held_out),
+        )
+        self.curves.append(curve)
+
+    def timed(self, stage: str, began: float) -> float:
+        """Note what a stage took since `began`, and return when the next one begins."""
+        now = perf_counter()
+        self.timing_s[stage] = now - began
+        return now
+
+
+def guarded(identify: Callable[[], None], draft: Draft, failed: Callable[[str], NonlinearFit]) -> NonlinearFit | None:
+    """Run the stages of a fit; an interruption leaves the best draft, a breakdown gives a failed fit."""
+    began = perf_counter()
+    try:
+        identify()
+    except KeyboardInterrupt:
+        draft.status = "stalled"
+        draft.warnings.insert(0, "interrupted: the best model so far")
+    except (np.linalg.LinAlgError, FloatingPointError) as error:
+        draft.timing_s["all"] = perf_counter() - began
+        return failed(f"the training broke down: {error}")
+    return None
+
+
+def refine(
+    draft: Draft, problem_of: Callable[[Array], LaggedProblem], most: int, tick: Tick | None, units: str
+) -> None:
+    """Go on with the errors of the free run; `problem_of` gives its problem around parameters."""
+    problem = problem_of(draft.theta)
+    if not np.isfinite(problem.cost(draft.theta)):
+        draft.status = "stalled"
+        draft.warnings.append(
+            f"the free run diverges, so that the weights are those of the one-step errors: fewer {units} or other lags"
+        )
+        return
+
+    def keep(v: Array) -> None:
+        draft.theta, draft.free = problem.whole(v), True
+
+    rounds = 1 if draft.function.n_outputs == 1 else 2  # the sizes of several outputs' errors are known only afterwards
+    for part in portions(tick, (1.0,) * rounds):
+        start = draft.theta[problem.live]
+        found = search(problem, start, stage="simulation errors", most=most, tick=part, keep=keep)
+        keep(found.theta)
+        draft.note(found, problem, "Levenberg-Marquardt, simulation errors")
+        draft.status = "converged" if found.converged else "stalled"
+        problem = problem_of(draft.theta)
+
+
+def finish(
+    structure: str,
+    records: Sequence[IOData],
+    used: Mapping[str, object],
+    data: Scaled,
+    draft: Draft,
+    problem: LaggedProblem,
+    found: Laplace,
+    *,
+    covariance: Array | None,
+    origin: str,
+    seed: int,
+) -> NonlinearFit:
+    """Return the fit of a draft in SI; `covariance` (n_live, n_live) is scaled, `origin` says where it is from."""
+    began = perf_counter()
+    of, whole = draft.function, None
+    unit = np.broadcast_to(of.unit(data.y_scale, data.u_scale), draft.theta.shape)
+    if covariance is not None:
+        whole = np.zeros((draft.theta.size, draft.theta.size))
+        whole[np.ix_(problem.live, problem.live)] = covariance
+        whole *= unit[:, None] * unit
+    x = np.concatenate([r.x for r in problem.rows()])
+    model = LaggedModel(
+        dt=records[0].dt, function=of, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
+        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x[:, of.in_cloud]),
+    )  # fmt: skip
+    draft.timed("result", began)
+    draft.timing_s["all"] = sum(draft.timing_s.values())
+    return NonlinearFit(
+        structure=structure,
+        settings=used,
+        model=model,
+        covariance=whole,
+        covariance_from="" if whole is None else origin,
+        n_estimated=int(np.count_nonzero(problem.live)),
+        noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
+        seed=seed,
+        status=draft.status,
+        curves=tuple(draft.curves),
+        warnings=tuple(draft.warnings),
+        timing_s=dict(draft.timing_s),
+        details={"effective_parameters": found.effective, **draft.details},
+        **provenance(records),
+    )
+
+
+def cautions(
+    structure: str, records: Sequence[IOData], draft: Draft, problem: LaggedProblem, found: Laplace, units: str
+) -> list[str]:
+    """Return what a reader must be told of a model without a noise model; `units` are what it has too many of."""
+    out, taken = [], found.effective / problem.n_errors
+    if taken > _CROWDED:
+        out.append(
+            f"the data determine {taken:.0%} as many numbers as there are errors: the model follows the noise, and "
+            f"standard deviations are not to be trusted. Fewer {units}, or a longer record"
+        )
+    if not problem.function.regressors.noisy.size and records[0].n_inputs and not all(x.open_loop for x in records):
+        what = "the free run" if draft.free else "one-step errors"
+        out.append(
+            f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are "
+            "white, and nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
+        )
+    if draft.stopped_early:
+        out.append(
+            f"training was stopped where the held-out error was least: more {units.split()[0]} than the data carry; "
+            "standard deviations are those of a linearisation there"
+        )
+    if not draft.free and not np.isfinite(rms_error(draft.function, draft.theta, problem.parts, free=True)):
+        out.append(
+            "the free run diverges on the records that the model was trained on: it predicts, but does not simulate"
+        )
+    return out

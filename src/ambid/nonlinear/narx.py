@@ -1,0 +1,370 @@
+"""Neural NARX: a linear part and one hidden layer of tanh units on lagged outputs and inputs (Billings 2013, sec. 8.2).
+
+Scale -> lags and neurons (where left open) -> training from several random starts, each watched on held-out data -> the
+best, once more on all data -> simulation errors (option) -> covariance by Laplace's approximation, sandwich, bootstrap.
+
+Weights of the hidden layer are N(0, prior^2) for scaled signals: where the data speak it does not count; where they do
+not (units that do the same thing), it makes the information matrix regular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from time import perf_counter
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.linear import triangle_of
+from ambid.estimation.progress import Tick, part_of, portions
+from ambid.estimation.search import search
+from ambid.estimation.uncertainty import bootstrapped
+from ambid.nonlinear.failed import NO_WEIGHTS, failed_fit
+from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Linear, Regressors, Tanh, channel_names, lags
+from ambid.nonlinear.lagged_problem import (
+    Draft,
+    LaggedProblem,
+    cautions,
+    finish,
+    guarded,
+    laplace,
+    problem_at,
+    refine,
+    rms_error,
+    sandwiched,
+    split,
+)
+from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.settings import choice, number, read_settings, whole
+
+_LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
+_ENOUGH = 1e-2  # gain that ends a search: a step of 0.1 standard deviations
+_FIRST = 12  # iterations of every start; only the best goes on
+_LAGS = (1, 2, 3, 4, 6)
+_NEURONS = (2, 4, 8, 12)
+_FIRST_NEURONS = 4  # with which lags are compared
+_AS_GOOD = 1.02
+_MOST_ROWS = 6000  # that a comparison looks at
+_ITERATIONS = 15  # of a comparison
+_BLOCK = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NarxSettings:
+    """Settings of a neural NARX fit."""
+
+    ny: int | None = whole("lags of the outputs; chosen by held-out error", 0, 50)
+    nu: int | None = whole("lags of each input; chosen by held-out error", 0, 50)
+    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
+    neurons: int | None = whole("hidden units; chosen by held-out error", 0, 60)
+    starts: int = whole("random starts; 3", 1, 50, 3)
+    held_out: float = number("part at the end of each record that training is watched on; 0.2", 0.0, 0.5, 0.2)
+    prior: float = number(
+        "standard deviation of the hidden layer's weights before the data, scaled signals; 10", 0.01, 1e6, 10.0
+    )
+    iterations: int = whole("of each training, at most; 60", 1, 2000, 60)
+    focus: str = choice(
+        "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
+    )
+    uncertainty: str = choice(
+        "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich for simulation); auto",
+        "auto", "laplace", "sandwich", "bootstrap", "none",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class NarxFunction(LaggedFunction):
+    """yhat(t) = L z + c + W2 tanh(W1 z + b1), z = [y(t-1), .., y(t-ny), u(t-nk), .., u(t-nk-nu+1)]."""
+
+    kind: ClassVar[str] = "narx"
+    p: int  # outputs
+    m: int  # inputs
+    ny: int
+    nu: int
+    nk: int
+    neurons: int
+
+    @cached_property
+    def regressors(self) -> Regressors:
+        """What it looks at."""
+        return lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """What it is the sum of."""
+        d = self.regressors.column.size
+        linear = Linear(n_outputs=self.p, at=slice(0, d), constant=True)
+        return linear, Tanh(n_outputs=self.p, width=d, neurons=self.neurons)
+
+    @property
+    def n_linear(self) -> int:
+        """Leading numbers that one-step errors are linear in: L, c, W2."""
+        return int(self.edges[1]) + self.p * self.neurons
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        z, channel = self.regressors.names, channel_names("y", self.p)
+        out = [f"{o}: {x}" for o in channel for x in z] + [f"{o}: 1" for o in channel]
+        out += [f"{o}: unit {k + 1}" for o in channel for k in range(self.neurons)]
+        out += [f"unit {k + 1}: {x}" for k in range(self.neurons) for x in z]
+        return (*out, *(f"unit {k + 1}: 1" for k in range(self.neurons)))
+
+    def precision(self, prior: float) -> Array:
+        """Return one over the prior's standard deviation of every number."""
+        out = np.full(self.n_theta, 1.0 / prior)
+        out[: self.edges[1]] /= _LINEAR_PRIOR
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """As `LaggedFunction.as_json`."""
+        sizes = {"ny": self.ny, "nu": self.nu, "nk": self.nk, "neurons": self.neurons}
+        return {"sizes": {"n_outputs": self.p, "n_inputs": self.m, **sizes}}
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back."""
+        sizes = {k: int(v) for k, v in found["sizes"].items()}
+        return cls(p=sizes.pop("n_outputs"), m=sizes.pop("n_inputs"), **sizes)
+
+
+def read_model(found: dict[str, Any]) -> LaggedModel:
+    """Read a neural NARX model back."""
+    try:
+        return NarxFunction.from_json(found).model_from_json(found)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise EstimationError(f"no neural NARX model ({type(error).__name__}: {error}). Write it again") from error
+
+
+def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+    """Identify a neural NARX model, y(t) = L z + c + W2 tanh(W1 z + b1) + e(t).
+
+    Its errors are taken as white: under feedback, or with coloured noise, it is biased. `seed` is that of the starts
+    and of the bootstrap; `tick` is called with the stage and may raise KeyboardInterrupt.
+    """
+    s = read_settings(NarxSettings, "narx", settings)
+    if s.ny == 0 and s.nu == 0:
+        raise EstimationError("narx: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+    data = scaled_records("narx", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
+    function = _function(data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, s.nk, 0)
+    draft = Draft(function=function, theta=linear_start(function, data.parts))  # for an interruption at once
+    spread: list[Array] = []
+    failed = guarded(
+        lambda: _identify(s, data, draft, spread, seed, tick), draft,
+        lambda why: failed_fit("narx", records, asdict(s), seed, why, draft.timing_s),
+    )  # fmt: skip
+    return failed or _finish(s, records, data, draft, spread, seed)
+
+
+def _function(parts: Parts, ny: int, nu: int, nk: int, neurons: int) -> NarxFunction:
+    p, m = parts[0][0].shape[1], parts[0][1].shape[1]
+    return NarxFunction(p=p, m=m, ny=ny, nu=nu if m else 0, nk=nk, neurons=neurons)
+
+
+def narx_problem(
+    function: LaggedFunction, parts: Parts, theta: Array, prior: float, *, free: bool = False
+) -> LaggedProblem:
+    """Return the problem whose errors have unit variance at given weights."""
+    assert isinstance(function, NarxFunction)
+    return problem_at(function, parts, theta, function.precision(prior), free=free)
+
+
+def _identify(s: NarxSettings, data: Scaled, draft: Draft, spread: list[Array], seed: int, tick: Tick | None) -> None:
+    free, many = s.focus == "simulation", s.uncertainty == "bootstrap"
+    choosing, training, refining, last = portions(tick, (3.0, 5.0, 8.0 * free, 4.0 * many))
+    began = perf_counter()
+    function = _choose_sizes(s, data.parts, draft, seed, choosing)
+    began = draft.timed("choice", began)
+    _train(s, function, data, draft, seed, training)
+    began = draft.timed("training", began)
+    if free:
+        refine(
+            draft, lambda theta: narx_problem(function, data.parts, theta, s.prior, free=True), s.iterations, refining,
+            "neurons",
+        )  # fmt: skip
+        began = draft.timed("simulation errors", began)
+    if many:
+        problem = narx_problem(function, data.parts, draft.theta, s.prior, free=draft.free)
+        rows = problem.sample_rows(draft.theta)
+        spread.append(bootstrapped(rows, problem.prior_rows(draft.theta), seed, last))
+        draft.timed("bootstrap", began)
+
+
+def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: Tick | None) -> NarxFunction:
+    """Choose what is left open of lags and neurons: the smallest that predict held-out data nearly as well as the best.
+
+    Each candidate is trained for a while on part of the data.
+    """
+    tried: list[dict[str, Any]] = []
+    draft.details["tried"] = tried
+    share = s.held_out or 0.2
+
+    def run(ny: int, nu: int, neurons: int) -> None:
+        if tick is not None:
+            tick("choice of lags and neurons", len(tried) / (len(_LAGS) + len(_NEURONS)))
+        function = _function(parts, ny, nu, s.nk, neurons)
+        error = _compare(function, parts, share, s.prior, seed)
+        tried.append({"ny": ny, "nu": function.nu, "neurons": neurons, "held_out_rms": error})
+
+    def smallest(first: int) -> dict[str, Any]:
+        best = min(x["held_out_rms"] for x in tried[first:])
+        return next((x for x in tried[first:] if x["held_out_rms"] <= _AS_GOOD * best), tried[first])
+
+    ny, nu, neurons = s.ny, s.nu, s.neurons
+    if ny is None or nu is None:
+        short = min(y.shape[0] for y, _ in parts)
+        for k in [k for k in _LAGS if 3 * (k + s.nk) < short * share] or [1]:
+            run(ny or k, k if nu is None else nu, neurons or _FIRST_NEURONS)
+        one = smallest(0)
+        ny, nu = one["ny"], one["nu"]
+    if neurons is None:
+        first = len(tried)
+        for h in _NEURONS:
+            run(ny, nu, h)
+        neurons = smallest(first)["neurons"]
+    return _function(parts, ny, nu, s.nk, neurons)
+
+
+def _compare(function: NarxFunction, parts: Parts, share: float, prior: float, seed: int) -> float:
+    most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
+    training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
+    start = random_start(function, linear_start(function, training), np.random.default_rng(seed))
+    problem = narx_problem(function, training, start, prior)
+    found = search(
+        problem, start, stage="", most=_ITERATIONS, held_out=partial(_error, function, held), slack=0.0,
+        solved=partial(solve_linear, problem), n_linear=function.n_linear,
+    )  # fmt: skip
+    return min(found.held_out)
+
+
+def _error(function: NarxFunction, parts: Parts, theta: Array) -> float:
+    return rms_error(function, theta, parts)
+
+
+def _train(s: NarxSettings, function: NarxFunction, data: Scaled, draft: Draft, seed: int, tick: Tick | None) -> None:
+    """Train from several starts, go on with the best, and end on all data."""
+    training, held = split(data.parts, s.held_out, function.lag)
+    best = linear_start(function, training)
+    draft.function, draft.theta = function, best
+    rng, linear, least = np.random.default_rng(seed), best, np.inf
+    watch = partial(_error, function, held) if held else None
+    starts = s.starts if function.neurons else 1
+    first, second, third = portions(tick, (starts * _FIRST, 2 * _FIRST, 2 * _FIRST * bool(held)))
+
+    def run(parts: Parts, start: Array, **options: Any) -> Any:
+        problem = narx_problem(function, parts, start, s.prior)
+        solved = partial(solve_linear, problem)
+        return problem, search(problem, start, solved=solved, n_linear=function.n_linear, **options)
+
+    for k in range(starts):
+        share = part_of(first, k / starts, (k + 1) / starts)
+        start = random_start(function, linear, rng)
+        most = min(_FIRST, s.iterations)
+        _, found = run(training, start, stage="starts", most=most, held_out=watch, slack=0.0, tick=share)
+        error = min(found.held_out) if held else found.cost
+        if error < least:
+            best, least = found.theta, error
+            draft.keep(best)
+    usual: dict[str, Any] = {"most": s.iterations, "enough": _ENOUGH, "keep": draft.keep}
+    problem, found = run(training, best, stage="training", held_out=watch, tick=second, **usual)
+    draft.keep(found.theta)
+    draft.note(found, problem, "Levenberg-Marquardt, prediction errors")
+    draft.stopped_early = found.stopped_early
+    draft.held_out = watch(found.theta) if watch else float("nan")
+    if held and not found.stopped_early:  # nothing is overfitted: the held-out part may teach as well
+        usual.pop("keep")
+        _, found = run(data.parts, found.theta, stage="all data", tick=third, **usual)
+        draft.keep(found.theta)
+    draft.status = "converged" if found.converged else "stalled"
+    if not found.converged and len(found.costs) > s.iterations:  # a valley of networks that differ little
+        lately = 50.0 * (1.0 - found.costs[-1] / found.costs[-min(11, len(found.costs))])
+        draft.warnings.append(
+            f"the training was still improving at its limit of {s.iterations} iterations, the errors by {lately:.1g} % "
+            "over the last ten: raise iterations if that matters. Standard deviations are those of a linearisation "
+            "there"
+        )
+
+
+def linear_start(function: NarxFunction, parts: Parts) -> Array:
+    """Return the weights of the best linear model, the hidden layer's zero."""
+    rows = [function.rows(y, u) for y, u in parts]
+    x, y = np.concatenate([r.x for r in rows]), np.concatenate([r.y for r in rows])
+    found = np.linalg.lstsq(np.hstack([x, np.ones((x.shape[0], 1))]), y, rcond=1e-12)[0]
+    theta = np.zeros(function.n_theta)
+    theta[: found.size] = np.concatenate([found[:-1].T.ravel(), found[-1]])
+    return theta
+
+
+def random_start(function: NarxFunction, linear: Array, rng: np.random.Generator) -> Array:
+    """Return weights with a random hidden layer whose units bend inside the data, beside those of `linear_start`."""
+    h, d = function.neurons, function.regressors.column.size
+    hidden = rng.standard_normal(h * d) / np.sqrt(max(d, 1))
+    bias = rng.standard_normal(h)
+    out = 0.01 * rng.standard_normal(function.p * h)
+    return np.concatenate([linear[: function.edges[1]], out, hidden, bias])
+
+
+def solve_linear(problem: LaggedProblem, theta: Array) -> Array:
+    """Return the weights with L, c and W2 at their best for these hidden units, for one-step errors.
+
+    As given where the units are not finite.
+    """
+    of = problem.function
+    assert isinstance(of, NarxFunction)
+    layer, p, d = of.blocks[1], of.p, of.regressors.column.size
+    assert isinstance(layer, Tanh)
+    own, blocks = of.split(theta)[1], []
+    for rows in problem.rows():
+        for k in range(0, rows.x.shape[0], _BLOCK):
+            x = rows.x[k : k + _BLOCK]
+            blocks.append(np.hstack([x, np.ones((x.shape[0], 1)), layer.hidden(own, x), rows.y[k : k + _BLOCK]]))
+    R = triangle_of(blocks)
+    if not np.all(np.isfinite(R)):
+        return theta
+    width = R.shape[1] - p
+    pull = np.concatenate([problem.precision[: d + 1], problem.precision[of.edges[1] :][: width - d - 1]])
+    found = np.empty((width, p))
+    for o in range(p):
+        rows_o = np.concatenate([R[:, :width], np.diag(pull / problem.weight[o, o])])
+        found[:, o] = np.linalg.lstsq(rows_o, np.concatenate([R[:, width + o], np.zeros(width)]), rcond=1e-15)[0]
+    return np.concatenate([found[:d].T.ravel(), found[d], found[d + 1 :].T.ravel(), theta[of.n_linear :]])
+
+
+def _finish(
+    s: NarxSettings, records: Sequence[IOData], data: Scaled, draft: Draft, spread: list[Array], seed: int
+) -> NonlinearFit:
+    of = draft.function
+    assert isinstance(of, NarxFunction)
+    used = {**asdict(s), "ny": of.ny, "nu": of.nu, "neurons": of.neurons}
+    used["focus"] = "simulation" if draft.free else "prediction"
+    problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
+    if not np.isfinite(problem.cost(draft.theta)):
+        return failed_fit("narx", records, used, seed, NO_WEIGHTS, draft.timing_s)
+    found = laplace(problem, draft.theta)
+    draft.warnings += cautions("narx", records, draft, problem, found, "neurons or lags")
+    covariance, origin = found.covariance, "laplace"
+    if spread:
+        covariance, origin = spread[0], "bootstrap"
+    elif s.uncertainty == "none":
+        covariance = None
+        draft.warnings.append("no covariance was asked for, and so there are no standard deviations")
+    elif s.uncertainty == "sandwich" or (draft.free and s.uncertainty == "auto"):
+        covariance, origin = sandwiched(problem, draft.theta), "sandwich"
+    elif draft.free:
+        covariance = None
+        draft.warnings.append(
+            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
+            "Say uncertainty = sandwich or bootstrap"
+        )
+    if covariance is None and s.uncertainty != "none" and not (draft.free and s.uncertainty == "laplace"):
+        draft.warnings.append(
+            "no standard deviations: data and prior do not determine the weights. Fewer neurons or lags"
+        )
+    draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
+    return finish("narx", records, used, data, draft, problem, found, covariance=covariance, origin=origin, seed=seed)

@@ -1,1 +1,0 @@
-"""Networks of radial basis functions on lagged outputs and inputs (structure `rbf`)."""
