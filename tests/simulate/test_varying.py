@@ -18,7 +18,6 @@ from ambid.simulate import (
     VaryingLoop,
     closed_loop_matrix,
     simulate,
-    simulate_varying,
 )
 
 BEARING = preset("unstable-bearing")
@@ -43,7 +42,7 @@ def test_nothing_varying_is_the_stationary_simulation_bit_for_bit(delay: float) 
     stands = {**STANDS, "loop": replace(BEARING.loop, delay=delay), "noise": noise}
     u = 20.0 * excite(3000)
     plain = simulate(PLANT, u, seed=7, **stands)
-    varying = simulate_varying(PLANT, u, variation=Variation(), seed=7, **stands)
+    varying = simulate(PLANT, u, variation=Variation(), seed=7, **stands)
     assert np.array_equal(varying.states, plain.states)
     for name in ("voltage", "current", "position"):
         assert np.array_equal(varying.record[name], plain.record[name])
@@ -60,7 +59,7 @@ def test_other_models_vary_too(name: str, parameters: dict[str, float]) -> None:
     plant, u = LinearPlant(model=model(name), parameters=parameters), excite(500)
     plain = simulate(plant, u, rate_hz=RATE, seed=1)
     flat = Variation(parameters={k: Schedule.constant(v) for k, v in parameters.items()})
-    varying = simulate_varying(plant, u, variation=flat, rate_hz=RATE, seed=1)
+    varying = simulate(plant, u, variation=flat, rate_hz=RATE, seed=1)
     assert np.array_equal(varying.states, plain.states)
     assert set(varying.record.names) == {*plain.record.names, *(f"true_{k}" for k in parameters)}
 
@@ -71,7 +70,7 @@ def test_a_jump_is_two_stationary_simulations_joined() -> None:
     both = Variation(
         parameters={n: Schedule.step(THESIS.parameters[n], after.parameters[n], k / RATE) for n in ("k_i", "m")}
     )
-    joined = simulate_varying(THESIS, u, variation=both, rate_hz=RATE, seed=0, loop=Loop())
+    joined = simulate(THESIS, u, variation=both, rate_hz=RATE, seed=0, loop=Loop())
     first = simulate(THESIS, u[: k + 1], rate_hz=RATE, seed=0)
     second = simulate(after, u[k:], rate_hz=RATE, seed=0, start=first.states[-1])
     assert np.array_equal(joined.states[: k + 1], first.states)
@@ -85,7 +84,7 @@ def test_a_jump_under_feedback_follows_the_two_loop_matrices(delay: float) -> No
     less = {**BEARING.parameters, "k_i": 0.85 * BEARING.parameters["k_i"]}
     jump = Variation(parameters={"k_i": Schedule.step(BEARING.parameters["k_i"], less["k_i"], k / RATE)})
     x0 = np.array([1e-5, 1e-3, 0.02])
-    done = simulate_varying(PLANT, np.zeros(n), variation=jump, rate_hz=RATE, seed=0, loop=loop, start=x0)
+    done = simulate(PLANT, np.zeros(n), variation=jump, rate_hz=RATE, seed=0, loop=loop, start=x0)
     before, after = (closed_loop_matrix(p, loop, RATE) for p in (BEARING.parameters, less))
     z = np.zeros(before.shape[0])
     z[:3], z[-1] = x0, x0[0]
@@ -103,10 +102,11 @@ def test_drifting_matrices_are_those_of_the_exact_discretisation(name: str, dela
     r, k_i = p.parameters["R"], p.parameters["k_i"]
     drift = {"R": Schedule.ramp(r, 1.2 * r, 0.0, 1.0), "k_i": Schedule.ramp(k_i, 0.9 * k_i, 0.0, 1.0)}
     x0, u = np.array([1e-5, 1e-3, 0.02]), excite(400)
-    found = simulate_varying(
-        plant, u, variation=Variation(parameters=drift), rate_hz=p.rate_hz, seed=0, loop=Loop(delay=delay), start=x0,
+    running = VaryingLoop(
+        plant, Variation(parameters=drift), rate_hz=p.rate_hz, seed=0, loop=Loop(delay=delay), start=x0,
         grid_s=1.0 / p.rate_hz,
-    ).states  # fmt: skip
+    )  # fmt: skip
+    found = running.advance(u).states
     x, late = x0, np.concatenate([[0.0, 0.0], u])
     whole = int(delay)
     for k in range(400):
@@ -147,14 +147,13 @@ def test_a_drift_agrees_with_brute_force_to_second_order_in_the_grid() -> None:
     wanted = brute_force(u, drift, 16)
     size, off = np.abs(wanted).max(axis=0), {}
     for grid in (4e-4, 2e-4):
-        found = simulate_varying(
-            THESIS, u, variation=Variation(parameters=drift), rate_hz=RATE, seed=0, grid_s=grid
-        ).states
+        running = VaryingLoop(THESIS, Variation(parameters=drift), rate_hz=RATE, seed=0, grid_s=grid)
+        found = running.advance(u).states
         off[grid] = float((np.abs(found - wanted).max(axis=0) / size).max())
     assert off[2e-4] < 5e-4
     assert off[2e-4] < off[4e-4] / 3.0
     slow = {"R": Schedule.ramp(1.25, 1.25 * (1 + 0.2 * 0.04 / 60.0), 0.0, 0.04)}
-    found = simulate_varying(THESIS, u, variation=Variation(parameters=slow), rate_hz=RATE, seed=0).states
+    found = simulate(THESIS, u, variation=Variation(parameters=slow), rate_hz=RATE, seed=0).states
     assert (np.abs(found - brute_force(u, slow, 16)).max(axis=0) / size).max() < 2e-7
 
 
@@ -167,7 +166,7 @@ def energy(states: np.ndarray, m: float) -> np.ndarray:
 def test_k_i_does_the_same_work_in_force_and_in_voltage_before_and_after_a_jump() -> None:
     free = changed(THESIS, R=1e-12)
     jump = Variation(parameters={"k_i": Schedule.step(-310.08, -200.0, 0.01)})
-    done = simulate_varying(free, np.zeros(1000), variation=jump, rate_hz=RATE, seed=0, start=[1e-4, 0.05, 0.3])
+    done = simulate(free, np.zeros(1000), variation=jump, rate_hz=RATE, seed=0, start=[1e-4, 0.05, 0.3])
     e = energy(done.states, 0.1)
     assert e == pytest.approx(np.full(1000, e[0]), rel=1e-9)
     # all of it swings between the two forms, so the balance is no accident of a small coupling
@@ -177,7 +176,7 @@ def test_k_i_does_the_same_work_in_force_and_in_voltage_before_and_after_a_jump(
 def test_an_added_mass_moves_with_the_rotor() -> None:
     free = changed(THESIS, R=1e-12)
     jump = Variation(parameters={"m": Schedule.step(0.1, 0.11, 0.01)})
-    done = simulate_varying(free, np.zeros(600), variation=jump, rate_hz=RATE, seed=0, start=[1e-4, 0.05, 0.3])
+    done = simulate(free, np.zeros(600), variation=jump, rate_hz=RATE, seed=0, start=[1e-4, 0.05, 0.3])
     before, after = energy(done.states[:201], 0.1), energy(done.states[200:], 0.11)
     assert before == pytest.approx(np.full(201, before[0]), rel=1e-9)
     assert after == pytest.approx(np.full(400, before[0] + 0.005 * done.states[200, 1] ** 2), rel=1e-9)
@@ -186,7 +185,7 @@ def test_an_added_mass_moves_with_the_rotor() -> None:
 def test_a_sensor_that_loses_gain_misleads_the_controller() -> None:
     fault = Variation(gains={"position": Schedule.step(1.0, 0.8, 0.01), "current": Schedule.constant(1.1)})
     noise = Noise(force=1e-3)
-    done = simulate_varying(
+    done = simulate(
         PLANT, excite(600), variation=fault, rate_hz=RATE, seed=0, loop=BEARING.loop, noise=noise, setpoint=2e-5
     )
     x, i = done.states[:, 0], done.states[:, 2]
@@ -194,7 +193,7 @@ def test_a_sensor_that_loses_gain_misleads_the_controller() -> None:
     assert np.array_equal(done.record["position"], gain * x)
     assert np.array_equal(done.record["current"], 1.1 * i)
     assert np.array_equal(done.record["true_gain_position"], gain)
-    long = simulate_varying(
+    long = simulate(
         PLANT, np.zeros(40_000), variation=Variation(gains={"position": Schedule.constant(0.8)}), rate_hz=RATE, seed=0,
         loop=BEARING.loop, setpoint=2e-5,
     )  # fmt: skip
@@ -206,7 +205,7 @@ def test_unbalance_at_constant_speed_has_the_analytic_response(speed: float) -> 
     moment, phase, n = 3e-6, 0.7, 30_000
     p = ROTOR.parameters
     turning = Variation(unbalance=Unbalance(moment=moment, phase=phase, speed=Schedule.constant(speed)))
-    done = simulate_varying(ROTOR, np.zeros(n), variation=turning, rate_hz=RATE, seed=0)
+    done = simulate(ROTOR, np.zeros(n), variation=turning, rate_hz=RATE, seed=0)
     tail = slice(n // 2, None)
     angle = done.record["angle"][tail]
     assert angle == pytest.approx(speed * done.record.time_s[tail], rel=1e-12)
@@ -223,11 +222,11 @@ def test_unbalance_at_constant_speed_has_the_analytic_response(speed: float) -> 
 def test_unbalance_in_the_loop_has_the_loop_s_response() -> None:
     speed, moment, n = 900.0, 1e-6, 40_000
     turning = Variation(unbalance=Unbalance(moment=moment, speed=Schedule.constant(speed)))
-    done = simulate_varying(PLANT, np.zeros(n), variation=turning, rate_hz=RATE, seed=0, loop=BEARING.loop)
+    done = simulate(PLANT, np.zeros(n), variation=turning, rate_hz=RATE, seed=0, loop=BEARING.loop)
     m = closed_loop_matrix(BEARING.parameters, BEARING.loop, RATE)
     turn = np.exp(1j * speed / RATE)
     push = np.zeros(m.shape[0], dtype=complex)
-    one = simulate_varying(
+    one = simulate(
         PLANT, np.zeros(2), variation=Variation(force=Schedule.constant(1.0)), rate_hz=RATE, seed=0
     )  # what one newton does in one sample
     push[:3] = one.states[1]
@@ -238,7 +237,7 @@ def test_unbalance_in_the_loop_has_the_loop_s_response() -> None:
 
 def test_a_load_moves_the_current_that_balances_it() -> None:
     pushed = Variation(force=Schedule.step(0.0, 2.0, 0.1))
-    done = simulate_varying(PLANT, np.zeros(40_000), variation=pushed, rate_hz=RATE, seed=0, loop=BEARING.loop)
+    done = simulate(PLANT, np.zeros(40_000), variation=pushed, rate_hz=RATE, seed=0, loop=BEARING.loop)
     assert not done.states[: int(0.1 * RATE) + 1].any()
     assert done.states[-1, 2] == pytest.approx(-2.0 / BEARING.parameters["k_i"], rel=1e-4)
     assert done.record["true_force"][[1999, 2000]].tolist() == [0.0, 2.0]
@@ -279,7 +278,7 @@ def test_limits_act_and_are_counted_across_calls() -> None:
 
 def test_an_unstable_end_is_told_by_its_pole() -> None:
     weak = Variation(parameters={"k_i": Schedule.step(55.7, 20.0, 0.1)})
-    done = simulate_varying(PLANT, np.zeros(2100), variation=weak, seed=0, **STANDS)
+    done = simulate(PLANT, np.zeros(2100), variation=weak, seed=0, **STANDS)
     assert done.largest_pole > 1.0
     assert any("unstable" in w for w in done.warnings)
     assert done.truth["k_i"] == 55.7
@@ -287,7 +286,7 @@ def test_an_unstable_end_is_told_by_its_pole() -> None:
 
 def test_what_cannot_vary_is_refused() -> None:
     def vary(variation: Variation, plant: LinearPlant = PLANT, **more: object) -> None:
-        simulate_varying(plant, np.zeros(9), variation=variation, seed=0, **{"rate_hz": RATE, **more})  # type: ignore[arg-type]
+        simulate(plant, np.zeros(9), variation=variation, seed=0, **{"rate_hz": RATE, **more})  # type: ignore[arg-type]
 
     one = Schedule.constant(1.0)
     coil = LinearPlant(model=model("coil"), parameters={"R": 1.5, "L": 2e-3})
@@ -299,11 +298,13 @@ def test_what_cannot_vary_is_refused() -> None:
         vary(Variation(gains={"speed": one}))
     with pytest.raises(ModelError, match="no rotor"):
         vary(Variation(force=one), coil)
+    with pytest.raises(ModelError, match="nonlinear plant does not vary"):
+        simulate(BEARING.plant, np.zeros(9), variation=Variation(), seed=0, rate_hz=RATE)
     with pytest.raises(ModelError, match="must be positive"):
         vary(Variation(), rate_hz=0.0)
     with pytest.raises(ModelError, match="start has shape"):
         vary(Variation(), start=[0.0])
-    with pytest.raises(ModelError, match="one column"):
-        simulate_varying(PLANT, [np.nan], variation=Variation(), rate_hz=RATE, seed=0)
+    with pytest.raises(ModelError, match="not finite at sample 0"):
+        simulate(PLANT, [np.nan], variation=Variation(), rate_hz=RATE, seed=0)
     with pytest.raises(ModelError, match="leaves the finite numbers"):
-        simulate_varying(PLANT, np.ones(200_000), variation=Variation(), rate_hz=100.0, seed=0)
+        simulate(PLANT, np.ones(200_000), variation=Variation(), rate_hz=100.0, seed=0)

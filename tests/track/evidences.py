@@ -14,8 +14,7 @@ from ambid.physics.loop import Noise
 from ambid.physics.models import model
 from ambid.physics.sensor_gain import SensorGains
 from ambid.signals import multisine
-from ambid.simulate import LinearPlant
-from ambid.simulate.bench import simulate_varying
+from ambid.simulate import LinearPlant, simulate
 from ambid.simulate.variation import Schedule, Variation
 from ambid.track.evidence import Evidence
 from tests.bearing.benches import SETTINGS
@@ -74,7 +73,7 @@ def changed_record(what: str, factor: float, at: int, n: int, seed: int) -> tupl
     gain = {o: Schedule.step(1.0, factor, t) for o in of.outputs if what == f"gain_{o}"}
     moved = {what: Schedule.step(s.truth[what], s.truth[what] * factor, t)} if what in s.truth else {}
     force = Schedule.step(0.0, factor, t) if what == "force" else None
-    done = simulate_varying(
+    done = simulate(
         LinearPlant(model=of, parameters=s.truth),
         multisine(n, s.rate_hz, amplitude=s.rms, band=s.band, seed=seed, amplitude_is="rms"),
         variation=Variation(parameters=moved, gains=gain, force=force),

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from ambid.simulate.bench import VaryingLoop as VaryingLoop
     from ambid.simulate.bench import simulate as simulate
     from ambid.simulate.bench import simulate_preset as simulate_preset
-    from ambid.simulate.bench import simulate_varying as simulate_varying
     from ambid.simulate.levels import largest_amplitude as largest_amplitude
     from ambid.simulate.levels import noise_at_snr as noise_at_snr
     from ambid.simulate.lost_samples import Loss as Loss

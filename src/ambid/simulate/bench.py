@@ -11,7 +11,7 @@ rotor's speed, an inductance changes at equal current, and the term i dL/dt of a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 
@@ -20,68 +20,19 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import ModelError
-from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.plant import LinearPlant, Standing, closed_loop_poles, nonlinear_truth
-from ambid.simulate.variation import Tables, Variation, check_variation
+from ambid.simulate.variation import Pieces, Tables, Variation, check_variation
 
+GRID_S = 1e-3
+"""Longest stretch of equal parameters while they drift, in s."""
 
-def drawn_noise(
-    of: LinearModel, noise: Noise, n: int, rate_hz: float, seed: int | np.random.Generator
-) -> tuple[Array, Array]:
-    """Return sensor noise (n, n_outputs) and disturbances (n, n_disturbances), in SI units."""
-    # All columns are drawn whatever their size, so that one level changed leaves the others' numbers as they were.
-    rng, size = np.random.default_rng(seed), noise_sizes(of, noise, rate_hz)
-    drawn = rng.standard_normal((n, size.size)) * size
-    outputs = len(of.outputs)
-    return np.ascontiguousarray(drawn[:, :outputs]), np.ascontiguousarray(drawn[:, outputs:])
-
-
-def noise_sizes(of: LinearModel, noise: Noise, rate_hz: float) -> Array:
-    """Return the rms of the noise of outputs, then disturbances (held over a sample), in SI units."""
-    force, voltage = noise.held_rms(rate_hz)
-    size = {"force": force, "voltage": voltage, "position": noise.position, "current": noise.current}
-    return np.array([size[name] for name in (*of.outputs, *of.disturbances)])
-
-
-def logged(
-    standing: Standing,
-    command: Array,
-    measured: Array,
-    rate_hz: float,
-    seed: int | np.random.Generator,
-    settings: Mapping[str, object],
-) -> Record:
-    """Return the record: input, current, position, as far as the model has them."""
-    of = standing.model
-    outputs = {name: measured[:, j] for j, name in enumerate(of.outputs)}
-    columns = {of.inputs[0]: command}
-    columns.update((name, outputs[name]) for name in ("current", "position") if name in outputs)
-    how = "linear" if standing.linear else "nonlinear"
-    named = "a generator" if isinstance(seed, np.random.Generator) else str(seed)
-    return Record(
-        rate_hz=rate_hz,
-        channels=tuple(Channel(name=name, unit=of.units[name], values=values) for name, values in columns.items()),
-        history=(Step(name="simulate", settings={"plant": f"{of.name}, {how}", "seed": named, **settings}),),
-        provenance=MappingProxyType({"simulator": "ambid.simulate", "plant": f"{of.name}, {how}", "seed": named}),
-    )
-
-
-def written(values: Loop | Noise | Limits) -> dict[str, object]:
-    """Return the settings that act, as JSON-able values: zeros and infinite limits are left out."""
-    found: dict[str, object] = {}
-    for name, value in asdict(values).items():
-        if isinstance(value, tuple):
-            ends = {end: v for end, v in zip(("low", "high"), value, strict=True) if math.isfinite(v)}
-            if ends:
-                found[name] = ends
-        elif value and math.isfinite(value):
-            found[name] = value
-    return found
+TRUE = "true_"
+"""With what the names of the columns begin that hold the truth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,6 +109,7 @@ def simulate(
     start: ArrayLike | None = None,
     substeps: int = 1,
     current_offset: float = 0.0,
+    variation: Variation | None = None,
 ) -> Simulation:
     """Simulate a plant in open or closed loop.
 
@@ -190,6 +142,9 @@ def simulate(
         Runge-Kutta steps in each sample (nonlinear only).
     current_offset : float
         What the current sensor shows without current, in A; the controller knows what it shows at rest.
+    variation : Variation, optional
+        What changes on the way (linear only); the record then has a column ``true_<name>`` for all that varies, and
+        ``speed`` and ``angle`` where the rotor turns.
 
     Returns
     -------
@@ -199,65 +154,15 @@ def simulate(
     Raises
     ------
     ModelError
-        If an argument has a wrong shape or value, or the simulation leaves the air gap or the finite numbers.
+        If an argument has a wrong shape or value, something varies that the model does not have, or the simulation
+        leaves the air gap or the finite numbers.
     """
-    from ambid.simulate.kernels import run
-
-    loop, limits, noise = loop or Loop(), limits or Limits(), noise or Noise()
-    standing = Standing.of(plant, operating_point)
     u = _vector("excitation", excitation)
-    r = _vector("setpoint", standing.point.position if setpoint is None else setpoint, u.size)
-    x0 = standing.centre if start is None else _vector("start", start, standing.centre.size)
-    if not (math.isfinite(rate_hz) and rate_hz > 0.0 and substeps >= 1):
-        raise ModelError(f"rate_hz {rate_hz} and substeps {substeps} must be positive. Correct them")
-    of, period, whole = standing.model, 1.0 / rate_hz, math.floor(loop.delay)
-    sensor, disturbance = drawn_noise(of, noise, u.size, rate_hz, seed)
-    if current_offset and "current" in of.outputs:
-        sensor[:, of.outputs.index("current")] += current_offset
-        u += loop.kc * current_offset
-    measured, command, states, contact, first, count, lost = run(
-        standing.linear,
-        u,
-        r,
-        sensor,
-        disturbance,
-        x0,
-        standing.centre,
-        standing.centre_input,
-        np.array([of.states.index(o) for o in of.outputs]),
-        (_index(of.outputs, "position"), _index(of.outputs, "current")),
-        *standing.matrices(period, loop.delay - whole),
-        *standing.nonlinear(),
-        np.array([loop.kp, loop.ki * period, loop.kd, loop.kc, loop.filter_s, period]),
-        whole,
-        loop.delay - whole,
-        period,
-        substeps,
-        np.array([getattr(noise, f"{o}_resolution") for o in of.outputs]),
-        (*getattr(limits, of.inputs[0]), getattr(noise, f"{of.inputs[0]}_resolution")),
-        limits.position,
-        standing.gap,
-    )
-    if lost >= 0:
-        raise ModelError(
-            f"the simulation leaves the air gap or the finite numbers at sample {lost} ({lost / rate_hz:.6g} s); an"
-            " unstable plant needs a loop, and stops in the gap. Give limits.position, another loop, or more substeps"
-        )
-    linear = {**standing.parameters(), "delay": loop.delay}
-    more = {} if isinstance(plant, LinearPlant) else nonlinear_truth(plant)
-    truth = {**linear, **more, **({"i_offset": current_offset} if current_offset else {})}
-    settings = {"rate_hz": rate_hz, "loop": written(loop), "noise": written(noise), "limits": written(limits)}
-    return Simulation(
-        record=logged(standing, command, measured, rate_hz, seed, settings),
-        states=states[:, : len(of.states)],
-        state_names=of.states,
-        truth=MappingProxyType(truth),
-        first_contact=None if contact < 0 else contact,
-        first_saturated=None if first < 0 else first,
-        n_saturated=count,
-        n_over_current=_beyond(of, states, limits),
-        largest_pole=float(np.abs(closed_loop_poles(linear, loop, rate_hz, of=of.name)[0])),
-    )
+    running = VaryingLoop(
+        plant, variation, rate_hz=rate_hz, seed=seed, loop=loop, limits=limits, noise=noise,
+        operating_point=operating_point, start=start, substeps=substeps, current_offset=current_offset,
+    )  # fmt: skip
+    return join(running, [running.advance(u, setpoint)], seed)
 
 
 def simulate_preset(
@@ -327,39 +232,6 @@ def simulate_preset(
     )
 
 
-def _vector(name: str, values: ArrayLike, n: int | None = None) -> Array:
-    array = np.asarray(values, dtype=np.float64)
-    if n is not None and array.ndim == 0:
-        array = np.full(n, float(array))
-    if array.ndim != 1 or array.size == 0 or (n is not None and array.size != n):
-        raise ModelError(
-            f"{name} has shape {array.shape}; it must be one column of {n or 'n_samples'} values. Reshape it"
-        )
-    if not np.isfinite(array).all():
-        raise ModelError(f"{name} is not finite at sample {int(np.argmin(np.isfinite(array)))}. Replace the value")
-    return np.array(array)
-
-
-def _index(names: tuple[str, ...], name: str) -> int:
-    return names.index(name) if name in names else -1
-
-
-def _beyond(of: LinearModel, states: Array, limits: Limits) -> int:
-    if "current" not in of.states:
-        return 0
-    i = states[:, of.states.index("current")]
-    return int(np.count_nonzero((i < limits.current[0]) | (i > limits.current[1])))
-
-
-GRID_S = 1e-3
-"""Longest stretch of equal parameters while they drift, in s."""
-
-TRUE = "true_"
-"""With what the names of the columns begin that hold the truth."""
-
-_CHUNK = 16384
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stretch:
     """Consecutive samples of a running simulation.
@@ -394,20 +266,16 @@ class VaryingLoop:
 
     Parameters
     ----------
-    plant : LinearPlant
+    plant : LinearPlant or NonlinearPlant
         With its parameters where the variation does not say otherwise.
-    variation : Variation
-        What changes.
+    variation : Variation, optional
+        What changes (linear only).
     rate_hz : float
         Sampling rate in Hz.
     seed : int or numpy.random.Generator
-        Seed of the noise; with nothing varying the record is that of `ambid.simulate.simulate`, bit for bit.
-    loop, limits, noise, operating_point
+        Seed of the noise.
+    loop, limits, noise, operating_point, start, substeps, current_offset
         As in `ambid.simulate.simulate`.
-    setpoint : float, optional
-        Wanted position in m; default the operating point's.
-    start : array_like, shape (n_states,), optional
-        Initial state; default at rest at the operating point.
     grid_s : float
         Longest stretch of equal parameters while they drift, in s.
 
@@ -419,8 +287,8 @@ class VaryingLoop:
 
     def __init__(
         self,
-        plant: LinearPlant,
-        variation: Variation,
+        plant: LinearPlant | NonlinearPlant,
+        variation: Variation | None = None,
         *,
         rate_hz: float,
         seed: int | np.random.Generator,
@@ -428,47 +296,48 @@ class VaryingLoop:
         limits: Limits | None = None,
         noise: Noise | None = None,
         operating_point: OperatingPoint | None = None,
-        setpoint: float | None = None,
         start: ArrayLike | None = None,
+        substeps: int = 1,
+        current_offset: float = 0.0,
         grid_s: float = GRID_S,
     ) -> None:
-        from ambid.simulate.kernels import run_varying
+        from ambid.simulate.kernels import run
 
-        if not (math.isfinite(rate_hz) and rate_hz > 0.0 and grid_s > 0.0):
-            raise ModelError(f"rate_hz {rate_hz} and grid_s {grid_s} must be positive. Correct them")
-        check_variation(variation, plant.model)
+        if not (math.isfinite(rate_hz) and rate_hz > 0.0 and substeps >= 1 and grid_s > 0.0):
+            raise ModelError(f"rate_hz {rate_hz} and substeps {substeps} must be positive. Correct them")
         self.loop, self.limits, self.noise = loop or Loop(), limits or Limits(), noise or Noise()
-        self.standing, self.variation, self.rate_hz = Standing.of(plant, operating_point), variation, rate_hz
-        self._run: Callable[..., int] = run_varying
-        self._rng = np.random.default_rng(seed)
-        of, period, whole = plant.model, 1.0 / rate_hz, math.floor(self.loop.delay)
-        self.tables = Tables(
-            of, plant.parameters, variation.parameters, variation.gains, rate_hz, self.loop.delay - whole,
-            max(1, round(grid_s * rate_hz)),
-        )  # fmt: skip
-        at_rest = self.standing.centre if start is None else np.array(start, dtype=np.float64)
-        if at_rest.shape != self.standing.centre.shape or not np.isfinite(at_rest).all():
-            raise ModelError(f"start has shape {at_rest.shape}; it is {len(of.states)} finite states. Correct it")
-        self._x, self._memory, self._counts = at_rest.copy(), np.zeros(3), np.array([0, -1, -1, 0])
+        self.standing, self.rate_hz = Standing.of(plant, operating_point), rate_hz
+        self.variation, self._told = variation or Variation(), variation is not None
+        of, period, whole = self.standing.model, 1.0 / rate_hz, math.floor(self.loop.delay)
+        fraction = self.loop.delay - whole
+        self.tables: Tables | None = None
+        if isinstance(plant, LinearPlant):
+            check_variation(self.variation, of)
+            v, grid = self.variation, max(1, round(grid_s * rate_hz))
+            self.tables = Tables(of, plant.parameters, v.parameters, v.gains, rate_hz, fraction, grid)
+        else:
+            if self._told:
+                raise ModelError("a nonlinear plant does not vary. Give a LinearPlant, or leave the variation out")
+            self._equations = self.standing.equations(period, fraction, substeps)
+        self._run: Callable[..., int] = run
+        self._rng, self.current_offset = np.random.default_rng(seed), current_offset
+        self._x = self.standing.centre.copy() if start is None else _vector("start", start, self.standing.centre.size)
+        self._memory, self._counts = np.zeros(3), np.array([0, -1, -1, 0])
         self._line = np.full(whole + 2, self.standing.centre_input)
-        self._over = 0
-        self._sizes = noise_sizes(of, self.noise, rate_hz)
-        self._force_column = of.disturbances.index("force") if "force" in of.disturbances else -1
-        self._input: str = of.inputs[0]
-        goal = self.standing.point.position if setpoint is None else float(setpoint)
-        self._settings = np.array([self.standing.centre_input, goal])
-        self._outputs = np.array([of.states.index(o) for o in of.outputs])
-        roles = [of.outputs.index(o) if o in of.outputs else -1 for o in ("position", "current")]
-        self._roles = np.array(roles)
-        c = self.loop
-        self._gains = np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period])
-        self._resolution = np.array([getattr(self.noise, f"{o}_resolution") for o in of.outputs])
-        self._ends = np.array(
-            [
-                *getattr(self.limits, self._input),
-                *self.limits.position,
-                getattr(self.noise, f"{self._input}_resolution"),
-            ]
+        self.n_over_current = 0
+        force, voltage = self.noise.held_rms(rate_hz)
+        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
+        self._sizes = np.array([sizes[name] for name in (*of.outputs, *of.disturbances)])
+        self._roles = tuple(of.outputs.index(o) if o in of.outputs else -1 for o in ("position", "current"))
+        c, resolution = self.loop, [getattr(self.noise, f"{name}_resolution") for name in (*of.outputs, of.inputs[0])]
+        self._law = (
+            np.array([of.states.index(o) for o in of.outputs]),
+            self._roles,
+            np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
+            np.array(resolution[:-1]),
+            (*getattr(self.limits, of.inputs[0]), resolution[-1]),
+            self.limits.position,
+            self.standing.gap,
         )
 
     @property
@@ -498,18 +367,15 @@ class VaryingLoop:
         """Number of limited commands."""
         return int(self._counts[3])
 
-    @property
-    def n_over_current(self) -> int:
-        """Number of samples with the true current outside its limits."""
-        return self._over
-
-    def advance(self, excitation: Array) -> Stretch:
+    def advance(self, excitation: Array, setpoint: ArrayLike | None = None) -> Stretch:
         """Run on for as many samples as there are of the excitation.
 
         Parameters
         ----------
         excitation : ndarray, shape (n_samples,), in the unit of the input
             Added at the controller's output.
+        setpoint : array_like, shape () or (n_samples,), in m, optional
+            Wanted position; default the operating point's.
 
         Returns
         -------
@@ -519,36 +385,50 @@ class VaryingLoop:
         Raises
         ------
         ModelError
-            If the states leave the finite numbers.
+            If the states leave the air gap or the finite numbers.
         """
-        of, n, first = self.standing.model, excitation.size, self.n_done
-        pieces = self.tables.pieces(first, first + n)
-        noise = self._rng.standard_normal((n, self._sizes.size))  # in the order in which `simulate` draws
+        of, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
+        wanted = _vector("setpoint", standing.point.position if setpoint is None else setpoint, n)
+        if self.tables is None:
+            pieces = Pieces(np.array([0, n]), np.ones((1, len(of.outputs))), self._equations, {})
+        else:
+            pieces = self.tables.pieces(first, first + n)
+        # All columns are drawn whatever their size, so that one level changed leaves the others' numbers as they were.
+        noise = self._rng.standard_normal((n, self._sizes.size)) * self._sizes
+        u = np.array(excitation, dtype=np.float64)
+        if self.current_offset and "current" in of.outputs:
+            noise[:, self._roles[1]] += self.current_offset
+            u += self.loop.kc * self.current_offset
         force, speed, angle = self._loads(first, n)
-        measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, len(of.states)))
+        column = of.disturbances.index("force") if "force" in of.disturbances else -1
+        measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, self._x.size))
         lost = self._run(
-            np.ascontiguousarray(excitation, dtype=np.float64), noise, self._sizes, force, self._force_column,
-            pieces.edges, pieces.A, pieces.B, pieces.B_late, pieces.E, pieces.gains, self._x, self._memory, self._line,
-            self._counts, self.standing.centre, self._settings, self._outputs, self._roles, self._gains,
-            self._resolution, self._ends, measured, command, states,
+            u, wanted, noise, force, column, pieces.edges, pieces.equations, pieces.gains, self._x, self._memory,
+            self._line, self._counts, standing.centre, standing.centre_input, *self._law, measured, command, states,
         )  # fmt: skip
         if lost >= 0:
-            raise ModelError(
-                f"the simulation leaves the finite numbers at sample {first + lost}"
-                f" ({(first + lost) / self.rate_hz:.6g} s); an unstable plant needs a loop that holds it while it"
-                " changes, and stops. Give limits.position, another loop, or a smaller change"
-            )
+            raise ModelError(self._loss(first + lost))
         if "current" in of.states:
-            i = states[:, of.states.index("current")]
-            low, high = self.limits.current
-            self._over += int(np.count_nonzero((i < low) | (i > high)))
-        lengths = np.diff(pieces.edges)
-        truth = {name: np.repeat(values, lengths) for name, values in pieces.theta.items()}
+            i, (low, high) = states[:, of.states.index("current")], self.limits.current
+            self.n_over_current += int(np.count_nonzero((i < low) | (i > high)))
+        truth = {name: np.repeat(values, np.diff(pieces.edges)) for name, values in pieces.theta.items()}
         truth.update(self._true_loads(first, n))
         return Stretch(
-            first=first, command=command, measured=measured, states=states, speed=speed, angle=angle,
-            truth=MappingProxyType(truth),
+            first=first, command=command, measured=measured, states=states[:, : len(of.states)], speed=speed,
+            angle=angle, truth=MappingProxyType(truth),
         )  # fmt: skip
+
+    def _loss(self, sample: int) -> str:
+        at = f"at sample {sample} ({sample / self.rate_hz:.6g} s); an unstable plant needs a loop"
+        if self._told:
+            return (
+                f"the simulation leaves the finite numbers {at} that holds it while it changes, and stops. Give"
+                " limits.position, another loop, or a smaller change"
+            )
+        return (
+            f"the simulation leaves the air gap or the finite numbers {at}, and stops in the gap. Give limits.position,"
+            " another loop, or more substeps"
+        )
 
     def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None]:
         """Return load and unbalance over each sample (empty for none), and speed and angle at the sampling instants."""
@@ -574,95 +454,27 @@ class VaryingLoop:
         return found
 
 
-def simulate_varying(
-    plant: LinearPlant,
-    excitation: ArrayLike,
-    *,
-    variation: Variation,
-    rate_hz: float,
-    seed: int | np.random.Generator,
-    loop: Loop | None = None,
-    limits: Limits | None = None,
-    noise: Noise | None = None,
-    operating_point: OperatingPoint | None = None,
-    setpoint: float | None = None,
-    start: ArrayLike | None = None,
-    grid_s: float = GRID_S,
-) -> Simulation:
-    """Simulate a linear plant whose parameters, sensors and loads change, in open or closed loop.
-
-    Parameters
-    ----------
-    plant : LinearPlant
-        With its parameters where the variation does not say otherwise.
-    excitation : array_like, shape (n_samples,), in the unit of the input (V)
-        Added at the controller's output, before its limits.
-    variation : Variation
-        What changes.
-    rate_hz : float
-        Sampling rate in Hz.
-    seed : int or numpy.random.Generator
-        Seed of the noise; with nothing varying the record is that of `ambid.simulate.simulate`, bit for bit.
-    loop, limits, noise, operating_point
-        As in `ambid.simulate.simulate`.
-    setpoint : float, optional
-        Wanted position in m; default the operating point's.
-    start : array_like, shape (n_states,), optional
-        Initial state; default at rest at the operating point.
-    grid_s : float
-        Longest stretch of equal parameters while they drift, in s.
-
-    Returns
-    -------
-    Simulation
-        Its record has a column ``true_<name>`` for all that varies, and ``speed`` and ``angle`` where the rotor turns;
-        `Simulation.truth` are the parameters at the beginning.
-
-    Raises
-    ------
-    ModelError
-        If an argument has a wrong shape or value, or the states leave the finite numbers.
-    """
-    u = np.asarray(excitation, dtype=np.float64)
-    if u.ndim != 1 or u.size == 0 or not np.isfinite(u).all():
-        raise ModelError(f"excitation has shape {u.shape}; it is one column of finite values. Correct it")
-    running = VaryingLoop(
-        plant, variation, rate_hz=rate_hz, seed=seed, loop=loop, limits=limits, noise=noise,
-        operating_point=operating_point, setpoint=setpoint, start=start, grid_s=grid_s,
-    )  # fmt: skip
-    return gathered(running, [running.advance(u[k : k + _CHUNK]) for k in range(0, u.size, _CHUNK)], seed)
-
-
-def gathered(running: VaryingLoop, stretches: Iterable[Stretch], seed: int | np.random.Generator) -> Simulation:
-    """Return all stretches of a run as one simulation.
-
-    `running`: the bench, after it has made the stretches; `stretches`: all of them, in order; `seed`: for the record's
-    history. Returns as `simulate_varying`.
-    """
-    parts = list(stretches)
+def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.random.Generator) -> Simulation:
+    """Return all stretches of a run, in order, as one simulation; `seed` is for the record's history."""
     standing, loop, rate_hz = running.standing, running.loop, running.rate_hz
-    command, measured, states = (
-        np.concatenate([getattr(p, n) for p in parts]) for n in ("command", "measured", "states")
-    )
-    settings = {
-        "rate_hz": rate_hz,
-        "loop": written(loop),
-        "noise": written(running.noise),
-        "limits": written(running.limits),
-    }
-    record = logged(standing, command, measured, rate_hz, seed, settings)
-    units = running.units
-    turning = [n for n in ("speed", "angle") if getattr(parts[0], n) is not None]
-    more = [Channel(name=n, unit=units[n], values=np.concatenate([getattr(p, n) for p in parts])) for n in turning]
-    for name in parts[0].truth:
-        values = np.concatenate([p.truth[name] for p in parts])
-        more.append(Channel(name=f"{TRUE}{name}", unit=units[name], values=values))
-    begin = {name: s.at(np.zeros(1), rate_hz)[0] for name, s in running.variation.parameters.items()}
+    of, plant = standing.model, standing.plant
+    named = "a generator" if isinstance(seed, np.random.Generator) else str(seed)
+    made = {"plant": f"{of.name}, {'linear' if isinstance(plant, LinearPlant) else 'nonlinear'}", "seed": named}
+    settings = {name: _acting(getattr(running, name)) for name in ("loop", "noise", "limits")}
+    begin = {name: float(s.at(np.zeros(1), rate_hz)[0]) for name, s in running.variation.parameters.items()}
+    truth = {**standing.parameters(), **begin, "delay": loop.delay}
+    truth |= {} if isinstance(plant, LinearPlant) else nonlinear_truth(plant)
+    truth |= {"i_offset": running.current_offset} if running.current_offset else {}
     return Simulation(
-        record=replace(record, channels=(*record.channels, *more)),
-        states=states,
-        state_names=standing.model.states,
-        truth=MappingProxyType({**standing.parameters(), **begin, "delay": loop.delay}),
+        record=Record(
+            rate_hz=rate_hz,
+            channels=_channels(running, stretches),
+            history=(Step(name="simulate", settings={**made, "rate_hz": rate_hz, **settings}),),
+            provenance=MappingProxyType({"simulator": "ambid.simulate", **made}),
+        ),
+        states=np.concatenate([s.states for s in stretches]),
+        state_names=of.states,
+        truth=MappingProxyType(truth),
         first_contact=running.first_contact,
         first_saturated=running.first_saturated,
         n_saturated=running.n_saturated,
@@ -671,13 +483,43 @@ def gathered(running: VaryingLoop, stretches: Iterable[Stretch], seed: int | np.
     )
 
 
+def _channels(running: VaryingLoop, stretches: Sequence[Stretch]) -> tuple[Channel, ...]:
+    """Return input, current and position as far as the model has them, speed and angle, and what varies."""
+    of, units = running.standing.model, running.units
+    measured = np.concatenate([s.measured for s in stretches])
+    columns = {of.inputs[0]: np.concatenate([s.command for s in stretches])}
+    columns |= {name: measured[:, of.outputs.index(name)] for name in ("current", "position") if name in of.outputs}
+    for name in ("speed", "angle"):
+        parts = [x for x in (getattr(s, name) for s in stretches) if x is not None]
+        columns |= {name: np.concatenate(parts)} if parts else {}
+    found = [Channel(name=name, unit={**of.units, **units}[name], values=x) for name, x in columns.items()]
+    for name in stretches[0].truth:
+        values = np.concatenate([s.truth[name] for s in stretches])
+        found.append(Channel(name=f"{TRUE}{name}", unit=units[name], values=values))
+    return tuple(found)
+
+
+def _acting(values: Loop | Noise | Limits) -> dict[str, object]:
+    """Return the settings that act, as JSON-able values: zeros and infinite limits are left out."""
+    found: dict[str, object] = {}
+    for name, value in asdict(values).items():
+        if isinstance(value, tuple):
+            ends = {end: v for end, v in zip(("low", "high"), value, strict=True) if math.isfinite(v)}
+            if ends:
+                found[name] = ends
+        elif value and math.isfinite(value):
+            found[name] = value
+    return found
+
+
 def _largest_pole(running: VaryingLoop) -> float:
     """Return the largest modulus over the run, looked at wherever a change begins or ends."""
-    corners = running.tables.corners
-    corners = corners[corners <= running.n_done][:: max(1, corners.size // 50)].astype(np.float64)
-    at = np.append(corners, float(running.n_done))
     v, rate, loop = running.variation, running.rate_hz, running.loop
-    of = running.standing.model
+    of, at = running.standing.model, np.zeros(1)
+    if running.tables is not None and (v.parameters or v.gains):
+        corners = running.tables.corners
+        corners = corners[corners <= running.n_done][:: max(1, corners.size // 50)].astype(np.float64)
+        at = np.append(corners, float(running.n_done))
     theta = {name: s.at(at, rate) for name, s in v.parameters.items()}
     gains = {name: s.at(at, rate) for name, s in v.gains.items()}
     largest = 0.0
@@ -687,3 +529,16 @@ def _largest_pole(running: VaryingLoop) -> float:
         seen = replace(loop, kp=p * loop.kp, ki=p * loop.ki, kd=p * loop.kd, kc=c * loop.kc)
         largest = max(largest, float(np.abs(closed_loop_poles(here, seen, rate, of=of.name)[0])))
     return largest
+
+
+def _vector(name: str, values: ArrayLike, n: int | None = None) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if n is not None and array.ndim == 0:
+        array = np.full(n, float(array))
+    if array.ndim != 1 or array.size == 0 or (n is not None and array.size != n):
+        raise ModelError(
+            f"{name} has shape {array.shape}; it must be one column of {n or 'n_samples'} values. Reshape it"
+        )
+    if not np.isfinite(array).all():
+        raise ModelError(f"{name} is not finite at sample {int(np.argmin(np.isfinite(array)))}. Replace the value")
+    return np.array(array)

@@ -17,10 +17,15 @@ from ambid.physics.coenergy_law import coenergy_derivatives
 
 Integers = NDArray[np.int64]
 
+# The equations of a plant: A, B, B_late and E; or magnet, body, and fraction, period and steps of a sample, as
+# `Standing.equations` has them.
+Linear = tuple[Array, Array, Array, Array]
+Nonlinear = tuple[Array, Array, tuple[float, float, int]]
+
 _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 
-@compiled
+@compiled(error_model="numpy")
 def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
     """Return force, k_i and L of a `CoEnergy` (7 numbers) or a `LawMagnet` (12), as `Standing.nonlinear` has them."""
     if magnet.size > 7:
@@ -35,7 +40,7 @@ def magnet_at(x: float, i: float, magnet: Array) -> tuple[float, float, float]:
     return pull, motional, magnet[0] * gap_a + magnet[2] * gap_b + magnet[5]
 
 
-@compiled
+@compiled(error_model="numpy")
 def rate_of_change(
     x: float, v: float, i: float, p: float, voltage: float, force: float, magnet: Array, body: Array
 ) -> tuple[float, float, float]:
@@ -51,7 +56,7 @@ def rate_of_change(
     return acceleration, (voltage - body[2] * i - motional * v) / inductance, lag
 
 
-@compiled
+@compiled(error_model="numpy")
 def runge_kutta(
     x: float, v: float, i: float, p: float, voltage: float, force: float, h: float, magnet: Array, body: Array
 ) -> tuple[float, float, float, float]:
@@ -73,7 +78,7 @@ def runge_kutta(
     )
 
 
-@compiled
+@compiled(error_model="numpy")
 def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, body: Array) -> tuple[float, float]:
     """Return current and lagging force a step later of a rotor that lies on a stop: without speed no voltage by it."""
     _, c1, p1 = rate_of_change(x, 0.0, i, p, voltage, 0.0, magnet, body)
@@ -83,7 +88,7 @@ def lie(x: float, i: float, p: float, voltage: float, h: float, magnet: Array, b
     return i + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), p + h / 6.0 * (p1 + 2.0 * (p2 + p3) + p4)
 
 
-@compiled
+@compiled(error_model="numpy", inline="always")
 def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, bool]:
     """Stop the rotor at the ends of its range, without rebound; the flag says that it touched."""
     if x >= high:
@@ -93,27 +98,25 @@ def stop(x: float, v: float, low: float, high: float) -> tuple[float, float, boo
     return x, v, False
 
 
-@compiled
+@compiled(error_model="numpy", inline="always")
 def quantise(value: float, step: float) -> float:
     """Return `value` on the grid of `step`; a step of zero leaves it."""
     return math.floor(value / step + 0.5) * step if step > 0.0 else value
 
 
-@compiled
+@compiled(error_model="numpy")
 def advance_nonlinear(
     x: Array,
     late: float,
     now: float,
-    fraction: float,
+    timing: tuple[float, float, int],
     disturbance: Array,
-    period: float,
-    substeps: int,
     magnet: Array,
     body: Array,
-    low: float,
-    high: float,
+    stops: tuple[float, float],
 ) -> bool:
     """Carry the state over one sample in place: first under the voltage `late`, then under `now`."""
+    (fraction, period, substeps), (low, high) = timing, stops
     touched = False
     p, v, i = x[0], x[1], x[2]
     lagging = x[3] if x.size > 3 else 0.0
@@ -139,7 +142,7 @@ def advance_nonlinear(
     return touched
 
 
-@compiled
+@compiled(error_model="numpy", inline="always")
 def advance_linear(
     x: Array,
     centre: Array,
@@ -168,214 +171,128 @@ def advance_linear(
         x[row] = s
 
 
-@compiled
+@compiled(error_model="numpy")
+def advance_plant(
+    x: Array,
+    centre: Array,
+    voltages: tuple[float, float, float],
+    disturbance: Array,
+    equations: Linear | Nonlinear,
+    stops: tuple[float, float],
+    room: Array,
+) -> bool:
+    """Carry the state of a plant over one sample in place; tell whether the rotor touched a stop.
+
+    `voltages`: before and after the delay's fraction has passed, and that at `centre`. `disturbance`: held over the
+    sample; of the nonlinear plant force, then voltage. Position and velocity come first in `x` where there are any;
+    `room` (n_states,) is to work in.
+    """
+    late, now, rest = voltages
+    if len(equations) == 3:  # known while compiling: each plant compiles its own equations alone
+        magnet, body, timing = equations
+        return advance_nonlinear(x, late, now, timing, disturbance, magnet, body, stops)
+    else:
+        a, b, b_late, e = equations
+        advance_linear(x, centre, late - rest, now - rest, disturbance, a, b, b_late, e, room)
+        touched = False
+        if x.size > 1:
+            x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
+        return touched
+
+
+@compiled(error_model="numpy")
 def run(
-    linear: bool,
     excitation: Array,
     setpoint: Array,
-    sensor_noise: Array,
-    disturbance: Array,
-    start: Array,
-    centre: Array,
-    centre_input: float,
-    outputs: Integers,
-    roles: tuple[int, int],
-    a: Array,
-    b: Array,
-    b_late: Array,
-    e: Array,
-    magnet: Array,
-    body: Array,
-    gains: Array,
-    delay: int,
-    fraction: float,
-    period: float,
-    substeps: int,
-    resolution: Array,
-    input_limits: tuple[float, float, float],
-    stops: tuple[float, float],
-    gap: tuple[float, float],
-) -> tuple[Array, Array, Array, int, int, int, int]:
-    """Run the loop over all samples.
-
-    `outputs` are the states that are measured, `roles` the columns among them of position and current (-1: none),
-    `gains` kp, ki T, kd, kc, tau, T, and `input_limits` low, high and resolution of the command.
-    """
-    n, ny = sensor_noise.shape
-    measured, command, states = np.empty((n, ny)), np.empty(n), np.empty((n, start.size))
-    contact, saturated, n_saturated = -1, -1, 0
-    x, room = start.copy(), np.empty(start.size)
-    at, current_at = roles
-    integral = derivative = last = 0.0
-    low, high, step = input_limits
-    for k in range(n):
-        for j in range(ny):
-            truth = x[outputs[j]]
-            if not math.isfinite(truth):
-                return measured, command, states, contact, saturated, n_saturated, k
-            measured[k, j] = quantise(truth + sensor_noise[k, j], resolution[j])
-        states[k] = x
-        wanted, error = centre_input + excitation[k], 0.0
-        if at >= 0:
-            y = measured[k, at]
-            error = setpoint[k] - y
-            derivative = (gains[4] * derivative - (gains[2] * (y - last) if k > 0 else 0.0)) / (gains[4] + gains[5])
-            last = y
-            wanted += gains[0] * error + integral + derivative
-        if current_at >= 0:
-            wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
-        beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
-        if beyond != 0.0:
-            n_saturated += 1
-            saturated = k if saturated < 0 else saturated
-        # Anti-windup: while the command is limited the integral may only move back.
-        growth = gains[1] * error
-        if beyond * growth <= 0.0:
-            integral += growth
-        command[k] = min(max(quantise(wanted, step), low), high)
-        now = command[k - delay] if k >= delay else centre_input
-        late = command[k - delay - 1] if k > delay else centre_input
-        if linear:
-            advance_linear(x, centre, late - centre_input, now - centre_input, disturbance[k], a, b, b_late, e, room)
-            touched = False
-            if at >= 0:
-                x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
-        else:
-            touched = advance_nonlinear(
-                x, late, now, fraction, disturbance[k], period, substeps, magnet, body, stops[0], stops[1]
-            )
-            # Beyond a pole face the equations hold no more, though they give finite numbers again.
-            if not gap[0] < x[0] < gap[1] and k + 1 < n:
-                return measured, command, states, contact, saturated, n_saturated, k + 1
-        if touched and contact < 0:
-            contact = k + 1
-    return measured, command, states, contact, saturated, n_saturated, -1
-
-
-@compiled
-def run_varying(
-    excitation: Array,
     noise: Array,
-    noise_size: Array,
     force: Array,
     force_column: int,
     edges: Integers,
-    a: Array,
-    b: Array,
-    b_late: Array,
-    e: Array,
+    equations: Linear | Nonlinear,
     sensor_gain: Array,
     x: Array,
     memory: Array,
     line: Array,
     counts: Integers,
     centre: Array,
-    settings: Array,
+    centre_input: float,
     outputs: Integers,
-    roles: Integers,
+    roles: tuple[int, int],
     gains: Array,
     resolution: Array,
-    limits: Array,
+    limits: tuple[float, float, float],
+    stops: tuple[float, float],
+    gap: tuple[float, float],
     measured: Array,
     command: Array,
     states: Array,
 ) -> int:
-    """Run the loop over some samples and keep what the next call needs; the law is that of `_kernels.run`.
+    """Run the loop over some samples and keep what the next call needs.
 
-    `noise` (n, n_outputs + n_disturbances) are standard normal numbers, `noise_size` what they are multiplied with;
-    `force` (n,) adds to the disturbance `force_column`, or is empty. `edges` (n_pieces + 1) bound the stretches of the
-    matrices a (n_pieces, n, n), b, b_late (n_pieces, n), e and of sensor_gain (n_pieces, n_outputs). settings: centre
-    input, set point. limits: low and high of command and of position, resolution of the command.
+    `noise` (n, n_outputs + n_disturbances); `force` (n,) adds to the disturbance `force_column`, or is empty. `edges`
+    (n_pieces + 1) bound the stretches of `sensor_gain` (n_pieces, n_outputs) and of a linear plant's matrices, each
+    with one axis more in front. `outputs` are the states that are measured, `roles` the columns among them of position
+    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `limits` low, high and resolution of the command, and
+    `gap` the positions between which the equations hold.
 
-    Kept between calls: x (n,), memory = integral, derivative, last position; line = the newest commands, newest first
-    (whole delay + 2); counts = samples done, first contact, first limited command (-1: none), limited commands.
-    Filled: measured, command, states. Returns the first sample of these that is not finite, -1 for none.
+    Kept between calls: x (n_states,), memory = integral, derivative, last position; line = the newest commands, newest
+    first (whole delay + 2); counts = samples done, first contact, first limited command (-1: none), limited commands.
+    Filled: measured, command, states. Returns the first sample of these that is not finite or outside the gap, -1 for
+    none.
     """
-    at, current_at = roles[0], roles[1]
+    at, current_at = roles
     integral, derivative, last = memory[0], memory[1], memory[2]
-    centre_input, setpoint = settings[0], settings[1]
-    whole = line.size - 2
-    n_outputs, loaded = outputs.size, force.size > 0
-    disturbance, room = np.empty(noise_size.size - n_outputs), np.empty(x.size)
+    low, high, step = limits
+    whole, n_outputs, n = line.size - 2, outputs.size, command.size
+    disturbance, room = np.empty(noise.shape[1] - n_outputs), np.empty(x.size)
     for piece in range(edges.size - 1):
-        a_now, b_now, b_before, e_now, gain = a[piece], b[piece], b_late[piece], e[piece], sensor_gain[piece]
+        gain = sensor_gain[piece]
+        if len(equations) == 3:
+            here: Linear | Nonlinear = equations
+        else:
+            here = (equations[0][piece], equations[1][piece], equations[2][piece], equations[3][piece])
         for k in range(edges[piece], edges[piece + 1]):
             for j in range(n_outputs):
                 truth = x[outputs[j]]
                 if not math.isfinite(truth):
                     return k
-                measured[k, j] = quantise(gain[j] * truth + noise[k, j] * noise_size[j], resolution[j])
-            for row in range(x.size):
-                states[k, row] = x[row]
+                measured[k, j] = quantise(gain[j] * truth + noise[k, j], resolution[j])
+            for j in range(x.size):
+                states[k, j] = x[j]
             wanted, error = centre_input + excitation[k], 0.0
             if at >= 0:
                 y = measured[k, at]
-                error = setpoint - y
+                error = setpoint[k] - y
                 moved = y - last if counts[0] > 0 else 0.0
                 derivative = (gains[4] * derivative - gains[2] * moved) / (gains[4] + gains[5])
                 last = y
                 wanted += gains[0] * error + integral + derivative
             if current_at >= 0:
                 wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
-            beyond = max(wanted - limits[1], 0.0) + min(wanted - limits[0], 0.0)
+            beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
             if beyond != 0.0:
                 counts[3] += 1
                 if counts[2] < 0:
                     counts[2] = counts[0]
+            # Anti-windup: while the command is limited the integral may only move back.
             growth = gains[1] * error
             if beyond * growth <= 0.0:
                 integral += growth
-            command[k] = min(max(quantise(wanted, limits[4]), limits[0]), limits[1])
+            command[k] = min(max(quantise(wanted, step), low), high)
             for j in range(whole + 1, 0, -1):
                 line[j] = line[j - 1]
             line[0] = command[k]
-            late, now = line[whole + 1] - centre_input, line[whole] - centre_input
             for j in range(disturbance.size):
-                disturbance[j] = noise[k, n_outputs + j] * noise_size[n_outputs + j]
-            if loaded:
+                disturbance[j] = noise[k, n_outputs + j]
+            if force.size > 0:
                 disturbance[force_column] += force[k]
-            advance_linear(x, centre, late, now, disturbance, a_now, b_now, b_before, e_now, room)
-            if at >= 0:
-                x[0], x[1], touched = stop(x[0], x[1], limits[2], limits[3])
-                if touched and counts[1] < 0:
-                    counts[1] = counts[0] + 1
+            voltages = (line[whole + 1], line[whole], centre_input)
+            touched = advance_plant(x, centre, voltages, disturbance, here, stops, room)
+            if touched and counts[1] < 0:
+                counts[1] = counts[0] + 1
             counts[0] += 1
+            # Beyond a pole face the equations hold no more, though they give finite numbers again.
+            if not gap[0] < x[0] < gap[1] and k + 1 < n:
+                return k + 1
     memory[0], memory[1], memory[2] = integral, derivative, last
     return -1
-
-
-@compiled
-def advance_plant(
-    linear: bool,
-    x: Array,
-    centre: Array,
-    voltages: tuple[float, float, float],
-    disturbance: Array,
-    matrices: tuple[Array, Array, Array, Array],
-    magnet: Array,
-    body: Array,
-    timing: tuple[float, float, int],
-    stops: tuple[float, float],
-    room: Array,
-) -> bool:
-    """Carry the state of a plant over one sample, in place.
-
-    `linear`: which equations: the matrices, or magnet and body; `x`: (n_states,), SI, state; position and velocity come
-    first where the plant has them; `centre`: (n_states,), SI, where the matrices hold; `voltages`: before and after the
-    delay's fraction has passed, and that at `centre`, V; `disturbance`: (n_disturbances,), SI, held over the sample; of
-    the nonlinear plant force, then voltage; `matrices`: a (n_states, n_states), B and B_late (n_states,), E (n_states,
-    n_disturbances), as `Standing.matrices` has them; `magnet`, `body`: as `Standing.nonlinear` has them; `stops`: where
-    the rotor is stopped, m; `room`: (n_states,), to work in. Returns whether the rotor touched a stop.
-    """
-    late, now, rest = voltages
-    if not linear:
-        fraction, period, substeps = timing
-        return bool(
-            advance_nonlinear(x, late, now, fraction, disturbance, period, substeps, magnet, body, stops[0], stops[1])
-        )
-    a, b, b_late, e = matrices
-    advance_linear(x, centre, late - rest, now - rest, disturbance, a, b, b_late, e, room)
-    if x.size < 3:
-        return False
-    x[0], x[1], touched = stop(x[0], x[1], stops[0], stops[1])
-    return bool(touched)

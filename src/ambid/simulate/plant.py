@@ -22,6 +22,8 @@ from ambid.physics.magnet import CoEnergy
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
+Equations = tuple[Array, Array, Array, Array] | tuple[Array, Array, tuple[float, float, int]]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinearPlant:
@@ -82,11 +84,6 @@ class Standing:
             centre_input=known[of.inputs[0]],
         )
 
-    @property
-    def linear(self) -> bool:
-        """True for a linear plant."""
-        return isinstance(self.plant, LinearPlant)
-
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the linear model in SI units."""
         if isinstance(self.plant, LinearPlant):
@@ -98,36 +95,26 @@ class Standing:
         """Positions in m between which the equations hold."""
         return (-math.inf, math.inf) if isinstance(self.plant, LinearPlant) else self.plant.magnet.range
 
-    def matrices(self, period: float, fraction: float) -> tuple[Array, Array, Array, Array]:
-        """Return A, B, B_late and E over a period; zeros for a nonlinear plant.
+    def equations(self, period: float, fraction: float, substeps: int) -> Equations:
+        """Return what a compiled loop steps the plant with: A, B, B_late and E, or magnet, body and timing.
 
-        `period`: in s; `fraction`: part of the period by which the input is late, 0 to 1. Returns shapes (n_states,
-        n_states), (n_states,), (n_states,), (n_states, n_disturbances).
-        """
-        if not isinstance(self.plant, LinearPlant):
-            return np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros((3, 2))
-        d, _ = discretise(self.model.matrices(self.plant.parameters), period, fraction=fraction)
-        full, now, late, noise = (np.ascontiguousarray(x) for x in (d.A, d.B[:, 0], d.B_late[:, 0], d.E))
-        return full, now, late, noise
-
-    def nonlinear(self) -> tuple[Array, Array]:
-        """Return the numbers of the magnet, and of body and stage, for compiled loops; zeros for a linear plant.
-
-        Returns `magnet`: k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a `CoEnergy`, or `LawMagnet.vector`; SI;
-        `body`: (10,), m, c, R, gravity, eddy pole, v_drop, i_drop, the stage's limits and its offset; SI.
+        The input is late by `fraction` of `period`. The magnet is k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a
+        `CoEnergy`, or `LawMagnet.vector`; the body m, c, R, gravity, eddy pole, v_drop, i_drop, limits and offset.
         """
         if isinstance(self.plant, LinearPlant):
-            return np.zeros(7), np.zeros(10)
+            d, _ = discretise(self.model.matrices(self.plant.parameters), period, fraction=fraction)
+            full, now, late, noise = (np.ascontiguousarray(x) for x in (d.A, d.B[:, 0], d.B_late[:, 0], d.E))
+            return full, now, late, noise
         w, p = self.plant.magnet.coenergy, self.plant
         if isinstance(w, LawMagnet):
-            magnet = w.vector
+            magnet = np.array(w.vector)
         elif isinstance(w, CoEnergy):
             magnet = np.array([w.k_a, w.s_a, w.k_b, w.s_b, w.i0, w.leakage, w.i0_asym])
         else:
             raise ModelError(f"a {type(w).__name__} cannot be simulated. Give a CoEnergy or a LawMagnet")
         stage = p.stage
         body = [p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits, stage.offset]
-        return magnet, np.array(body)
+        return magnet, np.array(body), (fraction, period, substeps)
 
 
 def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:

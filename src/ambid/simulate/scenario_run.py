@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
-from ambid.simulate.bench import TRUE, Simulation, Stretch, VaryingLoop, gathered
+from ambid.simulate.bench import TRUE, Simulation, Stretch, VaryingLoop, join
 from ambid.simulate.lost_samples import losses
 from ambid.simulate.rig_bench import as_columns
 from ambid.simulate.scenarios import Bench, Scenario, scenario
@@ -116,7 +116,7 @@ def simulate_scenario(
         u = run.excitation(first, min(_CHUNK, run.n_samples - first))
         stretches.append(run.running.advance(u))
         excitations.append(u)
-    done = gathered(run.running, stretches, seed)
+    done = join(run.running, stretches, seed)
     record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(run.settings())))
     if log_excitation:
         unit = run.bench.plant.model.units[run.bench.plant.model.inputs[0]]

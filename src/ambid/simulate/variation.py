@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from ambid.arrays import Array
 from ambid.errors import ModelError, nearest
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
+from ambid.simulate.plant import Equations
 
 _PER_TIME_CONSTANT = 50  # corners of a warm-up: the lines leave the exponential by 5e-5 of its rise at most
 
@@ -263,16 +264,12 @@ _DEGREE = 14  # at a norm of 0.5 the Taylor polynomial of the exponential is rig
 _NODE = 20  # cells from one exact discretisation to the next
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pieces:
+class Pieces(NamedTuple):
     """What the loop needs for some samples: `edges` (n_pieces + 1,), and matrices and values for each piece."""
 
     edges: Integers
-    A: Array
-    B: Array
-    B_late: Array
-    E: Array
     gains: Array
+    equations: Equations
     theta: Mapping[str, Array]
 
 
@@ -339,12 +336,10 @@ class Tables:
         theta = {name: s.at(middles, self._rate) for name, s in self._schedules.items()}
         one = np.ones(middles.size)
         gains = np.ascontiguousarray(np.column_stack([theta.get(f"gain_{o}", one) for o in self._of.outputs]))
-        return Pieces(
-            edges=np.array(edges, dtype=np.int64) - first, A=a, B=b, B_late=late, E=e, gains=gains, theta=theta
-        )
+        return Pieces(np.array(edges, dtype=np.int64) - first, gains, (a, b, late, e), theta)
 
     def _still(self, begin: int) -> _Part:
-        """Return one stretch, with matrices to the last bit as `Standing.matrices` has them."""
+        """Return one stretch, with matrices to the last bit as `Standing.equations` has them."""
         middle = np.array([begin + 0.5])
         (theta,) = self._parameters(middle)
         key = tuple(theta.values())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.simulate.kernels import advance_plant
+from ambid.simulate.kernels import Linear, Nonlinear, advance_plant
 
 Integers = NDArray[np.int64]
 
@@ -157,13 +157,9 @@ def tick_on(
     line: Array,
     roles: tuple[int, int],
     maps: tuple[Array, Array, Array, Array, Array, Array],
-    linear: bool,
     centre: Array,
     centre_input: float,
-    matrices: tuple[Array, Array, Array, Array],
-    magnet: Array,
-    body: Array,
-    timing: tuple[float, float, int],
+    equations: Linear | Nonlinear,
     stops: tuple[float, float],
     room: Array,
 ) -> int:
@@ -206,18 +202,7 @@ def tick_on(
         line[0] = mapped(float(duty), maps[4], maps[5]) if on else 0.0
         for j in range(disturbance.size):
             disturbance[j] = noise[k, 2 + j] * noise_size[2 + j]
-        advance_plant(
-            linear,
-            x,
-            centre,
-            (line[whole + 1], line[whole], centre_input),
-            disturbance,
-            matrices,
-            magnet,
-            body,
-            timing,
-            stops,
-            room,
-        )
+        voltages = (line[whole + 1], line[whole], centre_input)
+        advance_plant(x, centre, voltages, disturbance, equations, stops, room)
         memory[TICK] += 1
     return -1

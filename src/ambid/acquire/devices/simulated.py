@@ -25,7 +25,7 @@ from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
-from ambid.simulate.plant import Standing
+from ambid.simulate.plant import Equations, Standing
 from ambid.track.blocks import Block
 
 Integers = NDArray[np.int64]
@@ -43,13 +43,9 @@ _PLACES = (  # of the settings that are passed on as they are, in the order of t
 class _Plant:
     """What the compiled loop is given of the plant, all SI."""
 
-    linear: bool
     centre: Array
     centre_input: float
-    matrices: tuple[Array, Array, Array, Array]
-    magnet: Array
-    body: Array
-    timing: tuple[float, float, int]
+    equations: Equations
     stops: tuple[float, float]
     noise_size: Array
     roles: tuple[int, int]
@@ -201,13 +197,9 @@ class SimulatedDevice(PlayedDevice):
             self._line,
             plant.roles,
             self._maps,
-            plant.linear,
             plant.centre,
             plant.centre_input,
-            plant.matrices,
-            plant.magnet,
-            plant.body,
-            plant.timing,
+            plant.equations,
             plant.stops,
             self._room_x,
         )
@@ -233,13 +225,9 @@ def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
     # Short of the pole faces, where the equations end.
     stops = (max(low, inside[0] + 1e-3 * abs(inside[0])), min(high, inside[1] - 1e-3 * abs(inside[1])))
     plant = _Plant(
-        linear=standing.linear,
         centre=standing.centre,
         centre_input=standing.centre_input,
-        matrices=standing.matrices(period, delay - whole),
-        magnet=standing.nonlinear()[0],
-        body=standing.nonlinear()[1],
-        timing=(delay - whole, period, _SUBSTEPS),
+        equations=standing.equations(period, delay - whole, _SUBSTEPS),
         stops=stops,
         noise_size=np.array([bench.noise.position, bench.noise.current, *(size[d] for d in of.disturbances)]),
         roles=(_place(of.states, "position"), _place(of.states, "current")),
