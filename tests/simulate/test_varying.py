@@ -15,10 +15,10 @@ from ambid.simulate import (
     Schedule,
     Unbalance,
     Variation,
-    VaryingLoop,
     closed_loop_matrix,
     simulate,
 )
+from ambid.simulate.bench import VaryingLoop
 
 BEARING = preset("unstable-bearing")
 PLANT = LinearPlant(model=model("one-axis"), parameters=BEARING.parameters)

@@ -8,8 +8,6 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.simulate.bench import Simulation as Simulation
-    from ambid.simulate.bench import Stretch as Stretch
-    from ambid.simulate.bench import VaryingLoop as VaryingLoop
     from ambid.simulate.bench import simulate as simulate
     from ambid.simulate.bench import simulate_preset as simulate_preset
     from ambid.simulate.levels import largest_amplitude as largest_amplitude

@@ -234,55 +234,22 @@ def simulate_preset(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Stretch:
-    """Consecutive samples of a running simulation.
+    """Consecutive samples of a running simulation, SI."""
 
-    Attributes
-    ----------
-    first : int
-        Number of its first sample.
-    command : ndarray, shape (n_samples,), in the unit of the input
-        As logged.
-    measured : ndarray, shape (n_samples, n_outputs), SI
-        Outputs as logged, in the order of the model.
-    states : ndarray, shape (n_samples, n_states), SI
-        True states.
-    speed, angle : ndarray, shape (n_samples,), or None
-        In rad/s and rad (not folded), at the sampling instants, where the rotor turns.
-    truth : Mapping[str, ndarray of shape (n_samples,)]
-        What varies, by name: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``, SI.
-    """
-
-    first: int
-    command: Array
-    measured: Array
-    states: Array
-    speed: Array | None
-    angle: Array | None
+    first: int  # number of its first sample
+    command: Array  # (n_samples,), as logged
+    measured: Array  # (n_samples, n_outputs), as logged, in the order of the model
+    states: Array  # (n_samples, n_states), true
+    speed: Array | None  # (n_samples,), rad/s, at the sampling instants, where the rotor turns
+    angle: Array | None  # (n_samples,), rad, not folded
+    # (n_samples,) of what varies: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``
     truth: Mapping[str, Array]
 
 
 class VaryingLoop:
     """A bench that runs on from call to call; how the samples are cut into calls changes no number.
 
-    Parameters
-    ----------
-    plant : LinearPlant or NonlinearPlant
-        With its parameters where the variation does not say otherwise.
-    variation : Variation, optional
-        What changes (linear only).
-    rate_hz : float
-        Sampling rate in Hz.
-    seed : int or numpy.random.Generator
-        Seed of the noise.
-    loop, limits, noise, operating_point, start, substeps, current_offset
-        As in `ambid.simulate.simulate`.
-    grid_s : float
-        Longest stretch of equal parameters while they drift, in s.
-
-    Raises
-    ------
-    ModelError
-        If an argument has a wrong shape or value, or something varies that the model does not have.
+    Arguments are those of `simulate`; while parameters drift, stretches of `grid_s` s have equal ones.
     """
 
     def __init__(
@@ -368,25 +335,7 @@ class VaryingLoop:
         return int(self._counts[3])
 
     def advance(self, excitation: Array, setpoint: ArrayLike | None = None) -> Stretch:
-        """Run on for as many samples as there are of the excitation.
-
-        Parameters
-        ----------
-        excitation : ndarray, shape (n_samples,), in the unit of the input
-            Added at the controller's output.
-        setpoint : array_like, shape () or (n_samples,), in m, optional
-            Wanted position; default the operating point's.
-
-        Returns
-        -------
-        Stretch
-            New arrays.
-
-        Raises
-        ------
-        ModelError
-            If the states leave the air gap or the finite numbers.
-        """
+        """Run on for as many samples as there are of the excitation, new arrays each time."""
         of, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
         wanted = _vector("setpoint", standing.point.position if setpoint is None else setpoint, n)
         if self.tables is None:

@@ -42,7 +42,7 @@ class ScenarioBlock:
         As logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns. Lost
         samples of the scenario ``dropped`` are NaN.
     truth : Mapping[str, ndarray of shape (n_samples,)]
-        What varies, SI, by name as in `Stretch.truth`.
+        What varies, SI, by name: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``.
     """
 
     first: int
