@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ambid.recursive.adaptive.gradient import Lms, Nlms
-from ambid.recursive.adaptive.least_squares import RecursiveLeastSquares
 from ambid.recursive.filters.kalman import KalmanFilter, constant_velocity
 from ambid.recursive.filters.scalar import ScalarKalman
 from ambid.recursive.polynomial.recursive import RecursivePolynomial
+from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
 from experiments import AT_SPEED
 from peers import Array, Bench, model_of
 from tracking_bearing_jobs import bearing_jobs

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ambid.recursive.adaptive.least_squares import RecursiveLeastSquares
 from ambid.recursive.estimator import RecursiveEstimator
 from ambid.recursive.polynomial.recursive import RecursivePolynomial
+from ambid.recursive.regression import RecursiveLeastSquares
 from table import Table
 from tracking_benches import RATE, Array, TrackBench, preset_bench
 from tracking_quiet import HOURS, smallest_eigenvalue

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.recursive.adaptive.arx.estimators import RecursiveArx, RecursiveIvArx
-from ambid.recursive.adaptive.gradient import Lms, Nlms
-from ambid.recursive.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
-from ambid.recursive.adaptive.least_squares import RecursiveLeastSquares
+from ambid.recursive.arx import RecursiveArx, RecursiveIvArx
+from ambid.recursive.instrumental import RecursiveInstrumentalVariables
+from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
 from tests.recursive.cases import Case
 
 Array = NDArray[np.float64]

@@ -10,10 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ambid.recursive.adaptive.gradient import Lms, Nlms
-from ambid.recursive.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
-from ambid.recursive.adaptive.least_squares import RecursiveLeastSquares
 from ambid.recursive.estimator import RecursiveEstimator
+from ambid.recursive.instrumental import RecursiveInstrumentalVariables
+from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
 
 RUNS = 400
 TRUTH = np.array([1.5, -0.7, 1.0, 0.5])

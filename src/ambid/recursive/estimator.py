@@ -1,12 +1,18 @@
-"""What every recursive estimator promises: the same numbers from single samples and from blocks, and a way back."""
+"""What every recursive estimator promises: the same numbers from single samples and from blocks, and a way back.
+
+And how what a caller gives is brought into the one form that the compiled recursions know: float64, C order, writable.
+"""
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Protocol, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
+from ambid.errors import EstimationError
 
 
 class RecursiveEstimator(Protocol):
@@ -70,3 +76,95 @@ class RecursiveEstimator(Protocol):
         RecursiveEstimator
         """
         ...
+
+
+def as_blocks(
+    name: str, inputs: ArrayLike, outputs: ArrayLike, n_inputs: int, n_outputs: int = 1
+) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return inputs (n, n_inputs) and outputs (n, n_outputs) of one sample or a block, and the shape of `outputs`."""
+    u, y = np.asarray(inputs), np.asarray(outputs)
+    if u.dtype.kind not in "fiub" or y.dtype.kind not in "fiub":
+        raise EstimationError(f"{name}: inputs ({u.dtype}) and outputs ({y.dtype}) must be real numbers")
+    n = y.shape[0] if y.ndim == 2 or (y.ndim == 1 and n_outputs == 1) else 1
+    if not (_fits(y, n, n_outputs) and _fits(u, n, n_inputs)):
+        raise EstimationError(
+            f"{name}: inputs of shape {u.shape} and outputs of shape {y.shape}; a sample is ({n_inputs},) and "
+            f"({n_outputs},), a block (n, {n_inputs}) and (n, {n_outputs}), and where there is one, its axis may be "
+            "left out. Reshape them"
+        )
+    return _rows(u, n, n_inputs), _rows(y, n, n_outputs), y.shape
+
+
+def as_block(given: Array, channels: int, name: str) -> Array:
+    """Return one sample or a block of `channels` signals as a block (n_samples, channels)."""
+    n = given.shape[0] if given.ndim == 2 or (given.ndim == 1 and channels == 1) else 1
+    if not _fits(given, n, channels):
+        raise EstimationError(
+            f"{name}: input of shape {given.shape} for {channels} channels; it must be ({channels},) for a sample or "
+            f"(n_samples, {channels}) for a block. Reshape it"
+        )
+    return _rows(given, n, channels)
+
+
+def _fits(values: Array, n: int, width: int) -> bool:
+    """Whether values are a block (n, width), or one that leaves out an axis of length one."""
+    alone = values.shape == (width,) and n == 1
+    return values.shape == (n, width) or alone or (width == 1 and values.shape in ((n,), () if n == 1 else (n,)))
+
+
+def _rows(values: Array, n: int, width: int) -> Array:
+    """Return values as (n, width): for arrays of another kind the recursions would be compiled anew."""
+    return np.require(values.reshape(n, width), np.float64, ["C", "W"])
+
+
+def check_channels(name: str, rate_hz: float, channels: int) -> None:
+    """Refuse a rate that is not positive or a number of channels that is none; `name` is for the message."""
+    if not (isfinite(rate_hz) and rate_hz > 0):
+        raise EstimationError(f"{name}: the rate is {rate_hz} Hz; it must be positive. Give the sampling rate")
+    if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
+        raise EstimationError(f"{name}: {channels!r} channels; give a whole number from 1 up")
+
+
+def positive(name: str, value: float) -> float:
+    """Return `value` where it is positive and finite."""
+    if not (np.isfinite(value) and value > 0):
+        raise EstimationError(f"{name} is {value!r}; it must be positive and finite")
+    return float(value)
+
+
+def count(name: str, value: int) -> int:
+    """Return `value` where it is a whole number of samples, one or more."""
+    if value != int(value) or value < 1:
+        raise EstimationError(f"{name} is {value!r}; it must be a whole number of samples, 1 or more")
+    return int(value)
+
+
+def numbers(name: str, value: ArrayLike, p: int) -> Array:
+    """Return `value` as p finite numbers (p,), a single one for all."""
+    found = np.asarray(value, dtype=np.float64)
+    if found.shape not in ((), (p,)) or not np.isfinite(found).all():
+        raise EstimationError(f"{name} must be a finite number or {p} of them, not {value!r}")
+    return np.full(p, found) if found.ndim == 0 else found.copy()
+
+
+def prior_of(name: str, value: ArrayLike, p: int) -> Array:
+    """Return `value`, a variance, p variances or a matrix, as a positive definite matrix (p, p)."""
+    found = np.asarray(value, dtype=np.float64)
+    matrix = found if found.shape == (p, p) else np.diag(numbers(name, found, p))
+    sd = np.sqrt(np.diag(matrix)) if (np.diag(matrix) > 0).all() and np.isfinite(matrix).all() else np.zeros(p)
+    if not sd.all() or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
+        raise EstimationError(f"{name} must be symmetric with positive variances")
+    if np.linalg.eigvalsh(matrix / np.outer(sd, sd))[0] < 1e-12:
+        raise EstimationError(f"{name} must be positive definite; a combination of its coefficients has no variance")
+    return matrix
+
+
+def forgetting_factor(factor: float | None, memory: float | None) -> float:
+    """Return the factor of forgetting, or that of a time constant in samples; 1 where neither is given."""
+    if factor is not None and memory is not None:
+        raise EstimationError("factor and memory say the same thing. Give one of them")
+    if factor is not None and not 0 < factor < 1:
+        raise EstimationError(f"factor is {factor!r}; it must lie between 0 and 1. Leave it out to forget nothing")
+    if memory is not None and not memory > 1:
+        raise EstimationError(f"memory is {memory!r}; it must be longer than one sample")
+    return 1.0 - 1.0 / memory if memory is not None else 1.0 if factor is None else float(factor)

@@ -73,16 +73,24 @@ def shrink(F: Array, f: Array, r: float, k: Array) -> float:
 @compiled(error_model="numpy", fastmath={"contract"})
 def widen(F: Array, a: Array, q: float) -> None:
     """Replace P by P + q a aᵀ, q > 0 (Agee and Turner; Bierman 1977, sec. III.3); `a` is used up."""
+    total = 1.0 / q
+    inverse = q
     for j in range(a.size - 1, -1, -1):
         x, d = a[j], F[j, j]
-        new = d + q * x * x
-        if new > 0.0:
-            part = q * x / new
-            q *= d / new
-            F[j, j] = new
+        if d > 0.0:
+            part = x / d
+            total += part * x
+            F[j, j] = d * total * inverse
+            inverse = 1.0 / total
+            part *= inverse
             for i in range(j):
                 a[i] -= x * F[j, i]
                 F[j, i] += part * a[i]
+        elif x != 0.0:  # a direction that was certain: what is added lies along it alone
+            F[j, j] = x * x * inverse
+            for i in range(j):
+                F[j, i] = a[i] / x
+            return
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

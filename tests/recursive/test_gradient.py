@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.adaptive.gradient import Lms, Nlms
+from ambid.recursive.regression import Lms, Nlms
 
 
 def test_lms_step_and_covariance_follow_their_recursions() -> None:

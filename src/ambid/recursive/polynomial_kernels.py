@@ -2,7 +2,7 @@
 
 Every signal is a row of one buffer that is written from column to column; when it is full, its end becomes the history
 of a new beginning, so that a sample costs the same whether it comes alone or in a block. What is filtered by what is
-a table of whole numbers, see `plan`; only the coefficients `coef` = 1, -1, free ones, constant move.
+a table of whole numbers, see `ambid.recursive.polynomial_state.plan_of`; only the coefficients `coef` = 1, -1, free ones, constant move.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
+from ambid.recursive.square_root_kernels import project, shrink, variance
 
 Table = NDArray[np.int64]
 
@@ -40,40 +41,6 @@ def filter_column(plan: Table, meta: Table, first: int, last: int, coef: Array, 
         for j in range(n):
             x -= coef[over + j] * s[row, t - 1 - j]
         s[row, t] = x
-
-
-@compiled
-def gradient(plan: Table, meta: Table, s: Array, t: int, psi: Array) -> None:
-    """Write the gradient of the prediction at column t."""
-    for j in range(meta[_N]):
-        k = meta[_COLUMNS] + j
-        psi[j] = plan[k, 2] * s[plan[k, 0], t - plan[k, 1]]
-
-
-@compiled
-def _ud(UD: Array, n: int, psi: Array, forget: float, gain: Array) -> float:
-    """Take one row into P = U D U' (Bierman 1977, ch. 5), P/forget before; return 1 + psi' P psi / forget.
-
-    Row j of `UD` holds column j of U above its diagonal, D_j on it.
-    """
-    alpha = forget
-    for j in range(n):
-        f = psi[j]
-        for i in range(j):
-            f += UD[j, i] * psi[i]
-        g = UD[j, j] * f
-        before = alpha
-        alpha = before + f * g
-        UD[j, j] *= before / (alpha * forget)
-        gain[j] = g
-        p = -f / before
-        for i in range(j):
-            x = UD[j, i]
-            UD[j, i] = x + gain[i] * p
-            gain[i] += x * g
-    for j in range(n):
-        gain[j] /= alpha
-    return alpha / forget
 
 
 @compiled
@@ -118,40 +85,25 @@ def follow(plan: Table, meta: Table, theta: Array, coef: Array, work: Array) -> 
 
 
 @compiled
-def _grown(UD: Array, limit: Array, variance: float) -> bool:
-    """Whether the variance of any coefficient is beyond its limit."""
-    n = limit.size
-    for i in range(n):
-        p = UD[i, i]
-        for j in range(i + 1, n):
-            p += UD[j, i] * UD[j, i] * UD[j, j]
-        if p * variance > limit[i]:
-            return True
-    return False
-
-
-@compiled
-def _fill(plan: Table, meta: Table, s: Array, t: int, count: Table) -> None:
+def _wait(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table) -> None:
     """One more sample of history: the noise is taken as zero, so the first w that has a memory is what is left of A y.
 
     From then on the error of w is of the size of the noise, not of the signal. When history is long enough, ones stand
-    for the unknown states of F and C: their response shows when those are forgotten.
+    for the unknown states of F and C: their response shows when those are forgotten, which ends the waiting.
     """
-    s[meta[_E], t] = 0.0
-    if meta[_W] >= 0:
-        s[meta[_W], t] += s[meta[_V], t]
-        s[meta[_V], t] = 0.0
-    count[_FILL] += 1
-    if count[_FILL] >= meta[_LONGEST]:
-        for f in range(meta[_GRADIENT], meta[_STATES]):
-            count[_RINGING] = 1
-            for j in range(plan[f, 2]):
-                s[plan[f, 0], t - j] = 1.0
-
-
-@compiled
-def _ring(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table) -> None:
-    """Let the unknown states die away; end the waiting when they have."""
+    count[_WAITED] += 1
+    if count[_FILL] < meta[_LONGEST]:
+        s[meta[_E], t] = 0.0
+        if meta[_W] >= 0:
+            s[meta[_W], t] += s[meta[_V], t]
+            s[meta[_V], t] = 0.0
+        count[_FILL] += 1
+        if count[_FILL] >= meta[_LONGEST]:
+            for f in range(meta[_GRADIENT], meta[_STATES]):
+                count[_RINGING] = 1
+                for j in range(plan[f, 2]):
+                    s[plan[f, 0], t - j] = 1.0
+        return
     filter_column(plan, meta, meta[_GRADIENT], meta[_STATES], coef, s, t)
     most = 0.0
     for f in range(meta[_GRADIENT], meta[_STATES]):
@@ -163,16 +115,6 @@ def _ring(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table)
 
 
 @compiled
-def _shift(plan: Table, meta: Table, step: float, s: Array, t: int) -> None:
-    """Let the past of v and e know of a new constant: both are linear in it, and its first steps may be large."""
-    ones = plan[meta[_COLUMNS] + meta[_N] - 1, 0]
-    for k in range(1, meta[_LONGEST] + 1):
-        s[meta[_V], t - k] -= step
-        if meta[_E] != meta[_V]:
-            s[meta[_E], t - k] -= step * s[ones, t - k]
-
-
-@compiled
 def _learn(
     plan: Table,
     meta: Table,
@@ -180,7 +122,7 @@ def _learn(
     real: Array,
     theta: Array,
     coef: Array,
-    UD: Array,
+    F: Array,
     S: Array,
     limit: Array,
     s: Array,
@@ -191,54 +133,57 @@ def _learn(
 
     The two differ only while C or F would be unstable: what the data said is then kept and not lost.
     """
-    psi, gain = work[0], work[1]
-    gradient(plan, meta, s, t, psi)
+    n, psi, gain, f = theta.size, work[0, : theta.size], work[1], work[2, : theta.size]
     e = s[meta[_E], t]
-    for j in range(theta.size):
+    for j in range(n):
+        k = meta[_COLUMNS] + j
+        psi[j] = plan[k, 2] * s[plan[k, 0], t - plan[k, 1]]
         e -= psi[j] * (theta[j] - coef[_FIRST + j])
     forget = keep = real[_FORGET]
     lost = 1.0 - min(forget, real[_FINAL])
     every = _EVERY if lost * _EVERY <= 0.5 else max(1, int(0.5 / lost))
     if count[_LEARNT] % every == 0 and real[_FINAL] < 1.0:
         # not less than at the start: a signal that stands still has no noise, and its P would grow without end
-        variance = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE])
-        # as large as it may be at the next look
-        count[_HOLD] = int(_grown(UD, limit, variance * (1.0 - lost) ** -every))
+        noise = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE]) * (1.0 - lost) ** -every
+        count[_HOLD] = 0
+        for i in range(n):  # as large as it may be at the next look
+            if variance(F, i) * noise > limit[i]:
+                count[_HOLD] = 1
     if count[_HOLD]:
         forget = 1.0
         count[_HELD] += 1
     real[_FORGET] = real[_FINAL] + real[_GROWTH] * (real[_FORGET] - real[_FINAL])
-    size = _ud(UD, theta.size, psi, forget, gain)
+    for j in range(n):
+        F[j, j] /= forget
+    project(F, psi, f)
+    size = shrink(F, f, 1.0, gain)
     # forgotten while the coefficients are held, too: after a long calm the noise would be taken for small too long
     real[_SQUARES] = keep * real[_SQUARES] + e * e / size
     real[_WEIGHT] = keep * real[_WEIGHT] + 1.0
     # the noise of the moment goes with what the moment says: a calm later on makes old samples no better
-    variance = real[_SQUARES] / real[_WEIGHT]
+    noise = real[_SQUARES] / real[_WEIGHT]
     for i in range(S.shape[0]):
         for j in range(i + 1):
-            S[i, j] = forget * forget * S[i, j] + variance * psi[i] * psi[j]
-    for j in range(theta.size):
-        theta[j] += gain[j] * e
-    level = coef[_FIRST + theta.size - 1]
+            S[i, j] = forget * forget * S[i, j] + noise * psi[i] * psi[j]
+    for j in range(n):
+        theta[j] += gain[j] * (e / size)
+    level = coef[_FIRST + n - 1]
     count[_PROJECTED] += follow(plan, meta, theta, coef, work[2])
-    _shift(plan, meta, coef[_FIRST + theta.size - 1] - level, s, t)
+    # the past of v and e is linear in the constant, and its first steps may be large
+    step, ones = coef[_FIRST + n - 1] - level, plan[meta[_COLUMNS] + n - 1, 0]
+    for k in range(1, meta[_LONGEST] + 1):
+        s[meta[_V], t - k] -= step
+        if meta[_E] != meta[_V]:
+            s[meta[_E], t - k] -= step * s[ones, t - k]
     filter_column(plan, meta, meta[_INPUT], meta[_RESIDUAL], coef, s, t)
     count[_LEARNT] += 1
 
 
 @compiled
-def _finite(u: Array, y: Array, k: int) -> bool:
-    x = y[k]
-    for i in range(u.shape[1]):
-        x += u[k, i] * 0.0
-    return bool(np.isfinite(x))
-
-
-@compiled
-def _forget_signals(s: Array, count: Table, longest: int) -> None:
-    for row in range(s.shape[0]):
-        for t in range(s.shape[1]):
-            s[row, t] = 0.0
+def _begin_anew(s: Array, count: Table, longest: int) -> None:
+    """Reject a sample and forget all signals."""
+    count[_REJECTED] += 1
+    s[:] = 0.0
     count[_POS] = longest
     count[_FILL] = 0
     count[_RINGING] = 0
@@ -256,7 +201,7 @@ def run(
     real: Array,
     theta: Array,
     coef: Array,
-    UD: Array,
+    F: Array,
     S: Array,
     limit: Array,
     s: Array,
@@ -266,9 +211,11 @@ def run(
     longest, width = meta[_LONGEST], s.shape[1]
     for k in range(y.size):
         errors[k] = np.nan
-        if not _finite(u, y, k):
-            count[_REJECTED] += 1
-            _forget_signals(s, count, longest)
+        x = y[k]
+        for i in range(u.shape[1]):
+            x += u[k, i] * 0.0
+        if not np.isfinite(x):
+            _begin_anew(s, count, longest)
             continue
         t = count[_POS]
         if t == width:
@@ -282,19 +229,14 @@ def run(
         filter_column(plan, meta, 0, meta[_RESIDUAL], coef, s, t)
         e = s[meta[_E], t]
         if not np.isfinite(e * e):  # too large to compute with
-            count[_REJECTED] += 1
-            _forget_signals(s, count, longest)
+            _begin_anew(s, count, longest)
             continue
         count[_POS] = t + 1
         count[_USED] += 1
-        if count[_FILL] < longest:
-            count[_WAITED] += 1
-            _fill(plan, meta, s, t, count)
-        elif count[_RINGING]:
-            count[_WAITED] += 1
-            _ring(plan, meta, coef, s, t, count)
+        if count[_FILL] < longest or count[_RINGING]:
+            _wait(plan, meta, coef, s, t, count)
         else:
             errors[k] = e
             if learn:
-                _learn(plan, meta, count, real, theta, coef, UD, S, limit, s, t, work)
+                _learn(plan, meta, count, real, theta, coef, F, S, limit, s, t, work)
         filter_column(plan, meta, meta[_RESIDUAL], meta[_GRADIENT], coef, s, t)

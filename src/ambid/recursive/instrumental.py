@@ -15,16 +15,9 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.adaptive._recursion import (
-    ENOUGH,
-    VAGUE,
-    Recursion,
-    coefficient_names,
-    count,
-    forgetting_factor,
-    numbers,
-    positive,
-)
+from ambid.recursive.estimator import count, forgetting_factor, numbers, positive
+from ambid.recursive.regression import ENOUGH, VAGUE, Recursion, coefficient_names
+from ambid.recursive.square_root import root_of
 
 _NOISE_MEMORIES = 10
 _LOOKS = 32
@@ -42,13 +35,45 @@ class RecursiveInstrumentalVariables(Recursion):
     squared weights. So v may be coloured. The lag behind moving coefficients is not in it. While instruments are
     silent the information is forgotten until the mean of the variances over their prior is `limit`.
 
-    `names`: names of the p coefficients, or p; `n_instruments`: m, p or more; p if not given; `start`: (p,), estimate
-    to begin with; zero if not given; `memory`: the same as a time constant in samples, 1 / (1 - factor); `correlation`:
-    samples; several times the time over which v is correlated. 1 for white v; `noise_start`: standard deviation of v
-    until the data have shown it.
+    Parameters
+    ----------
+    names : sequence of str, or int
+        Names of the p coefficients, or p.
+    n_instruments : int, optional
+        m, p or more; p if not given.
+    start : array_like, shape (p,), optional
+        Estimate to begin with; zero if not given.
+    prior : array_like, shape () or (p,), optional
+        Variances of the start's error over the variance of v, in the coefficients' units. If not given, nothing is
+        known of the coefficients, whatever the units of the signals: the start has no weight.
+    instrument_size : array_like, shape () or (m,), optional
+        Usual size of the instruments: a prior that is given counts like one sample of that size; 1 if not given.
+    factor : float, optional
+        Of forgetting, 0 < factor < 1; nothing is forgotten if neither it nor `memory` is given.
+    memory : float, optional
+        The same as a time constant in samples, 1 / (1 - factor).
+    limit : float
+        Of the wind-up, see above; over 1e9 times the best variances so far where no prior is given.
+    correlation : int
+        Samples; several times the time over which v is correlated. 1 for white v.
+    noise_start : float
+        Standard deviation of v until the data have shown it.
 
-    `estimate`: (p,); `covariance`: (p, p); `n_singular`: samples after which the instruments did not determine the
-    coefficients, and the estimate stayed; `noise_variance`: of v.
+    Attributes
+    ----------
+    names : tuple of str
+    estimate : ndarray, shape (p,)
+    covariance : ndarray, shape (p, p)
+    n_used, n_rejected : int
+    n_singular : int
+        Samples after which the instruments did not determine the coefficients, and the estimate stayed.
+    noise_variance : float
+        Of v.
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range.
     """
 
     _kernel = "instrumental"
@@ -128,9 +153,9 @@ class RecursiveInstrumentalVariables(Recursion):
         return found
 
     def _kernels(self) -> ModuleType:
-        from ambid.recursive.adaptive.instrumental import _kernels
+        from ambid.recursive import instrumental_kernels
 
-        return _kernels
+        return instrumental_kernels
 
     @property
     def n_singular(self) -> int:
@@ -167,6 +192,4 @@ class RecursiveInstrumentalVariables(Recursion):
 def _root(N: Array) -> Array:
     """Return a square root of N; what rounding made of its smallest eigenvalues does not count."""
     scale = np.sqrt(np.diag(N))
-    value, vector = np.linalg.eigh(N / np.outer(scale, scale))
-    floor = np.finfo(float).eps * value[-1]
-    return np.asarray(scale[:, None] * vector * np.sqrt(np.maximum(value, floor)))
+    return np.asarray(scale[:, None] * root_of(N / np.outer(scale, scale), floor=float(np.finfo(float).eps)))

@@ -18,19 +18,29 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.orders import Orders
-from ambid.blackbox.polynomial.orders import layout_of, read_orders
+from ambid.blackbox.polynomial.orders import layout_of, read_orders, shown_orders
 from ambid.blackbox.polynomial_model import PolynomialModel
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure as structure_named
 from ambid.errors import EstimationError
-from ambid.recursive.polynomial.columns import columns
-from ambid.recursive.polynomial.result import fit_of, model_of, offsets_of, warnings_of
-from ambid.recursive.polynomial.start import Identity, identity_of, state_from_fit
-from ambid.recursive.polynomial.state import COUNTED, Forgetting, State, covariance_of, noise_variance_of
-from ambid.recursive.polynomial.window import Window
+from ambid.recursive.estimator import as_blocks
+from ambid.recursive.polynomial_state import (
+    COUNTED,
+    Forgetting,
+    Identity,
+    State,
+    covariance_of_state,
+    identity_of,
+    noise_variance_of,
+    state_from_fit,
+)
 
 _USED, _REJECTED, _WAITED, _PROJECTED, _HELD = COUNTED
 _REFITTED = 16  # first windows
+_MOST = 20  # evaluations of a fit that begins near its end
+_WORSE = 1.5  # growth, or fall to one over it, of the innovations' standard deviation that is told
+_FEW = 20  # samples of memory for each coefficient, below which gradients of C, D and F mislead
+_INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
 _NUMBERS = (float, np.float64)
 
 
@@ -74,7 +84,7 @@ class RecursivePolynomial:
         If the structure is not known, or an order is missing, not known or out of range.
     """
 
-    _window: Window | None
+    _window: _Window | None
     _arrays: tuple[Any, ...]
 
     def __init__(
@@ -106,7 +116,7 @@ class RecursivePolynomial:
         first = max(500, 100 * layout.free.size) if burn_in is None else burn_in
         if first < need:
             raise EstimationError(f"{structure}: burn_in = {first} samples; at least {need} are needed. Raise it")
-        self._window = Window(first=first, last=first * _REFITTED, n_inputs=n_u)
+        self._window = _Window(first=first, last=first * _REFITTED, n_inputs=n_u)
 
     @classmethod
     def from_fit(
@@ -145,7 +155,7 @@ class RecursivePolynomial:
         return made
 
     def _prepare(self, who: Identity, forgetting: Forgetting | float, *, open_loop: bool) -> None:
-        from ambid.recursive.polynomial._kernels import run
+        from ambid.recursive.polynomial_kernels import run
 
         self._who, self._open_loop = who, open_loop
         self._forgetting = forgetting if isinstance(forgetting, Forgetting) else Forgetting(final=float(forgetting))
@@ -182,7 +192,7 @@ class RecursivePolynomial:
         """Of the error of `estimate`, shape (p, p); huge until the first window is full, large where it stalled."""
         n = len(self._names)
         state = self._state
-        return 1e12 * np.eye(n) if state is None else covariance_of(state, doubtful=self._doubtful)[:n, :n].copy()
+        return 1e12 * np.eye(n) if state is None else covariance_of_state(state, doubtful=self._doubtful)[:n, :n].copy()
 
     @property
     def sd(self) -> Array:
@@ -227,13 +237,13 @@ class RecursivePolynomial:
 
     @property
     def n_failed_starts(self) -> int:
-        """Windows from which no first estimate could be had (no excitation, say)."""
+        """_Windows from which no first estimate could be had (no excitation, say)."""
         return self._failed_starts
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return warnings_of(self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful)
+        return _warnings_of(self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -286,7 +296,9 @@ class RecursivePolynomial:
         return self._take(inputs, outputs, learn=False)
 
     def _take(self, inputs: ArrayLike, outputs: ArrayLike, *, learn: bool) -> Array:
-        u, y, shape = columns(self._who, inputs, outputs)
+        given = np.zeros((np.size(outputs), 0)) if not self._n_u and inputs is None else inputs
+        u, v, shape = as_blocks(self._who.structure, given, outputs, self._n_u)
+        y = v[:, 0]
         errors, first = np.full(y.size, np.nan), 0
         if self._window is not None:
             first = self._with_window(u, y, errors)
@@ -315,7 +327,7 @@ class RecursivePolynomial:
                 self._fit_window(self._window)
         return at
 
-    def _fit_window(self, window: Window) -> None:
+    def _fit_window(self, window: _Window) -> None:
         lost, none = self._state is None or self._doubtful, self._state is None
         fit = window.fit(self._who, None if lost else self.model.theta, stalled=none)
         if fit is not None:
@@ -327,7 +339,7 @@ class RecursivePolynomial:
         elif not (grown and window.target <= self._forgetting.memory):
             self._window = None  # later samples would count more than these
 
-    def _begin_anew(self, fit: BlackBoxFit, window: Window) -> None:
+    def _begin_anew(self, fit: BlackBoxFit, window: _Window) -> None:
         """Go on from an off-line fit of all samples so far."""
         before, n = self._state, window.filled
         now = self._begin(fit, n)
@@ -342,14 +354,14 @@ class RecursivePolynomial:
         """The estimate as a model: poles, frequency response and the rest."""
         full = self._start.copy()
         full[self._who.layout.free] = self.estimate
-        return model_of(self._who, full)
+        return _model_of(self._who, full)
 
     @property
     def offsets(self) -> Offsets:
         """Operating point for which the model holds, SI; NaN until the first window is full."""
         if self._state is None:
             return Offsets(u=np.full(self._n_u, np.nan), y=np.full(1, np.nan))
-        return offsets_of(self.model, self._state)
+        return _offsets_of(self.model, self._state)
 
     def fit(self) -> BlackBoxFit:
         """Return the present estimate in the form of an off-line fit.
@@ -368,14 +380,14 @@ class RecursivePolynomial:
             raise EstimationError(
                 f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
             )
-        found = fit_of(self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings)
+        found = _fit_of(self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings)
         return replace(found, status="stalled") if self._doubtful else found
 
     def __getstate__(self) -> dict[str, object]:
         return {k: v for k, v in self.__dict__.items() if k not in ("_run", "_arrays")}
 
     def __setstate__(self, kept: dict[str, object]) -> None:
-        from ambid.recursive.polynomial._kernels import run
+        from ambid.recursive.polynomial_kernels import run
 
         self.__dict__.update(kept)
         self._run = run
@@ -397,3 +409,210 @@ class RecursivePolynomial:
             twin._state = self._state.copy()
             twin._arrays = twin._state.arrays()
         return twin
+
+
+class _Window:
+    """Samples without a gap, and the counts at which they are fitted.
+
+    `first`, `last`: samples at the first and at most at the last fit.
+
+    `u`: (last, n_inputs), (last,); `y`: (last, n_inputs), (last,); `filled`: samples stored; samples at the next fit;
+    `target`: samples stored; samples at the next fit.
+    """
+
+    def __init__(self, *, first: int, last: int, n_inputs: int) -> None:
+        self.u, self.y = np.zeros((last, n_inputs)), np.zeros(last)
+        self.first, self.filled, self.target = first, 0, first
+
+    def copy(self) -> _Window:
+        """Return an independent window with the same samples."""
+        twin = _Window(first=self.first, last=self.y.size, n_inputs=self.u.shape[1])
+        twin.u[:], twin.y[:], twin.filled, twin.target = self.u, self.y, self.filled, self.target
+        return twin
+
+    def take(self, u: Array, y: Array) -> tuple[int, bool]:
+        """Take samples until the next fit, or up to and without one that is not finite.
+
+        `u`: (n_samples, n_inputs); `y`: (n_samples,). Returns samples taken, and whether the next one is not finite.
+        """
+        n = min(y.size, self.target - self.filled)
+        bad = np.flatnonzero(~(np.isfinite(y[:n]) & np.all(np.isfinite(u[:n]), axis=1)))
+        gap = bad.size > 0
+        n = int(bad[0]) if gap else n
+        at = slice(self.filled, self.filled + n)
+        self.u[at], self.y[at] = u[:n], y[:n]
+        self.filled += n
+        return n, gap
+
+    def clear(self) -> int:
+        """Begin anew; return how many samples were stored."""
+        n, self.filled, self.target = self.filled, 0, self.first
+        return n
+
+    def grow(self) -> bool:
+        """Move the next fit to twice as many samples.
+
+        Returns false where the window cannot grow: it is at its largest.
+        """
+        at_end = self.target >= self.y.size
+        self.target = min(2 * self.target, self.y.size)
+        return not at_end
+
+    def drop_half(self) -> int:
+        """Make room for as many samples as half of those stored.
+
+        Returns how many were dropped.
+        """
+        n = (self.filled + 1) // 2
+        keep = self.filled - n
+        self.u[:keep], self.y[:keep] = self.u[n : self.filled].copy(), self.y[n : self.filled].copy()
+        self.filled = keep
+        return n
+
+    def fit(self, who: Identity, near: Array | None, *, stalled: bool) -> BlackBoxFit | None:
+        """Return the off-line fit of the window.
+
+        `near`: (n_theta,), or None, coefficients to begin with; None: the search finds its own start. Returns none
+        where the window does not hold what it needs, or the search did not converge and more samples may help.
+        """
+        try:
+            data = IOData(
+                u=self.u[: self.filled],
+                y=self.y[: self.filled, None],
+                dt=who.dt,
+                inputs=who.inputs,
+                outputs=who.outputs,
+                units=who.units,
+                open_loop=True,  # whether it is, is no question of the coefficients
+            )
+            if near is None:
+                found = structure_named(who.structure).estimator(data, shown_orders(who.structure, who.layout))
+            else:
+                found = _fit_near(who, data, near)
+        except EstimationError:
+            return None
+        last_resort = stalled and self.filled == self.y.size
+        usable = found.status == "converged" or last_resort
+        return found if usable and float(found.noise_covariance[0, 0]) > 0.0 else None
+
+
+def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
+    from ambid.blackbox.polynomial.predictor import predictor
+    from ambid.blackbox.polynomial.result import result
+    from ambid.blackbox.polynomial.scaled import scaled_data, unit
+    from ambid.blackbox.polynomial.search import searched
+
+    scaled = scaled_data(who.structure, data)
+    worth = unit(who.layout, scaled, 0)
+    found = searched(predictor(who.layout), scaled.y[0], scaled.u, near / worth, most=_MOST)
+    return result(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
+
+
+def _model_of(who: Identity, full: Array) -> PolynomialModel:
+    """Return all coefficients as a model.
+
+    `full`: (n_theta,).
+    """
+    return PolynomialModel(outputs=(who.layout.polynomials(full),), dt=who.dt)
+
+
+def _offsets_of(model: PolynomialModel, state: State) -> Offsets:
+    """Turn the constant of A y = (B/F) u + constant into an operating point.
+
+    It is the output's, unless A sums to zero: an integrating plant has any level, and the constant stands for an offset
+    of its inputs.
+    """
+    centre, constant, p = state.levels.copy(), float(state.at[-1]), model.outputs[0]
+    level = float(p.A.sum())
+    gain = np.array([b.sum() / f.sum() if f.sum() else np.inf for b, f in zip(p.B, p.F, strict=True)])
+    if abs(level) > _INTEGRATES * float(np.abs(p.A).sum()):
+        centre[0] += constant / level
+    elif gain.size and np.all(np.isfinite(gain)) and np.any(gain):
+        centre[1:] -= constant * gain / float(gain @ gain)
+    return Offsets(u=centre[1:], y=centre[:1])
+
+
+def _warnings_of(
+    who: Identity, state: State | None, forgetting: Forgetting, *, open_loop: bool, doubtful: bool
+) -> tuple[str, ...]:
+    """Return what a reader of the estimate has to know.
+
+    `state`: none where there is no estimate yet; `open_loop`: whether the user says that no feedback is at work;
+    `doubtful`: whether the fit with which it began did not converge.
+    """
+    name, found = who.structure, []
+    if state is None:
+        found.append(f"{name}: the first window is not full: there is no estimate yet")
+    if doubtful:
+        found.append(
+            f"{name}: the search for the first estimate did not converge: coefficients may be wrong by as much as "
+            "they are large, and standard deviations say so. "
+            "Lower the orders, or begin with a fit that did"
+        )
+    x, least = who.layout, _FEW * (who.layout.free.size + 1)
+    memory = forgetting.memory
+    if memory < least and (x.nc or x.nd or any(x.nf)):
+        found.append(
+            f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
+            "estimate may lock at the border after a standstill, and standard deviations are too small. Remember "
+            f"{least} samples or more, or use arx"
+        )
+    if structure_named(name).feedback == "biased" and not open_loop:
+        found.append(
+            f"{name} is biased where a controller is at work, and nothing says that this loop is open: use bj or "
+            "armax, or say open_loop if there is no feedback"
+        )
+    if state is None:
+        return tuple(found)
+    if state.at_border:
+        found.append(
+            f"{name}: the data ask, or often asked, for an unstable C or F; stable coefficients are shown and their "
+            "standard deviations are not to be trusted. If the plant integrates or is unstable, use armax or arx"
+        )
+    if state.worse > _WORSE:
+        found.append(
+            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has grown, or the "
+            "structure does not hold what the data show. Raise the orders, or forget faster"
+        )
+    if state.worse < 1.0 / _WORSE:
+        found.append(
+            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has fallen, or "
+            "the signals stand still and tell nothing; without forgetting, standard deviations are too small then. "
+            "Look at the signals"
+        )
+    if state.waits:
+        found.append(f"{name}: nothing is learnt at present: the filters wait for history after the start or a gap")
+    return tuple(found)
+
+
+def _fit_of(
+    who: Identity,
+    model: PolynomialModel,
+    state: State,
+    spread: Array,
+    *,
+    samples: int,
+    warnings: tuple[str, ...],
+) -> BlackBoxFit:
+    """Return the present estimate as a fit.
+
+    `spread`: (n_free, n_free), covariance of the free coefficients; `samples`: taken in so far.
+    """
+    covariance, free = np.zeros((model.theta.size,) * 2), who.layout.free
+    covariance[np.ix_(free, free)] = spread
+    return BlackBoxFit(
+        structure=who.structure,
+        orders=shown_orders(who.structure, who.layout),
+        model=model,
+        covariance=covariance,
+        n_estimated=free.size,
+        offsets=_offsets_of(model, state),
+        noise_covariance=np.array([[noise_variance_of(state)]]),
+        inputs=who.inputs,
+        outputs=who.outputs,
+        units=dict(who.units),
+        dt=who.dt,
+        record={"samples": samples, "rate_hz": 1.0 / who.dt},
+        warnings=warnings,
+        details={"recursive": True, **state.counts()},
+    )

@@ -1,6 +1,7 @@
 """ARX models estimated as their signals come: by any recursion on regressors, or by instrumental variables.
 
-A(q) y = B(q) u + constant + v. Least squares wants white v; instruments leave v free.
+A(q) y = B(q) u + constant + v, φ(t) = [-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7). Least
+squares wants white v; instruments leave v free.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.adaptive.arx.regressor import DelayLines, columns_of, signals
-from ambid.recursive.adaptive.instrumental.estimator import RecursiveInstrumentalVariables
-from ambid.recursive.estimator import RecursiveEstimator
+from ambid.recursive.estimator import RecursiveEstimator, as_blocks
+from ambid.recursive.instrumental import RecursiveInstrumentalVariables
 
 Instruments = Literal["reference", "delayed input", "auxiliary model"]
 
 _REFRESH = 64  # samples with one auxiliary model
+_NO_MODEL = np.zeros(0)
 
 
 class _OnSignals:
@@ -123,7 +124,7 @@ class RecursiveArx(_OnSignals):
         EstimationError
             If the shapes do not fit.
         """
-        x, outputs, shape = signals(u, y, self._n_inputs)
+        x, outputs, shape = _signals(u, y, self._n_inputs)
         return self._estimator.update(self._lines.rows(x), outputs).reshape(shape)
 
 
@@ -226,7 +227,7 @@ class RecursiveIvArx(_OnSignals):
         EstimationError
             If the shapes do not fit.
         """
-        x, outputs, shape = signals(u, y, self._n_inputs, spare=1 if self._kind == "auxiliary model" else 0)
+        x, outputs, shape = _signals(u, y, self._n_inputs, spare=1 if self._kind == "auxiliary model" else 0)
         if self._kind != "auxiliary model":
             return self._estimator.update(self._lines.rows(x), outputs).reshape(shape)
         errors, start = np.empty(outputs.size), 0
@@ -270,3 +271,76 @@ def _gain(A: Array, B: Array) -> float:
     impulse[0] = 1.0
     size = float(np.sqrt(np.sum(lfilter(B, A, impulse) ** 2)))
     return size if 0 < size < np.inf else 1.0
+
+
+class DelayLines:
+    """Columns of delayed channels, compiled.
+
+    `columns`: channel -1 is the constant 1.
+    """
+
+    def __init__(self, columns: Sequence[tuple[int, int, int]], n_channels: int) -> None:
+        self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        self._past = np.full((max(1, int(self._table[:, 1].max())), n_channels), np.nan)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        from ambid.recursive.regression_kernels import tapped
+
+        self._run = tapped
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "_run"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare()
+
+    def rows(self, x: Array, theta: Array = _NO_MODEL, first: int = 0) -> Array:
+        """Return the columns for the next samples.
+
+        `x`: (n_samples, n_channels), its last channel is filled in where `theta` is given; `theta`: (p,), coefficients
+        of a model without noise whose output is the last channel; `first`: column at which the regressor of that model
+        begins. Returns (n_samples, n_columns).
+        """
+        rows = np.empty((x.shape[0], self._table.shape[0]))
+        self._run(self._past, self._table, x, rows, theta, first)
+        return rows
+
+    def silence(self, channel: int) -> None:
+        """Begin a channel with zeros instead of unknown numbers."""
+        self._past[:, channel] = 0.0
+
+    def scale(self, channel: int, factor: float) -> None:
+        """Change the unit of what is remembered of a channel."""
+        self._past[:, channel] *= factor
+
+
+def columns_of(
+    na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool, output: int = 0
+) -> tuple[list[tuple[int, int, int]], list[str]]:
+    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs.
+
+    `output`: channel that stands for the output.
+    """
+    if na < 0 or len(nb) != len(nk) or any(n < 0 for n in (*nb, *nk)) or na + sum(nb) == 0:
+        raise EstimationError(
+            f"na={na}, nb={list(nb)}, nk={list(nk)}: give orders that are not negative, and not all 0"
+        )
+    columns, names = [(output, lag, -1) for lag in range(1, na + 1)], [f"a{lag}" for lag in range(1, na + 1)]
+    for i, (order, delay) in enumerate(zip(nb, nk, strict=True), start=1):
+        for lag in range(delay, delay + order):
+            columns.append((i, lag, 1))
+            names.append(f"b{lag}" if len(nb) == 1 else f"b{lag}.{i - 1}")
+    if offset:
+        columns.append((-1, 0, 1))
+        names.append("offset")
+    return columns, names
+
+
+def _signals(u: ArrayLike, y: ArrayLike, n_inputs: int, spare: int = 0) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return channels [y, u] and `spare` columns of zeros, the outputs (n_samples,) and the shape of `y`."""
+    if isinstance(y, float) and isinstance(u, float) and n_inputs == 1 and spare == 0:  # one sample, quickly
+        return np.array([[y, u]]), np.array([y]), ()
+    inputs, outputs, shape = as_blocks("ARX", u, y, n_inputs)
+    return np.hstack([outputs, inputs, np.zeros((outputs.shape[0], spare))]), outputs[:, 0], shape

@@ -1,1 +1,0 @@
-"""Recursive estimators of linear regressions y = φᵀθ + e: gradient, least squares, instrumental variables."""

@@ -1,1 +1,0 @@
-"""Regressors from signals as they come, and ARX models estimated on them."""

@@ -1,1 +1,0 @@
-"""Recursive instrumental variables: consistent where noise reaches the regressor, as in a loop."""

@@ -1,0 +1,388 @@
+"""What a recursive polynomial estimator carries from sample to sample, packed for the compiled recursion.
+
+P is the covariance of the coefficients in units of the noise variance; S = sum of (product of the forgetting
+factors)^2 (noise variance at that time) psi psi'. Where nothing is forgotten, the error of the estimate has covariance
+P times the noise variance; otherwise P S P: a calm after the samples that told the coefficients changes nothing.
+
+What is filtered by what (theory.md 2.5): w = (B/F) u, v = A y - sum of w - constant, e = (D/C) v. Gradients of the
+prediction, all lags of one polynomial being one signal, shifted: by a_k -(D/C) y(t-k), by b_k D/(C F) u(t-k), by c_k
+e(t-k)/C, by d_k -v(t-k)/C, by f_k -D/(C F) w(t-k), by the constant D/C. The filters run with the coefficients of the
+moment, so they are written as a table in which only coefficients change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.polynomial.orders import Layout
+from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.structures import any_structure
+from ambid.errors import EstimationError
+from ambid.recursive.square_root import factors_of, root_of, root_of_factors
+
+Table = NDArray[np.int64]
+Term = tuple[int, int, int, int]  # source row, first coefficient, how many, lag
+
+ONE, MINUS, FIRST = 0, 1, 2  # places of 1, -1 and the first free coefficient in the vector that the filters take
+_Y, _ONES, _U = 0, 1, 2  # rows of the buffer
+COUNTED = (3, 4, 5, 6, 7)  # places in `State.count`: used, rejected, waited, projected, held
+_OFTEN = 1e-3
+_COLUMNS = 512  # samples that the buffer takes before its end becomes the next history
+_WORTH = 100.0  # samples, of the noise variance of a fit that does not say how many it saw
+_LOOSE = 100.0  # standard deviations of noise at the output: how far the operating point may have moved since
+_FIXED = 1e-9  # relative standard deviation of a coefficient that the fit holds fixed
+
+
+@dataclass(slots=True, kw_only=True)
+class _Writer:
+    n_rows: int
+    filters: list[tuple[int, int, int, int, int]] = field(default_factory=list)
+    terms: list[Term] = field(default_factory=list)
+
+    def filtered(self, terms: list[Term], over: tuple[int, int]) -> int:
+        """Note a filter (sum of terms) / (1 + `over`) and return its row; the source itself where it does nothing."""
+        if not over[1] and len(terms) == 1 and terms[0][1:] == (ONE, 1, 0):
+            return terms[0][0]
+        first = len(self.terms)
+        self.terms += terms
+        self.filters.append((self.n_rows, over[0], over[1], first, len(self.terms)))
+        self.n_rows += 1
+        return self.n_rows - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """Tables that the compiled recursion follows."""
+
+    # (n_filters + n_terms + n_columns + n_polynomials, 5), filters (destination, first coefficient and length of the
+    # denominator, first and last term), terms, columns of the gradient (row, lag, sign), polynomials that have to be
+    # stable (first coefficient, length)
+    rows: Table
+    meta: Table  # see `_kernels`
+    n_signals: int
+
+
+def plan_of(layout: Layout) -> Plan:
+    """Write down the recursion of a structure."""
+    n_u, place, n = layout.n_inputs, _coefficients(layout), layout.free.size + 1
+    A, C, D, none = place["A", None], place["C", None], place["D", None], (0, 0)
+    B, F = [place["B", i] for i in range(n_u)], [place["F", i] for i in range(n_u)]
+    out = _Writer(n_rows=_U + n_u)
+
+    def monic(row: int, p: tuple[int, int]) -> list[Term]:
+        return [(row, ONE, 1, 0)] + ([(row, *p, 1)] if p[1] else [])
+
+    def plain(row: int) -> list[Term]:
+        return [(row, ONE, 1, 0)]
+
+    uf = [out.filtered(plain(out.filtered(monic(_U + i, D), C)), F[i]) for i in range(n_u)]
+    ones = out.filtered(monic(_ONES, D), C)
+    ends = [len(out.filters)]
+    w = [out.filtered([(_U + i, *B[i], layout.nk[i])], F[i]) for i in range(n_u)]
+    constant = [(_ONES, FIRST + n - 1, 1, 0)]
+    minus = out.filtered(constant, none)
+    v = out.filtered(monic(_Y, A) + [(x, MINUS, 1, 0) for x in (*w, minus)], none)
+    e = out.filtered(monic(v, D), C)
+    ends.append(len(out.filters))
+    yf = out.filtered(monic(_Y, D), C) if A[1] else _Y
+    ef = out.filtered(plain(e), C)
+    vf = out.filtered(plain(v), C) if D[1] else v
+    wf = [out.filtered([(uf[i], *B[i], layout.nk[i])], F[i]) if F[i][1] else w[i] for i in range(n_u)]
+    ends.append(len(out.filters))
+    rings = [out.filtered([], F[i]) for i in range(n_u) if F[i][1]]
+    if C[1]:
+        out.filtered([(x, ONE, 1, 0) for x in rings], C)
+    ends.append(len(out.filters))
+
+    columns = [(yf, 1 + k, -1) for k in range(A[1])]
+    columns += [(uf[i], layout.nk[i] + k, 1) for i in range(n_u) for k in range(B[i][1])]
+    columns += [(ef, 1 + k, 1) for k in range(C[1])] + [(vf, 1 + k, -1) for k in range(D[1])]
+    columns += [(wf[i], 1 + k, -1) for i in range(n_u) for k in range(F[i][1])] + [(ones, 0, 1)]
+    stable = [p for p in (C, *F) if p[1]]
+    first_w = next((w[i] for i in range(n_u) if F[i][1]), -1)
+    parts: tuple[Sequence[tuple[int, ...]], ...] = (out.filters, out.terms, columns, stable)
+    starts = np.cumsum([0, *(len(p) for p in parts)])
+    rows = np.zeros((int(starts[-1]), 5), dtype=np.int64)
+    for first, part in zip(starts, parts, strict=False):
+        for k, row in enumerate(part):
+            rows[first + k, : len(row)] = row
+    meta = np.array([n, n_u, _longest(layout), *ends, *starts[1:4], len(stable), v, e, first_w], dtype=np.int64)
+    return Plan(rows=rows, meta=meta, n_signals=out.n_rows)
+
+
+def _coefficients(layout: Layout) -> dict[tuple[str, int | None], tuple[int, int]]:
+    """First free coefficient of every polynomial, and how many it has."""
+    out, first = {}, FIRST
+    for key in layout.places:
+        n = len(layout.free_lags(key))
+        out[key] = (first, n)
+        first += n
+    return out
+
+
+def _longest(layout: Layout) -> int:
+    """Samples of history after which w, v and e can be computed, and then reach back as far as C, D and F want."""
+    reach = max([1, layout.na, *(b + k for b, k in zip(layout.nb, layout.nk, strict=True))])
+    return int(reach + max([layout.nc, layout.nd, *layout.nf]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forgetting:
+    """How fast old samples lose their weight: lambda(t) = final + growth (lambda(t - 1) - final)."""
+
+    # weight of the last sample beside the present one in the long run; 1 forgets nothing. The memory is 1/(1 - final)
+    # samples.
+    final: float = 1.0
+    first: float | None = None  # the same at the beginning; None: `final`
+    growth: float = 0.99  # between 0 and 1: how slowly the one becomes the other
+
+    def __post_init__(self) -> None:
+        for name, value in (("final", self.final), ("first", self.first), ("growth", self.growth)):
+            if value is not None and not 0.0 < value <= 1.0:
+                raise EstimationError(f"forgetting: {name} = {value}; it must be above 0 and at most 1. Correct it")
+
+    @property
+    def memory(self) -> float:
+        """Samples of about the same weight, in the long run."""
+        return float("inf") if self.final == 1.0 else 1.0 / (1.0 - self.final)
+
+    @property
+    def forgets(self) -> bool:
+        """Whether any sample loses weight."""
+        return self.final < 1.0 or (self.first is not None and self.first < 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class State:
+    """Arrays that the compiled recursion works on, in the order of its arguments."""
+
+    plan: Table  # see `plan` and `_kernels`
+    meta: Table
+    count: Table
+    # (7 + n_inputs,), forgetting factors, squared errors and their weight, noise variance of the start, levels that
+    # are taken off
+    real: Array
+    theta: Array  # (n,), estimate: free coefficients, then the constant
+    coef: Array  # (2 + n,), 1, -1, then the same, C and F kept stable: what the filters use
+    F: Array  # (n, n), factors of P
+    S: Array  # (n, n), empty where nothing is forgotten
+    limit: Array  # (n,), variances beyond which forgetting rests
+    signals: Array  # (n_rows, n_columns)
+    work: Array  # (3, 2 + n)
+
+    def arrays(self) -> tuple[Any, ...]:
+        """Return all arrays in the order in which the recursion takes them."""
+        return tuple(getattr(self, f.name) for f in fields(self))
+
+    @property
+    def at(self) -> Array:
+        """Estimate with C and F kept stable, shape (n,)."""
+        return self.coef[2:]
+
+    @property
+    def levels(self) -> Array:
+        """What is taken off output and inputs, shape (1 + n_inputs,)."""
+        return self.real[6:]
+
+    def counts(self) -> dict[str, int]:
+        """Return how many samples were used, rejected, waited, projected and held."""
+        names = ("used", "rejected", "waited", "projected", "held")
+        return {name: int(self.count[k]) for name, k in zip(names, COUNTED, strict=True)}
+
+    @property
+    def at_border(self) -> bool:
+        """Whether the filters had to stop short of the estimate often, or do so now."""
+        return bool(self.count[6] > _OFTEN * self.count[8] or not np.array_equal(self.theta, self.at))
+
+    @property
+    def waits(self) -> bool:
+        """Whether nothing is predicted for want of history."""
+        return bool(self.count[1] < self.meta[2] or self.count[2])
+
+    @property
+    def worse(self) -> float:
+        """Standard deviation of the innovations over that of the start."""
+        return float(np.sqrt(self.real[3] / self.real[4] / self.real[5]))
+
+    def go_on_counting(self, before: State | None, samples: int) -> None:
+        """Take over counters and the forgetting of the moment, as if the samples had been taken in one by one.
+
+        `before`: none: this is the first estimate; `samples`: taken in so far.
+        """
+        self.count[list(COUNTED)] = [samples, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
+        if before is not None:
+            self.real[0] = before.real[0]
+
+    def copy(self) -> State:
+        """Return a state that shares nothing with this one."""
+        return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+
+def new_state(
+    layout: Layout,
+    *,
+    theta: Array,
+    P: Array,
+    limit: Array,
+    noise_variance: float,
+    weight: float,
+    centre: Array,
+    forgetting: Forgetting,
+) -> State:
+    """Return a state with no past signals.
+
+    `theta`: (n,), free coefficients, then the constant; `P`: (n, n), covariance over noise variance; `limit`: (n,);
+    `weight`: samples that the noise variance is worth; `centre`: (1 + n_inputs,), levels of output and inputs that are
+    taken off.
+    """
+    from ambid.recursive.polynomial_kernels import follow
+
+    plan = plan_of(layout)
+    longest = int(plan.meta[2])
+    first = forgetting.final if forgetting.first is None else forgetting.first
+    F = factors_of(P)
+    count = np.zeros(16, dtype=np.int64)
+    count[0] = longest
+    sd = np.sqrt(np.diag(P))
+    inverse = np.linalg.inv(root_of_factors(F) / sd[:, None]) / sd
+    coef, work = np.concatenate([[1.0, -1.0], theta]), np.zeros((3, 2 + theta.size))
+    follow(plan.rows, plan.meta, theta, coef, work[2])
+    return State(
+        plan=plan.rows,
+        meta=plan.meta,
+        count=count,
+        real=np.concatenate(
+            [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight, noise_variance], centre]
+        ),
+        theta=theta.copy(),
+        coef=coef,
+        F=F,
+        S=np.asarray(inverse.T @ inverse) * noise_variance if forgetting.forgets else np.empty((0, 0)),
+        limit=limit.copy(),
+        signals=np.zeros((plan.n_signals, longest + _COLUMNS)),
+        work=work,
+    )
+
+
+def covariance_of_state(state: State, *, doubtful: bool = False) -> Array:
+    """Return the covariance (n, n) of the coefficients, symmetric and positive definite by construction.
+
+    It is that of a recursion that began near enough to the truth; `doubtful` adds what is not known where it did not.
+    """
+    G = root_of_factors(state.F)
+    if state.S.size:
+        lower = np.tril(state.S)
+        H = G.T @ (lower + np.tril(lower, -1).T) @ G
+        G = G @ root_of((H + H.T) / 2, floor=1e-14)
+        P = np.asarray(G @ G.T)
+    else:
+        P = np.asarray(noise_variance_of(state) * (G @ G.T))
+    return P + np.diag(np.where(np.isfinite(state.limit), state.limit, 0.0)) if doubtful else P
+
+
+def noise_variance_of(state: State) -> float:
+    """Return the variance of the innovations."""
+    return float(state.real[3] / state.real[4])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Identity:
+    """Who a fit is about: what the recursion does not change."""
+
+    structure: str
+    layout: Layout
+    dt: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: dict[str, str]
+
+
+def identity_of(fit: BlackBoxFit) -> Identity:
+    """Return what a fit says of itself.
+
+    `fit`: of a polynomial structure, one output.
+    """
+    model = fit.model
+    known = any_structure(fit.structure).home.startswith("ambid.blackbox.polynomial:")
+    if not known or not isinstance(model, PolynomialModel):
+        raise EstimationError(
+            f"{fit.structure} is no prediction error fit of a polynomial model; it cannot be followed. Fit armax, say"
+        )
+    if model.n_outputs != 1:
+        raise EstimationError(
+            f"the fit has {model.n_outputs} outputs; the recursion follows one. Fit and track each output by itself"
+        )
+    p = model.outputs[0]
+    nk = tuple(int(x) for x in _per_input(fit.orders.get("nk", 0), len(p.B)))
+    layout = Layout(
+        na=p.A.size - 1,
+        nb=tuple(b.size - k for b, k in zip(p.B, nk, strict=True)),
+        nc=p.C.size - 1,
+        nd=p.D.size - 1,
+        nf=tuple(f.size - 1 for f in p.F),
+        nk=nk,
+    )
+    return Identity(
+        structure=fit.structure,
+        layout=layout,
+        dt=fit.dt,
+        inputs=fit.inputs,
+        outputs=fit.outputs,
+        units=dict(fit.units),
+    )
+
+
+def state_from_fit(fit: BlackBoxFit, layout: Layout, forgetting: Forgetting, *, samples: int | None = None) -> State:
+    """Return a state whose prior information is what the fit knows."""
+    noise = float(fit.noise_covariance[0, 0])
+    if fit.covariance is None or not noise > 0.0:
+        raise EstimationError(
+            f"the {fit.structure} fit has {'no covariance' if fit.covariance is None else 'no noise'}; new data cannot "
+            "be weighed against it. Start from orders alone"
+        )
+    full, free = fit.model.theta, layout.free
+    n = free.size + 1
+    theta, P = np.zeros(n), np.zeros((n, n))
+    theta[: free.size] = full[free]
+    P[: free.size, : free.size] = fit.covariance[np.ix_(free, free)] / noise
+    scale = _magnitudes(full, layout)
+    floor = (_FIXED * scale) ** 2 / noise
+    k = np.arange(free.size)
+    P[k, k] = np.maximum(P[k, k], floor)
+    limit = np.full(n, np.inf)
+    limit[: free.size] = np.maximum(scale**2, noise * P[k, k])
+    p = layout.polynomials(full)
+    gain = float(np.clip(abs(p.C.sum()) / max(abs(p.D.sum()), 1e-3), 1e-3, 1e3))
+    P[-1, -1] = gain**2 / samples if samples else (_LOOSE * gain) ** 2
+    limit[-1] = 4.0 * noise * (_LOOSE * gain) ** 2
+    return new_state(
+        layout,
+        theta=theta,
+        P=P,
+        limit=limit,
+        noise_variance=noise,
+        weight=float(samples) if samples else _WORTH,
+        centre=np.concatenate([fit.offsets.y, fit.offsets.u]),
+        forgetting=forgetting,
+    )
+
+
+def _per_input(value: int | tuple[int, ...], n: int) -> tuple[int, ...]:
+    return value if isinstance(value, tuple) else (value,) * n
+
+
+def _magnitudes(full: Array, layout: Layout) -> Array:
+    """Size of each free coefficient: one for A, C, D and F, that of the polynomial for B."""
+    out = np.ones(full.size)
+    for (letter, _), place in layout.places.items():
+        if letter == "B" and place.stop > place.start:
+            size = float(np.max(np.abs(full[place])))
+            out[place] = size if size > 0.0 else 1.0
+    return np.asarray(out[layout.free])

@@ -1,0 +1,476 @@
+"""Recursions for y = φᵀθ + e over one square-root core: least squares with a choice of forgetting, LMS and NLMS.
+
+Least squares minimises the sum of squared errors over past samples, older ones with less weight, and the distance from
+the start; every sample costs O(p²) and nothing is inverted (Bierman 1977, ch. V; Ljung & Söderström 1983, sec. 6.2).
+LMS steps along the regressor, θ(t) = θ(t-1) + μ(t) φ(t) e(t): robust, but slow where regressors are correlated (Widrow
+& Stearns 1985, ch. 6; Haykin 2002, ch. 5 and 6).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.recursive.estimator import as_blocks, count, forgetting_factor, numbers, positive, prior_of
+from ambid.recursive.square_root import covariance_of, factors_of, root_of_factors
+
+Kernel = Callable[[Array, Array, Array, Array], None]
+Forgetting = Literal["none", "exponential", "directional"]
+
+VAGUE = 1e22  # variance of a coefficient of which nothing is known, whatever its unit
+ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
+_SMALLEST_VARIANCE = 1e-200  # exact data; a variance of 0 would not be positive definite
+_NOISE_MEMORIES = 10  # memory of the noise variance, in memories of the estimate
+_SETTLES = 0.25  # of the memory of the noise variance, after which it is good enough to be the unit of the covariance
+_LOOKS = 32  # most samples between two looks at the limit
+_FAR = 1e12  # variance of the start's error in units of step or of 1 / small, which have the signals' units
+_FLOAT = np.dtype(np.float64)
+
+
+class Recursion:
+    """State and interface of a recursion; its kernel is the only thing that differs.
+
+    `estimate`: (p,); `noise_variance`: tracked or given variance of e; the square of `noise_start` until one degree of
+    freedom has shown it.
+    """
+
+    _kernel = "regress"
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        width: int,
+        size: int,
+        start: ArrayLike | None,
+        noise_sd: float | None,
+        guess: float,
+    ) -> None:
+        p = len(names)
+        self._names, self._shape = names, (width,)
+        self._prepare()
+        self._s = np.zeros(self._at.HEAD + size)
+        self._s[self._at.SIZE] = p
+        self._known_noise = None if noise_sd is None else positive("noise_sd", noise_sd) ** 2
+        self._guess = positive("noise_start", guess) ** 2
+        self._s[self._at.HEAD :][:p] = numbers("start", 0.0 if start is None else start, p)
+
+    def _kernels(self) -> ModuleType:
+        """Return the module of compiled loops, which also knows where the numbers lie."""
+        from ambid.recursive import regression_kernels
+
+        return regression_kernels
+
+    def _prepare(self) -> None:
+        """Make what is not state: work space and the compiled kernel."""
+        self._at: Any = self._kernels()
+        self._run: Kernel = getattr(self._at, self._kernel)
+        self._row, self._y, self._e = np.zeros((1, *self._shape)), np.zeros(1), np.zeros(1)
+        self._error = self._e.reshape(())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what `_prepare` makes."""
+        made = {"_at", "_run", "_row", "_y", "_e", "_error"}
+        return {key: value for key, value in self.__dict__.items() if key not in made}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._prepare()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return self._names
+
+    @property
+    def estimate(self) -> Array:
+        """A copy, shape (p,)."""
+        return self._s[self._at.HEAD :][: len(self._names)].copy()
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used."""
+        return int(self._s[self._at.USED])
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that were not, for a number that is not finite or leads beyond 1e200."""
+        return int(self._s[self._at.REJECTED])
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of e, in squared units of the output."""
+        if self._known_noise is not None:
+            return self._known_noise
+        if self._s[self._at.NOISE_WEIGHT] < ENOUGH:
+            return self._guess
+        return max(float(self._s[self._at.NOISE_SUM] / self._s[self._at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
+
+    def update(self, phi: ArrayLike, y: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        `phi`: (p,), or (n_samples, p) for a block, regressors; `y`: (), or (n_samples,) or (n_samples, 1) for a block.
+        Returns y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
+        """
+        if isinstance(y, float) and type(phi) is np.ndarray and phi.shape == self._shape and phi.dtype is _FLOAT:
+            self._row[0] = phi
+            self._y[0] = y
+            self._run(self._s, self._row, self._y, self._e)
+            return self._error.copy()
+        rows, values, shape = as_blocks("regression", phi, y, self._shape[0])
+        out = np.empty(values.size)
+        self._run(self._s, rows, values[:, 0], out)
+        return out.reshape(shape)
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state."""
+        return copy.deepcopy(self)
+
+
+class _Factored(Recursion):
+    """A recursion with P and a companion of it in factors."""
+
+    def __init__(
+        self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None, guess: float
+    ) -> None:
+        found = coefficient_names(names)
+        p = len(found)
+        super().__init__(found, p, 6 * p + 4 * p * p, start, noise_sd, guess)
+
+    def _factors(self, which: int) -> Array:
+        """Return a view of the factors (p, p) of P (0), of its companion (1), or of both at the start (2, 3)."""
+        p = len(self._names)
+        first = self._at.HEAD + p + which * p * p
+        return self._s[first : first + p * p].reshape(p, p)
+
+    def _rest(self) -> Array:
+        """Return a view of the rows walk, prior and scratch, shape (5, p)."""
+        p = len(self._names)
+        return self._s[self._at.HEAD + p + 4 * p * p :].reshape(5, p)
+
+
+class RecursiveLeastSquares(_Factored):
+    """Recursive least squares, a `RecursiveEstimator`.
+
+    What is forgotten:
+
+    - ``"none"``: nothing. The estimate is that of batch least squares with the same prior. With `walk`, it is the
+      Kalman filter of coefficients that walk at random.
+    - ``"exponential"``: a sample k samples ago weighs factor**k. Where the regressor lacks a direction, P grows there
+      (wind-up) until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far
+      that it stays there: coefficients that are still excited are tracked more slowly meanwhile.
+    - ``"directional"``: only the part of the information that the present regressor meets is forgotten: without
+      excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`.
+
+    The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
+    regressors: σ²C with the error's own recursion C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ. With forgetting it is less than
+    σ²P, by 1 + factor in the stationary state. The lag behind moving coefficients is not in it, except with `walk`,
+    where C = P.
+
+    Where something is forgotten, every sample counts with the σ² of its own time, once σ² is known (after a memory): a
+    calm makes no coefficient surer.
+
+    σ² is tracked on errors e over 1 + φᵀCφ, each with the weight of what it says of the estimate: silence does not
+    lower it. Biased like all least squares where e is coloured and correlated with the regressor, as under feedback
+    or for noisy regressors: then take `RecursiveInstrumentalVariables`.
+
+    Numbers: factors U and D > 0 are updated without subtraction of D, so that P stays positive definite whatever is
+    rounded; forgetting divides D and damps old rounding errors; the limit bounds P from above, the data from below.
+    With `walk` nothing bounds P from above: unseen coefficients walk on, by n `walk` in n samples, and P says so.
+
+    Parameters
+    ----------
+    names : sequence of str, or int
+        Names of the p coefficients, or p.
+    start : array_like, shape (p,), optional
+        Estimate to begin with; zero if not given.
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error **over the variance of e** (P₀), in the coefficients' units. If not given,
+        nothing is known of the coefficients, whatever the units of the signals: the start has no weight.
+    forgetting : {"none", "exponential", "directional"}, optional
+        Exponential if not given but `factor` or `memory` is.
+    factor : float, optional
+        Of forgetting, 0 < factor < 1.
+    memory : float, optional
+        The same as a time constant in samples, 1 / (1 - factor).
+    limit : float
+        Of forgetting: largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
+        Without effect where nothing is forgotten, so also with `walk`.
+    reset_every : int, optional
+        P and C are set back to the prior after so many samples, the estimate kept.
+    walk : array_like, shape () or (p,), optional
+        Variance of one sample's step of each coefficient over the variance of e.
+    noise_sd : float, optional
+        Standard deviation of e, where known; else it is tracked.
+    noise_start : float
+        Taken for it until the data have shown it.
+    noise_memory : float, optional
+        Memory of the tracked variance, samples; ten times that of the estimate if not given.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of the estimate's error, see above.
+    P : ndarray, shape (p, p)
+        The matrix of the recursion.
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range, or two of them exclude each other.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str] | int,
+        *,
+        start: ArrayLike | None = None,
+        prior: ArrayLike | None = None,
+        forgetting: Forgetting | None = None,
+        factor: float | None = None,
+        memory: float | None = None,
+        limit: float = 100.0,
+        reset_every: int | None = None,
+        walk: ArrayLike | None = None,
+        noise_sd: float | None = None,
+        noise_start: float = 1.0,
+        noise_memory: float | None = None,
+    ) -> None:
+        kept, kind = _factor(forgetting, factor, memory), forgetting
+        if kept < 1.0 and walk is not None:
+            raise EstimationError("walk and forgetting are two models of one thing. Give one of them")
+        directional = kind == "directional"
+        super().__init__(names, start, noise_sd, noise_start)
+        s, p, at = self._s, len(self._names), self._at
+        s[at.KIND] = at.DIRECTIONAL if directional else at.LEAST_SQUARES if walk is None else at.WALK
+        s[at.FACTOR] = s[at.FACTOR_NOW] = kept
+        s[at.MEMORY] = 1.0 / (1.0 - kept) if kept < 1.0 else np.inf
+        s[at.EVERY] = max(1.0, min(_LOOKS, np.floor(s[at.MEMORY] / 2)))
+        s[at.LIMIT], s[at.VAGUE] = positive("limit", limit), float(prior is None)
+        s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
+        s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
+        settle = _NOISE_MEMORIES * s[at.MEMORY] if noise_memory is None else positive("noise_memory", noise_memory)
+        s[at.NOISE_RATE] = 1.0 / settle
+        s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], _SETTLES * settle)
+        steps = numbers("walk", 0.0 if walk is None else walk, p)
+        if (steps < 0).any():
+            raise EstimationError(f"walk is {walk!r}; variances are not negative")
+        self._rest()[0] = steps
+        self._set_prior(prior_of("prior", VAGUE if prior is None else prior, p))
+        self._begin()
+
+    @property
+    def P(self) -> Array:
+        """A copy of the matrix of the recursion, shape (p, p): covariance over σ² without forgetting."""
+        return covariance_of(self._factors(0))
+
+    @property
+    def covariance(self) -> Array:
+        """A copy of the covariance of the estimate's error, shape (p, p)."""
+        s, at = self._s, self._at
+        unit = float(s[at.UNIT] or self.noise_variance)
+        if s[at.KIND] == at.DIRECTIONAL:
+            return unit * covariance_of(self._factors(1))
+        if s[at.FACTOR] == 1.0:
+            return self.noise_variance * self.P
+        half = root_of_factors(self._factors(1)).T @ self.P
+        return np.asarray(unit * (half.T @ half))
+
+    def reset(self, prior: ArrayLike | None = None) -> None:
+        """Say that the coefficients may have moved: P and C become the prior, the estimate stays.
+
+        Parameters
+        ----------
+        prior : array_like, shape (), (p,) or (p, p), optional
+            Over the variance of e; the one given at the start if none.
+
+        Raises
+        ------
+        EstimationError
+            If it is not positive definite.
+        """
+        if prior is None:
+            self._begin()
+            return
+        kept = self._factors(2).copy(), self._factors(3).copy()
+        self._set_prior(prior_of("prior", prior, len(self._names)))
+        self._begin()
+        self._factors(2)[:], self._factors(3)[:] = kept
+
+    def _set_prior(self, prior: Array) -> None:
+        """Keep P₀ and what its companion begins with: C, or the information of squared weights."""
+        scale = np.sqrt(np.diag(prior))
+        inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
+        directional = self._s[self._at.KIND] == self._at.DIRECTIONAL
+        self._factors(2)[:] = factors_of(prior)
+        self._factors(3)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
+        if not self._s[self._at.USED]:
+            self._rest()[1] = np.diag(prior)
+
+    def _begin(self) -> None:
+        s, at = self._s, self._at
+        self._factors(0)[:], self._factors(1)[:] = self._factors(2), self._factors(3)
+        if s[at.UNIT]:
+            s[at.UNIT] = max(s[at.UNIT], self.noise_variance)
+            s[at.NOW] = at.noise_of_now(s)
+
+
+class _Gradient(_Factored):
+    """A recursion along the regressor, with the covariance of its error."""
+
+    def __init__(
+        self,
+        names: Sequence[str] | int,
+        start: ArrayLike | None,
+        prior: ArrayLike,
+        noise_sd: float | None,
+        noise_start: float,
+        noise_memory: float,
+    ) -> None:
+        super().__init__(names, start, noise_sd, noise_start)
+        self._s[self._at.NOISE_RATE] = 1.0 / positive("noise_memory", noise_memory)
+        self._factors(1)[:] = factors_of(prior_of("prior", prior, len(self._names)))
+
+    @property
+    def covariance(self) -> Array:
+        """A copy of the covariance of the estimate's error, shape (p, p)."""
+        return self.noise_variance * covariance_of(self._factors(1))
+
+
+class Lms(_Gradient):
+    """Least mean squares, a `RecursiveEstimator`: θ += step φ e.
+
+    A sample with step φᵀφ > 1 is used with the step 1 / φᵀφ, beyond which a single step overshoots; `n_limited` counts
+    them. The covariance is σ²C, C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ with K = step φ, the exact covariance of the error
+    given the regressors, for coefficients that do not move and white e independent of past regressors: from the
+    prior down to the misadjustment, about step σ²/2 for small steps. The lag behind moving coefficients is not in it.
+    Biased like least squares where e is coloured and correlated with the regressor, as under feedback.
+
+    Parameters
+    ----------
+    names : sequence of str, or int
+        Names of the p coefficients, or p.
+    step : float
+        In units of 1 over the square of the regressor; well below 2 / E φᵀφ.
+    start : array_like, shape (p,), optional
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error over the variance of e; 1e12 step if not given.
+    noise_sd : float, optional
+        Standard deviation of e, where known; else it is tracked.
+    noise_start : float
+        Taken for it until the data have shown it.
+    noise_memory : float
+        Memory of the tracked variance, samples.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of the estimate's error, see above.
+    n_limited : int
+        Samples whose step was limited.
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str] | int,
+        *,
+        step: float,
+        start: ArrayLike | None = None,
+        prior: ArrayLike | None = None,
+        noise_sd: float | None = None,
+        noise_start: float = 1.0,
+        noise_memory: float = 10_000.0,
+    ) -> None:
+        far = _FAR * positive("step", step)
+        super().__init__(names, start, far if prior is None else prior, noise_sd, noise_start, noise_memory)
+        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.LMS, step
+
+    @property
+    def n_limited(self) -> int:
+        """Samples whose step was limited."""
+        return int(self._s[self._at.LIMITED])
+
+
+class Nlms(_Gradient):
+    """Normalised least mean squares, a `RecursiveEstimator`: θ += step φ e / (small + φᵀφ).
+
+    The covariance is as in `Lms`, with this gain. Biased like least squares where e is coloured and correlated with
+    the regressor, as under feedback.
+
+    Parameters
+    ----------
+    names : sequence of str, or int
+        Names of the p coefficients, or p.
+    step : float
+        0 < step < 2; 1 meets each sample's output in full.
+    small : float
+        Regularisation, in squared units of the regressor: regressors below its root move little.
+    start : array_like, shape (p,), optional
+    prior : array_like, shape (), (p,) or (p, p), optional
+        Covariance of the start's error over the variance of e; 1e12 / small if not given.
+    noise_sd : float, optional
+        Standard deviation of e, where known; else it is tracked.
+    noise_start : float
+        Taken for it until the data have shown it.
+    noise_memory : float
+        Memory of the tracked variance, samples.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of the estimate's error, see `Lms`.
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str] | int,
+        *,
+        step: float,
+        small: float,
+        start: ArrayLike | None = None,
+        prior: ArrayLike | None = None,
+        noise_sd: float | None = None,
+        noise_start: float = 1.0,
+        noise_memory: float = 10_000.0,
+    ) -> None:
+        far = _FAR / positive("small", small)
+        super().__init__(names, start, far if prior is None else prior, noise_sd, noise_start, noise_memory)
+        if not 0 < step < 2:
+            raise EstimationError(f"step is {step!r}; normalised LMS converges for 0 < step < 2")
+        self._s[self._at.KIND], self._s[self._at.STEP] = self._at.NLMS, step
+        self._s[self._at.SMALL] = small
+
+
+def coefficient_names(names: Sequence[str] | int) -> tuple[str, ...]:
+    """Return the names of the coefficients, ``theta1``, ... where only their number is given."""
+    found = tuple(f"theta{i + 1}" for i in range(names)) if isinstance(names, int) else tuple(names)
+    if not found or len(set(found)) < len(found):
+        raise EstimationError(f"names is {names!r}; give at least one coefficient, each name once")
+    return found
+
+
+def _factor(forgetting: Forgetting | None, factor: float | None, memory: float | None) -> float:
+    if forgetting not in (None, "none", "exponential", "directional"):
+        raise EstimationError(f"forgetting is {forgetting!r}; it is none, exponential or directional")
+    kept = forgetting_factor(factor, memory)
+    if kept < 1.0 and forgetting == "none":
+        raise EstimationError("forgetting is none; leave factor and memory out")
+    if kept == 1.0 and forgetting in ("exponential", "directional"):
+        raise EstimationError(f"forgetting is {forgetting}; say how fast, by factor or memory")
+    return kept
