@@ -9,7 +9,7 @@ import numpy as np
 
 from ambid.recursive.filters.kalman import KalmanFilter, constant_velocity
 from ambid.recursive.filters.scalar import ScalarKalman
-from ambid.recursive.polynomial.recursive import RecursivePolynomial
+from ambid.recursive.polynomial import RecursivePolynomial
 from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
 from experiments import AT_SPEED
 from peers import Array, Bench, model_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ambid.recursive.estimator import RecursiveEstimator
-from ambid.recursive.polynomial.recursive import RecursivePolynomial
+from ambid.recursive.polynomial import RecursivePolynomial
 from ambid.recursive.regression import RecursiveLeastSquares
 from table import Table
 from tracking_benches import RATE, Array, TrackBench, preset_bench

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ambid.recursive.lines import Event as Event
     from ambid.recursive.lines import Track as Track
     from ambid.recursive.lines import TrackLine as TrackLine
-    from ambid.recursive.polynomial.recursive import RecursivePolynomial as RecursivePolynomial
+    from ambid.recursive.polynomial import RecursivePolynomial as RecursivePolynomial
     from ambid.recursive.regression import Lms as Lms
     from ambid.recursive.regression import Nlms as Nlms
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares

@@ -243,7 +243,9 @@ class RecursivePolynomial:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return _warnings_of(self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful)
+        return _warnings_of(
+            self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful
+        )
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -380,7 +382,9 @@ class RecursivePolynomial:
             raise EstimationError(
                 f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
             )
-        found = _fit_of(self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings)
+        found = _fit_of(
+            self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings
+        )
         return replace(found, status="stalled") if self._doubtful else found
 
     def __getstate__(self) -> dict[str, object]:

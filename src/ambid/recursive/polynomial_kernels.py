@@ -1,8 +1,8 @@
 """Compiled recursion of the polynomial predictor, its gradients and the U-D filter of its coefficients.
 
 Every signal is a row of one buffer that is written from column to column; when it is full, its end becomes the history
-of a new beginning, so that a sample costs the same whether it comes alone or in a block. What is filtered by what is
-a table of whole numbers, see `ambid.recursive.polynomial_state.plan_of`; only the coefficients `coef` = 1, -1, free ones, constant move.
+of a new beginning, so that a sample costs the same whether it comes alone or in a block. What is filtered by what is a
+table of whole numbers, see `plan_of`; only the coefficients `coef` = 1, -1, free ones, constant move.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from ambid.blackbox import polynomial
 from ambid.errors import EstimationError
 from ambid.recursive.polynomial import Forgetting, RecursivePolynomial
+from ambid.recursive.square_root import covariance_of
 from tests.blackbox.polynomial.systems import SYSTEMS, System, record, two_outputs, unstable_loop
 from tests.recursive.cases_polynomial import ORDERS, fit_of, signals
 
@@ -266,8 +267,7 @@ def test_a_short_memory_winds_up_to_the_limit_and_not_beyond(forgetting: Forgett
         r.update(2.0, 20.0)
         state = r._state
         assert state is not None
-        U = np.triu(state.UD.T, 1) + np.eye(5)
-        variance = max(r.noise_variance, 0.09) * np.diag(U * np.diag(state.UD) @ U.T)
+        variance = max(r.noise_variance, 0.09) * np.diag(covariance_of(state.F))
         largest = max(largest, float(np.max(variance / state.limit)))
     assert largest <= 1.0 + 1e-9
     assert r.n_held > 0

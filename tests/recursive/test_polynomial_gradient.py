@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.polynomial.orders import Layout
-from ambid.recursive.polynomial._kernels import gradient, run
-from ambid.recursive.polynomial.state import Forgetting, new_state
+from ambid.recursive.polynomial_kernels import run
+from ambid.recursive.polynomial_state import Forgetting, new_state
 
 N, SETTLED = 700, 600
 LAYOUTS = {
@@ -65,7 +65,8 @@ def test_gradient_is_that_of_the_residual(name: str) -> None:
     for t in range(N):
         run(u[t : t + 1], y[t : t + 1], one, False, *state.arrays())
         errors[t] = one[0]
-        gradient(state.plan, state.meta, state.signals, int(state.count[0]) - 1, psi[t])
+        columns = state.plan[state.meta[8] :][: free.size]  # row of the buffer, lag, sign
+        psi[t] = columns[:, 2] * state.signals[columns[:, 0], state.count[0] - 1 - columns[:, 1]]
     np.testing.assert_array_equal(state.at, free)
     np.testing.assert_allclose(errors[SETTLED:], residual(layout, theta, 0.3, u, y).real[SETTLED:], atol=1e-9)
     for j in range(free.size):
