@@ -14,7 +14,8 @@ from ambid.physics.presets import preset
 from ambid.recursive.fusion.fusion import SensorFusion
 from ambid.recursive.fusion.motion import free_motion
 from ambid.recursive.fusion.sensor import FusedSensor
-from ambid.recursive.joint import JointEkf, JointStart, JointUkf
+from ambid.recursive.joint import JointEkf, JointUkf
+from ambid.recursive.joint_start import JointStart
 from ambid.track.evidence import Samples
 from ambid.track.rpem import PhysicalRpem
 from ambid.track.window import MovingWindow

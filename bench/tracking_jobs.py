@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ambid.recursive.filters.kalman import KalmanFilter, constant_velocity
-from ambid.recursive.filters.scalar import ScalarKalman
+from ambid.recursive.kalman import KalmanFilter, constant_velocity
 from ambid.recursive.polynomial import RecursivePolynomial
 from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
+from ambid.recursive.streaming import ScalarKalman
 from experiments import AT_SPEED
 from peers import Array, Bench, model_of
 from tracking_bearing_jobs import bearing_jobs

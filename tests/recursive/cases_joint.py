@@ -9,7 +9,7 @@ import numpy as np
 from ambid.recursive.joint import JointEkf, JointUkf
 from tests.bearing.benches import Bench, run
 from tests.recursive.cases import Case
-from tests.recursive.joint.starts import start_of
+from tests.recursive.joint_starts import start_of
 
 _N = 1000
 

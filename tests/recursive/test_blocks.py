@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from ambid.bearing.blocks import ThreeBlocks, three_blocks
 from ambid.errors import EstimationError
 from ambid.recursive.blocks import OnlineThreeBlocks
-from ambid.recursive.filters.scalar import PassiveLowpass, ScalarKalman
+from ambid.recursive.streaming import PassiveLowpass, ScalarKalman
 from tests.bearing.benches import run
 from tests.reference.test_three_blocks import PRINTED
 

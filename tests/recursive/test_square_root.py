@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive import square_root_kernels as core
-from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.square_root import covariance_of, factors_of, root_of_factors
 
 SCALE = 10.0 ** np.array([-6, 0, 3, 6, -2])
 N = SCALE.size
@@ -58,7 +58,8 @@ def test_adding_and_taking_away_one_direction(P: np.ndarray, rng: np.random.Gene
     assert core.narrow(F, down.copy(), k)
     assert_covariance(F, P)
     before = F.copy()
-    assert not core.narrow(F, 1e3 * SCALE, k)
+    just_too_much = 1.001 * root_of_factors(F)[:, -1].copy()
+    assert not core.narrow(F, just_too_much, k)
     np.testing.assert_array_equal(F, before)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.recursive.joint import JointEkf, JointUkf
 from tests.bearing.benches import run
-from tests.recursive.joint.starts import start_of, truth_of
+from tests.recursive.joint_starts import start_of, truth_of
 
 RUNS = 80
 

@@ -18,8 +18,8 @@ from ambid.arrays import Array
 from ambid.bearing.blocks import ThreeBlocks, blocks_of, three_blocks
 from ambid.errors import EstimationError
 from ambid.recursive.blocks_regression import N_ROW, N_STATE, Linearisation, Sums
-from ambid.recursive.filters.scalar import ScalarKalman
-from ambid.recursive.filters.streaming import StreamingFilter, check_channels
+from ambid.recursive.estimator import check_channels
+from ambid.recursive.streaming import ScalarKalman, StreamingFilter
 
 _WARM_UP = 4000  # samples, from which scales, means and the start are found
 _BATCH = 256  # samples, at least

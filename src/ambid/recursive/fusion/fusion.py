@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.filters.streaming import as_block, check_channels
+from ambid.recursive.estimator import as_block, check_channels
 from ambid.recursive.fusion.motion import Motion
 from ambid.recursive.fusion.reasons import reason
 from ambid.recursive.fusion.sensor import FusedSensor, sensor_table

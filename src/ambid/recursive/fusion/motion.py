@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.physics.discretise import zero_order_hold
-from ambid.recursive.filters.kalman import LinearState, constant_velocity, linear_state
+from ambid.recursive.kalman import LinearState, constant_velocity, linear_state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

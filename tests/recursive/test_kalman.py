@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.filters.kalman import KalmanFilter, constant_velocity, linear_state
+from ambid.recursive.kalman import KalmanFilter, constant_velocity, linear_state
 
 TRACK = constant_velocity(1000.0, q=50.0, r=1e-4)
 

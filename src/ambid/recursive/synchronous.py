@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.filters.streaming import as_block, check_channels
+from ambid.recursive.estimator import as_block, check_channels
+from ambid.recursive.square_root import covariance_of
 
 _START = 1e6  # variance of each state before the first sample, over that of the noise
 _BATCHES = 16  # in one memory, to see the density of the noise around the rotation
@@ -67,7 +68,7 @@ class SynchronousFilter:
     """
 
     def __init__(self, rate_hz: float, *, memory_s: float, channels: int = 1) -> None:
-        from ambid.recursive.filters._kernels import synchronous_scan
+        from ambid.recursive.kalman_kernels import synchronous_scan
 
         check_channels("synchronous filter", rate_hz, channels)
         n = memory_s * rate_hz
@@ -83,7 +84,7 @@ class SynchronousFilter:
         size = int(n / _BATCHES)
         taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
         taper /= np.sqrt(np.mean(taper**2))
-        self._constants = np.array([sqrt(2.0) / n, 3 * _START, _LONGEST, sqrt(_START), *taper])
+        self._constants = np.array([2.0 / n**2, 3 * _START, _LONGEST, _START, *taper])
         self._scan = synchronous_scan
         self._one = (np.empty((1, channels)), np.empty(1), np.empty((1, channels)))
 
@@ -135,8 +136,7 @@ class SynchronousFilter:
         """Of the parts of each channel, shape (channels, 3, 3); infinite before the noise is known."""
         out = np.empty((self.channels, 3, 3))
         for j, s in enumerate(self._state):
-            root = s[3:12].reshape(3, 3)
-            out[j] = root @ root.T * s[15] if s[16] > 0 else np.diag(np.full(3, np.inf))
+            out[j] = covariance_of(s[3:12].reshape(3, 3)) * s[15] if s[16] > 0 else np.diag(np.full(3, np.inf))
         return out
 
     def sinusoid(self, channel: int = 0) -> Sinusoid:

@@ -194,3 +194,12 @@ def start_from(
         offset_sd=offset_sd or {},
         rates=rates or {},
     )
+
+
+def rates_of(share: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
+    """Return rates of random walks from relative ones.
+
+    `share`: by parameter: relative standard deviation gained in one second, s^(-1/2); `values`: parameters, SI. Returns
+    as `JointStart.rates` wants them.
+    """
+    return {name: rate * abs(values[name]) for name, rate in share.items()}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.joint import JointEkf, JointUkf, rates_of
-from ambid.recursive.joint._square_root import rank_one, rank_one_down
+from ambid.recursive.joint import JointEkf, JointUkf
+from ambid.recursive.joint_start import rates_of
 from tests.bearing.benches import run
-from tests.recursive.joint.dense import Dense
-from tests.recursive.joint.drifting import drifting_resistance
-from tests.recursive.joint.starts import start_of, truth_of
+from tests.recursive.joint_dense import Dense
+from tests.recursive.joint_drifting import drifting_resistance
+from tests.recursive.joint_starts import start_of, truth_of
 
 BOTH = pytest.mark.parametrize("kind", [JointEkf, JointUkf])
 
@@ -194,20 +194,6 @@ def test_follows_a_resistance_that_drifts(kind):
     off = (np.array(found) - truth_of(record.bench, filter_.names)) / np.array(sds)
     assert np.all(np.abs(off[:, others]) < 3.5)
     assert np.mean(np.abs(error) < 2 * np.array(sds)[5:, at] / record.R[999::1000][5:]) > 0.75
-
-
-def test_rank_one_changes_are_those_of_dense_matrices():
-    rng = np.random.default_rng(1)
-    S = np.tril(rng.standard_normal((5, 5))) + 3 * np.eye(5)
-    w = np.array([0.0, 0.5, -1.0, 0.2, 0.7])
-    up = np.ascontiguousarray(S.T)
-    rank_one(up, w.copy(), 1)
-    np.testing.assert_allclose(up.T @ up, S @ S.T + np.outer(w, w), rtol=1e-12)
-    assert rank_one_down(up, w.copy(), np.empty(5))
-    np.testing.assert_allclose(up.T @ up, S @ S.T, rtol=1e-11)
-    before = up.copy()
-    assert not rank_one_down(up, 1.001 * before[0], np.empty(5))
-    np.testing.assert_array_equal(up, before)
 
 
 def test_settings_that_make_no_filter_are_refused():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.joint import JointStart
+from ambid.recursive.joint_start import JointStart
 from tests.bearing.benches import Bench
 
 

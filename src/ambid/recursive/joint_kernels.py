@@ -1,9 +1,7 @@
-"""Compiled loops of the joint filters: square-root measurement and time updates, sample by sample.
+"""Compiled loops of the joint filters over the square-root core: measurement and time updates, sample by sample.
 
-The augmented state is z = [q, o, x]: scaled parameters, offsets, plant states. Its covariance is S S^T with S lower
-triangular; `T` holds S transposed, so that a column of S lies together in memory. Parameters and offsets stand first:
-they are carried on unchanged, so that a time update touches the rows of x only and leaves S triangular but for its
-last block. Sensor noise is one in scaled units.
+The augmented state is z = [x, o, q]: plant states, offsets, scaled parameters. Parameters and offsets stand last: they
+are carried on unchanged, so that a time update touches the leading states alone. Sensor noise is one in scaled units.
 """
 
 from __future__ import annotations
@@ -13,7 +11,17 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.joint._square_root import carry, rank_one, rank_one_down, shrink, triangle
+from ambid.recursive.square_root_kernels import (
+    follow,
+    narrow,
+    orthogonalise,
+    propagate,
+    shrink,
+    size,
+    spread,
+    variance,
+    widen,
+)
 
 Ints = NDArray[np.int64]
 
@@ -25,78 +33,51 @@ _BLIND = 32  # samples without any output after which the state is taken for los
 
 
 @compiled
-def _measure(z: Array, T: Array, C: Array, e: Array, level: Array, f: Array, b: Array) -> int:
+def _measure(z: Array, F: Array, C: Array, e: Array, level: Array, f: Array, b: Array) -> int:
     """Take in outputs one by one, `e` their innovations (NaN: missing), `level` a running mean; return how many."""
-    n, taken, (n_y, n_x) = z.size, 0, C.shape
-    s = n - n_x
+    n, taken, (n_y, n_x), one = z.size, 0, C.shape, 1.0
+    moved = np.zeros(n_x)  # what the outputs before have moved of x
     for o in range(n_y):
         if not np.isfinite(e[o]):
             continue
         left = e[o]
         for i in range(n_x):
-            left -= C[o, i] * f[n + i]  # what the outputs before have moved of x
-        alpha = 1.0
+            left -= C[o, i] * moved[i]
         for j in range(n):
-            acc = 0.0
-            for i in range(n_x):
-                acc += T[j, s + i] * C[o, i]
-            f[j] = acc
-            alpha += acc * acc
+            f[j] = C[o, j] if j < n_x else 0.0
+            for i in range(min(j, n_x)):
+                f[j] += F[j, i] * C[o, i]
+        alpha = one + size(F, f)
         if not left * left <= _ABSURD * _ABSURD * alpha < _HUGE:
             e[o] = np.nan
             continue
         level[o] += (left * left / alpha - level[o]) * _FORGET
-        shrink(T, f[:n], 1.0, b)
-        gain = left / alpha
+        gain = left / shrink(F, f, one, b)
         for i in range(n):
             z[i] += gain * b[i]
         for i in range(n_x):
-            f[n + i] += gain * b[s + i]
+            moved[i] += gain * b[i]
         taken += 1
     return taken
 
 
 @compiled
-def _spread(T: Array, walk: Array, w: Array) -> None:
+def _walk(F: Array, walk: Array, a: Array) -> None:
     """Let parameters and offsets walk at random, each only while its standard deviation is under its limit."""
     for j in range(walk.shape[1]):
-        if walk[0, j] > 0.0:
-            variance = 0.0
-            for i in range(j + 1):
-                variance += T[i, j] * T[i, j]
-            if variance < walk[1, j] * walk[1, j]:
-                for i in range(w.size):
-                    w[i] = 0.0
-                w[j] = walk[0, j]
-                rank_one(T, w, j)
-
-
-@compiled
-def _restart(z: Array, T: Array, wide: Array) -> None:
-    """Forget the plant's state, and what it had to do with the parameters."""
-    n, n_x = z.size, wide.size
-    s = n - n_x
-    for i in range(s, n):
-        z[i] = 0.0
-        for j in range(n):
-            T[j, i] = 0.0
-        T[i, i] = wide[i - s]
-
-
-@compiled
-def _blank(e: Array) -> None:
-    for o in range(e.size):
-        e[o] = np.nan
+        if walk[0, j] > 0.0 and variance(F, j) < walk[1, j] * walk[1, j]:
+            a[:] = 0.0
+            a[j] = 1.0
+            widen(F, a[: j + 1], walk[0, j] * walk[0, j])
 
 
 @compiled
 def _take(
-    u: Array, y: Array, e: Array, z: Array, T: Array, C: Array, io: Array, wide: Array, past: Array, counts: Ints,
+    u: Array, y: Array, e: Array, z: Array, F: Array, C: Array, io: Array, wide: Array, past: Array, counts: Ints,
     f: Array, b: Array,
 ) -> bool:  # fmt: skip
     """Take in one sample; leave scaled innovations in `e`, inputs in `past`; return whether there is a step to make."""
-    n, (n_y, n_x) = z.size, C.shape
-    s, n_u = n - n_x, u.size
+    (n_y, n_x), n_u = C.shape, u.size
     missing = 0
     for o in range(n_y):
         e[o] = (y[o] - io[0, n_u + o]) / io[1, n_u + o]
@@ -106,7 +87,7 @@ def _take(
         if not np.isfinite(u[i]):
             counts[REJECTED] += 1
             counts[FILLED], counts[FRESH] = 0, 1
-            _blank(e)
+            e[:] = np.nan
             return False
     for row in range(past.shape[0] - 1, 0, -1):
         for i in range(n_u):
@@ -116,7 +97,7 @@ def _take(
     counts[FILLED] = min(counts[FILLED] + 1, past.shape[0])
     if counts[FILLED] < past.shape[0]:
         counts[USED if missing < n_y else REJECTED] += 1
-        _blank(e)
+        e[:] = np.nan
         return False
     if missing == n_y:
         counts[REJECTED] += 1
@@ -125,79 +106,77 @@ def _take(
             counts[FRESH] = 1
         return bool(counts[FRESH] == 0)
     fresh, counts[MISSED] = counts[FRESH] == 1, 0
-    if fresh:
-        _restart(z, T, wide)
+    if fresh:  # forget the plant's state, and what it had to do with the parameters
+        z[:n_x] = 0.0
+        F[:, :n_x] = 0.0
+        for i in range(n_x):
+            F[i, i] = wide[i] * wide[i]
         counts[FRESH] = 0
     for o in range(n_y):
         for i in range(n_x):
-            e[o] -= C[o, i] * z[s + i]
-    for i in range(n, n + n_x):
-        f[i] = 0.0
-    taken = _measure(z, T, C, e, io[2, n_u:], f, b)
+            e[o] -= C[o, i] * z[i]
+    taken = _measure(z, F, C, e, io[2, n_u:], f, b)
     counts[USED if taken else REJECTED] += 1
     counts[PARTIAL] += 0 < taken < n_y
     if taken == 0:  # an innovation that no noise can make: the state is lost
         counts[FILLED], counts[FRESH] = 0, 1
     if fresh:
-        _blank(e)
+        e[:] = np.nan
     return bool(taken > 0)
 
 
 @compiled
 def ekf_block(
-    first: int, u: Array, y: Array, e: Array, z: Array, T: Array, at: Array, M: Array, dM: Array, dG: Array, C: Array,
-    dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, amount: float, work: Array,
+    first: int, u: Array, y: Array, e: Array, z: Array, F: Array, at: Array, M: Array, dM: Array, dG: Array, C: Array,
+    dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, amount: float,
 ) -> int:  # fmt: skip
     """Run the extended filter from sample `first` on; return before which sample the matrices are to be renewed.
 
     x+ = M(q) [x; u; u late; o], M(q) = M + sum dM_j (q_j - at_j); dG holds what the stationary gain's dependence on q
     adds to the sensitivity of x to q for a unit innovation (Ljung 1979).
     """
-    n, p, (n_x, wide_m) = z.size, dM.shape[0], M.shape
-    s, n_u, n_y, n_d = n - n_x, u.shape[1], y.shape[1], dist.size
-    f, b, v, now = work[0, : n + n_x], work[1, :n], work[2, :wide_m], work[3 : 3 + n_x, :wide_m]
-    J, W = work[3 + n_x : 3 + 2 * n_x, :s], work[3 + 2 * n_x : 3 + 3 * n_x, : n_x + n_d]
-    whole = 0  # a variable: of a constant the compiler would make one more version of `carry`
+    n, p, (n_x, columns) = z.size, dM.shape[0], M.shape
+    s, n_u, n_y, n_d = n - p, u.shape[1], y.shape[1], dist.size
+    f, b, v, now = np.empty(n), np.empty(n), np.empty(columns), np.empty((n_x, columns))
+    J, G = np.empty((n_x, n - n_x)), np.empty((n_x, n_d))
+    W, w = np.empty((n_x, n_x + n_d)), np.empty(n_x + n_d)
     for k in range(first, u.shape[0]):
         counts[K] += 1
-        if _take(u[k], y[k], e[k], z, T, C, io, wide, past, counts, f, b):
-            for i in range(n_x):
-                v[i] = z[s + i]
-                for c in range(wide_m):
-                    now[i, c] = M[i, c]
+        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b):
+            now[:] = M
+            v[:n_x] = z[:n_x]
             for i in range(n_u):
                 v[n_x + i] = past[past.shape[0] - 2, i]
                 v[n_x + n_u + i] = past[past.shape[0] - 1, i]
             for i in range(n_d):
-                v[n_x + 2 * n_u + i] = z[p + i]
+                v[n_x + 2 * n_u + i] = z[n_x + i]
             for j in range(p):
-                moved = z[j] - at[j]
+                moved = z[s + j] - at[j]
                 for i in range(n_x):
                     acc = 0.0
-                    for c in range(wide_m):
+                    for c in range(columns):
                         slope = dM[j, i, c]
                         now[i, c] += slope * moved
                         acc += slope * v[c]
                     for o in range(n_y):
                         if np.isfinite(e[k, o]):
                             acc += dG[j, i, o] * e[k, o]
-                    J[i, j] = acc
+                    J[i, n_d + j] = acc
             for i in range(n_x):
                 acc = 0.0
-                for c in range(wide_m):
+                for c in range(columns):
                     acc += now[i, c] * v[c]
-                z[s + i] = acc
+                z[i] = acc
                 for j in range(n_d):
-                    J[i, p + j] = now[i, wide_m - n_d + j]
-                    W[i, n_x + j] = now[i, wide_m - n_d + j] * dist[j]
-            carry(T, whole, s, now, J, W)
-            triangle(T, s, W)
-        for i in range(y.shape[1]):
+                    J[i, j] = now[i, columns - n_d + j]
+                    G[i, j] = J[i, j] * dist[j]
+            propagate(F, now, J, G, W, w)
+        for i in range(n_y):
             e[k, i] *= io[1, n_u + i]
         if counts[K] % every == 0:
-            _spread(T, walk, f[:n])
+            _walk(F, walk, f)
             for j in range(p):
-                if abs(z[j] - at[j]) > amount:
+                if abs(z[s + j] - at[j]) > amount:
                     counts[DUE] = 1
             if counts[DUE] == 1:
                 return k + 1
@@ -205,12 +184,12 @@ def ekf_block(
 
 
 @compiled
-def _fill(q: Array, logs: Ints, place: Ints, size: Array, start: Ints, factor: Ints, D: Array, t: Array) -> None:
+def _fill(q: Array, logs: Ints, place: Ints, scale: Array, start: Ints, factor: Ints, D: Array, t: Array) -> None:
     """Evaluate the continuous-time matrices [A, B, E] T at scaled parameters: entries are products of powers."""
     for j in range(logs.size):
         t[j] = np.exp(q[j]) if logs[j] else q[j]
-    for i in range(size.size):
-        acc = size[i]
+    for i in range(scale.size):
+        acc = scale[i]
         for c in range(start[i], start[i + 1]):
             g, power = t[factor[c, 0]], factor[c, 1]
             for _ in range(abs(power)):
@@ -250,71 +229,72 @@ def _move(D: Array, x: Array, u: Array, late: Array, o: Array, fraction: float, 
 
 @compiled
 def ukf_block(
-    u: Array, y: Array, e: Array, z: Array, T: Array, logs: Ints, place: Ints, size: Array, start: Ints, factor: Ints,
+    u: Array, y: Array, e: Array, z: Array, F: Array, logs: Ints, place: Ints, scale: Array, start: Ints, factor: Ints,
     C: Array, dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, terms: int,
-    scaled: Array, work: Array,
+    scaled: Array,
 ) -> None:  # fmt: skip
     """Run the unscented filter; `scaled` holds gamma^2, the weights W0 of mean and covariance, and the fraction."""
-    n, p, n_x, n_d = z.size, logs.size, C.shape[1], dist.size
-    s, n_u, wide_w = n - n_x, u.shape[1], n_x + n_d + p + 1
+    n, p, n_x, n_d, n_u = z.size, logs.size, C.shape[1], dist.size, u.shape[1]
+    s = n_x + n_d
     square, mean_0, cov_0, fraction = scaled[0], scaled[1], scaled[2], scaled[3]
     gamma, other = np.sqrt(square), 0.5 / square
-    f, b, t, zero, point = work[0, : n + n_x], work[1, :n], work[2, : 2 * n_x + p], work[3, :n_u], work[4, :n]
-    up, still, q, o, x = work[5, :n_x], work[6, :n_x], point[:p], point[p:s], point[s:]
-    D, ends = work[7 : 7 + n_x, : n_x + n_u + n_d], work[7 + n_x : 7 + 3 * n_x, :p]
-    A, J = work[7 + 3 * n_x : 7 + 4 * n_x, :n_x], work[7 + 4 * n_x : 7 + 5 * n_x, :s]
-    W = work[7 + 5 * n_x : 7 + 6 * n_x, :wide_w]
-    for i in range(n_u):
-        zero[i] = 0.0
+    f, b, t, zero, point = np.empty(n), np.empty(n), np.empty(2 * n_x + p), np.zeros(n_u), np.empty(n)
+    up, still, x, o, q = np.empty(n_x), np.empty(n_x), point[:n_x], point[n_x:s], point[s:]
+    D, ends = np.zeros((n_x, n_x + n_u + n_d)), np.empty((2 * n_x, p))
+    A, J = np.empty((n_x, n_x)), np.empty((n_x, n_d))
+    W, w = np.empty((n_x, s + p + 1)), np.ones(s + p + 1)
     # points of the linear columns lie about the moved centre: all share its distance from the mean
     centre = cov_0 + 2.0 * other * (n - p)
     for k in range(u.shape[0]):
         counts[K] += 1
-        if _take(u[k], y[k], e[k], z, T, C, io, wide, past, counts, f, b):
+        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b):
             now, late = past[past.shape[0] - 2], past[past.shape[0] - 1]
             # the central point, and the matrices there: the step is linear in states, offsets and disturbances
-            for i in range(n):
-                point[i] = z[i]
-            _fill(q, logs, place, size, start, factor, D, t)
+            point[:] = z
+            _fill(q, logs, place, scale, start, factor, D, t)
             _move(D, x, now, late, o, fraction, terms, t)
-            for i in range(n_x):
-                up[i] = x[i]
-            for j in range(n_x + n_d):
-                for i in range(n_x):
-                    x[i] = 1.0 if i == j else 0.0
-                for i in range(n_d):
-                    o[i] = 1.0 if i == j - n_x else 0.0
+            up[:] = x
+            for j in range(s):
+                point[:s] = 0.0
+                point[j] = 1.0
                 _move(D, x, zero, zero, o, fraction, terms, t)
                 for i in range(n_x):
                     if j < n_x:
                         A[i, j] = x[i]
                     else:
-                        J[i, p + j - n_x], W[i, j] = x[i], x[i] * dist[j - n_x]
+                        J[i, j - n_x] = x[i]
             # points along the parameters' columns, two by two
             for i in range(n_x):
                 still[i] = (mean_0 + 2.0 * other * (n - p)) * up[i]
             for j in range(p):
+                away = gamma * np.sqrt(F[s + j, s + j])
                 for side in range(2):
-                    for i in range(n):
-                        point[i] = z[i] + (gamma if side == 0 else -gamma) * T[j, i]
-                    _fill(q, logs, place, size, start, factor, D, t)
+                    to = away if side == 0 else -away
+                    point[:] = z
+                    for i in range(s + j):
+                        point[i] += to * F[s + j, i]
+                    point[s + j] += to
+                    _fill(q, logs, place, scale, start, factor, D, t)
                     _move(D, x, now, late, o, fraction, terms, t)
                     for i in range(n_x):
                         ends[side * n_x + i, j] = x[i]
                         still[i] += other * x[i]
-            carry(T, p, s, A, J, W)
+            follow(F, A, J, t)
+            spread(F, A, W, w)
             for i in range(n_x):
+                for j in range(n_d):
+                    W[i, n_x + j] = J[i, j] * dist[j]
                 for j in range(p):
                     plus, minus = ends[i, j], ends[n_x + i, j]
-                    T[j, s + i] = (plus - minus) / (2.0 * gamma)
-                    W[i, n_x + n_d + j] = np.sqrt(0.5 * other) * (plus + minus - 2.0 * still[i])
+                    F[s + j, i] = (plus - minus) / (2.0 * gamma * np.sqrt(F[s + j, s + j]))
+                    W[i, s + j] = np.sqrt(0.5 * other) * (plus + minus - 2.0 * still[i])
                 x[i] = np.sqrt(abs(centre)) * (up[i] - still[i])
-                W[i, wide_w - 1] = x[i] if centre > 0.0 else 0.0
-                z[s + i] = still[i]
-            triangle(T, s, W)
-            if centre < 0.0 and not rank_one_down(T[s:, s:], x, b[:n_x]):
+                W[i, s + p] = x[i] if centre > 0.0 else 0.0
+                z[i] = still[i]
+            orthogonalise(W, w, F)
+            if centre < 0.0 and not narrow(F, x, b):
                 counts[REFUSED] += 1
         for i in range(y.shape[1]):
             e[k, i] *= io[1, n_u + i]
         if counts[K] % every == 0:
-            _spread(T, walk, f[:n])
+            _walk(F, walk, f)

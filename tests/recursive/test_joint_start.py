@@ -14,7 +14,7 @@ from ambid.recursive.joint import JointEkf, JointUkf, start_from
 from ambid.signals import multisine
 from ambid.simulate import simulate_preset
 from tests.bearing.benches import run
-from tests.recursive.joint.starts import start_of
+from tests.recursive.joint_starts import start_of
 
 RATE = 20_000.0
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from ambid.recursive.joint import JointStart
+from ambid.recursive.joint_start import JointStart
 from tests.estimation.reference import continuous
 
 LOGS = ("m", "R", "L")
@@ -76,7 +76,10 @@ class Dense:
             self.z, self.P = self.moved(z, now, late).real, J @ self.P @ J.T + noise
             return
         square = self.unscented**2 * n
-        factor = np.sqrt(square) * np.linalg.cholesky(self.P)
+        turned = np.r_[self.s : n, self.p : self.s, : self.p]  # the root is upper triangular in [x, o, q]
+        factor = np.zeros((n, n))
+        upper = np.linalg.cholesky(self.P[np.ix_(turned, turned)][::-1, ::-1])[::-1, ::-1]
+        factor[np.ix_(turned, turned)] = np.sqrt(square) * upper
         points = np.array([self.z, *(self.z + factor.T), *(self.z - factor.T)])
         weights = np.full(2 * n + 1, 0.5 / square)
         weights[0] = 1 - n / square

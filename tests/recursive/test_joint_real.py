@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.job.physical import identify, load
-from ambid.recursive.joint import JointEkf, JointUkf, rates_of
+from ambid.recursive.joint import JointEkf, JointUkf
+from ambid.recursive.joint_start import rates_of
 from ambid.rig import load_rig
 from tests.real.test_maglev import AXIS_RIG, MAGLEV, written
 

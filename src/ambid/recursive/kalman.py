@@ -1,7 +1,7 @@
-"""Discrete Kalman filter of a linear state, in square-root form, for samples and blocks with gaps.
+"""Discrete Kalman filter of a linear state over the square-root core, for samples and blocks with gaps.
 
-x⁺ = A x + B u + w, y = C x + v. The covariance is carried as a triangular root (array form), so that it is symmetric
-and positive by construction however long it runs (Kailath, Sayed and Hassibi 2000, ch. 12).
+x⁺ = A x + B u + w, y = C x + v. The covariance is carried in factors, so that it is symmetric and positive by
+construction however long it runs.
 """
 
 from __future__ import annotations
@@ -15,25 +15,52 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.filters.streaming import as_block, check_channels
+from ambid.recursive.estimator import as_block, check_channels
+from ambid.recursive.square_root import covariance_of, factors_of, root_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LinearState:
-    """A sampled linear state and its noises."""
+    """A sampled linear state and its noises.
 
-    A: Array  # (n_states, n_states)
-    B: Array  # (n_states, n_inputs), no columns where there is no input
-    C: Array  # (n_outputs, n_states)
-    Q: Array  # (n_states, n_states), covariance of the process noise of one sample, positive semidefinite
-    R: Array  # (n_outputs, n_outputs), covariance of the measurement noise, positive definite; need not be diagonal
+    Attributes
+    ----------
+    A : ndarray, shape (n_states, n_states)
+    B : ndarray, shape (n_states, n_inputs)
+        No columns where there is no input.
+    C : ndarray, shape (n_outputs, n_states)
+    Q : ndarray, shape (n_states, n_states)
+        Covariance of the process noise of one sample, positive semidefinite.
+    R : ndarray, shape (n_outputs, n_outputs)
+        Covariance of the measurement noise, positive definite; need not be diagonal.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    Q: Array
+    R: Array
 
 
 def linear_state(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, *, B: ArrayLike | None = None) -> LinearState:
     """Check and keep the matrices of a sampled state.
 
-    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `Q`: (n_states, n_states); `R`: (n_outputs, n_outputs); `B`:
-    (n_states, n_inputs).
+    Parameters
+    ----------
+    A : array_like, shape (n_states, n_states)
+    C : array_like, shape (n_outputs, n_states)
+    Q : array_like, shape (n_states, n_states)
+    R : array_like, shape (n_outputs, n_outputs)
+    B : array_like, shape (n_states, n_inputs), optional
+
+    Returns
+    -------
+    LinearState
+
+    Raises
+    ------
+    EstimationError
+        If shapes do not fit, a number is not finite, Q is not positive semidefinite or R not positive definite.
     """
     a, c, q, r = (np.atleast_2d(np.array(M, dtype=np.float64)) for M in (A, C, Q, R))
     n, m = a.shape[0], c.shape[0]
@@ -123,25 +150,21 @@ class KalmanFilter:
         start_covariance: ArrayLike | None = None,
         give: Literal["filtered", "predicted"] = "filtered",
     ) -> None:
-        from ambid.recursive.filters._kernels import state_scan, two_state_scan
+        from ambid.recursive.kalman_kernels import state_scan
 
         if give not in ("filtered", "predicted"):
             raise EstimationError(f"Kalman filter: give {give!r}; it is 'filtered' or 'predicted'. Choose one of them")
         self.model = model
         n, m, n_u = model.A.shape[0], model.C.shape[0], model.B.shape[1]
-        p = max(n, m)
         self._n, self._m, self._n_u = n, m, n_u
-        self._model = np.zeros((n + m, n + n_u + p))
-        self._model[:n, : n + n_u] = np.hstack([model.A, model.B])
-        self._model[:n, n + n_u : n + n_u + n] = _root(model.Q)
-        self._model[n:, :n] = model.C
-        self._model[n:, n + n_u : n + n_u + m] = np.linalg.cholesky(model.R)
-        self._memory = np.zeros((n + m, n + 1 + m))
-        self._memory[:n, :n] = _start_root(model, start_covariance)
-        self._memory[:n, n] = 0.0 if start is None else _vector(start, n)
-        self._work = np.zeros((n + m, 2 * n + p + m))
+        parts = (model.A, model.B, model.C, root_of(model.Q), model.R)
+        self._model = np.concatenate([np.ravel(part) for part in parts])
+        self._memory = np.zeros(n * n + n + m * (2 * n + m + 2))
+        self._memory[: n * n] = factors_of(_start(model, start_covariance)).ravel()
+        self._memory[n * n :][:n] = 0.0 if start is None else _vector(start, n)
+        self._work = np.zeros(3 * n * n + 3 * n)
         self._tally = np.array([0.0, float(give == "predicted"), 0.0, 0.0, 0.0])
-        self._scan = two_state_scan if (n, m, n_u) == (2, 1, 0) else state_scan
+        self._scan = state_scan
         self._none = np.empty((1, 0))
         self._one = (np.empty((1, m)), np.empty((1, n)), np.empty((1, m)))
         self.n_samples = 0
@@ -184,13 +207,12 @@ class KalmanFilter:
     @property
     def state(self) -> Array:
         """Predicted state at the next sample, shape (n_states,)."""
-        return self._memory[: self._n, self._n].copy()
+        return self._memory[self._n**2 :][: self._n].copy()
 
     @property
     def covariance(self) -> Array:
         """Covariance of the error of `state`, shape (n_states, n_states)."""
-        S = np.tril(self._memory[: self._n, : self._n])
-        return np.asarray(S @ S.T)
+        return covariance_of(self._memory[: self._n**2].reshape(self._n, self._n))
 
     @property
     def filtered_covariance(self) -> Array:
@@ -238,33 +260,32 @@ class KalmanFilter:
         return as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
 
 
-def _root(Q: Array) -> Array:
-    values, vectors = np.linalg.eigh(Q)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _start_root(model: LinearState, covariance: ArrayLike | None) -> Array:
+def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
+    """Return the covariance (n_states, n_states) to begin with, the stationary one where none is given."""
     if covariance is None:
         from ambid.estimation.innovations import predictor_gain
 
         try:
             P = predictor_gain(model.A, model.C, model.Q, model.R).P
-            return np.asarray(np.linalg.cholesky(P + 0.0))
+            np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             raise EstimationError(
                 "Kalman filter: there is no stationary filter with a covariance that is positive definite: a state is "
                 "not seen by the outputs, or not moved by the noise. Give start_covariance, or another model"
             ) from None
+        return np.asarray(P)
     n = model.A.shape[0]
     P = np.array(covariance, dtype=np.float64).reshape(-1)
     if P.size != n * n:
         raise EstimationError(f"Kalman filter: start_covariance has {P.size} numbers for {n} states. Give {n} x {n}")
+    P = P.reshape(n, n)
     try:
-        return np.asarray(np.linalg.cholesky(P.reshape(n, n)))
+        np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
         raise EstimationError(
             "Kalman filter: start_covariance is not positive definite. Give every state a variance over 0"
         ) from None
+    return P
 
 
 def _vector(start: ArrayLike, n: int) -> Array:

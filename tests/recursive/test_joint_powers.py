@@ -11,7 +11,7 @@ from ambid.errors import EstimationError
 from ambid.physics.linear_model import StateSpace
 from ambid.physics.models import model, model_names
 from ambid.physics.one_axis import OneAxis
-from ambid.recursive.joint.powers import powers_of
+from ambid.recursive.joint import powers_of
 
 
 @pytest.mark.parametrize("name", model_names())

@@ -1,0 +1,523 @@
+"""Joint Kalman filters of plant states, physical parameters and offsets at once: extended and unscented.
+
+z = [x, o, q] with x+ = A(q) x + B(q) u + E(q) (o + w), y = C x + v. The extended filter's matrices are exact at a
+linearisation point and first-order about it. Points of the scaled unscented transform go through the plant's own A(q)
+by the Taylor series of its matrix exponential (no linearisation point), so that mean and covariance keep their
+second-order terms (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.innovations import gain_derivatives, predictor_gain
+from ambid.estimation.scaling import scales_for
+from ambid.physics.discretise import DiscreteSpace, discretise
+from ambid.physics.linear_model import LinearModel, StateSpace
+from ambid.recursive.estimator import as_blocks
+from ambid.recursive.joint_start import JointStart, parameter_scales, start_from
+from ambid.recursive.square_root import covariance_of, factors_of
+
+if TYPE_CHECKING:
+    from ambid.estimation.estimate import Estimate
+
+Ints = NDArray[np.int64]
+
+EVERY = 32  # samples between two steps of the random walk, and two looks at the linearisation point
+_SETTLED, _OFF = 4096, 0.1  # samples before a level of the innovations is judged, and how far off it may be
+_WIDE = 1e4  # units of the states, about their sensor noise: what is known of a state that is lost
+_LARGEST = 0.1  # a number's walk rests while its relative standard deviation is above this, and above its start
+_CURVED = 0.1  # of the squared relative error at the start: what linearising may leave
+_AMOUNT = 2e-3  # relative movement of a parameter after which the matrices are renewed: what is left is its square
+_MOST_TERMS = 40
+_REST = 1e-15  # of the Taylor series, relative
+
+
+class JointFilter:
+    """A Kalman filter of plant states, parameters and offsets at once, in square-root form; see its two kinds.
+
+    Parameters that must be positive are carried as logarithms: they cannot leave, and no step has to be refused.
+    Parameters and offsets make a step of their random walk every 32 samples, counted from the first; the walk of a
+    number rests while its standard deviation is over a tenth of its size (or over that at the start), so that the
+    covariance does not wind up where nothing excites.
+
+    A sample of which one output is missing is used with the other. One without any output moves only the state. One
+    without input is rejected, and the state begins anew from the next outputs, as it does after 32 samples without
+    outputs and after an innovation of both outputs that no noise makes (a thousand standard deviations). Smaller
+    errors of sensors are taken for noise: screen the samples before.
+
+    `names`: parameters, then offsets of the disturbances.
+    """
+
+    def __init__(self, start: JointStart) -> None:
+        self.start, self.names = start, start.names
+        model, p = start.model, len(start.free)
+        n_d = len(model.disturbances)
+        sensor = np.array([start.sensor_sd[r] for r in model.outputs])
+        disturbance = np.array([start.disturbance_sd[r] for r in model.disturbances])
+        scales = scales_for(model, start.values, np.ones(len(model.inputs)), sensor, start.rate_hz)
+        self._state, self._disturbance = scales.state, scales.disturbance
+        positive = {s.name for s in model.parameters if s.positive}
+        self._logs = np.array([k in positive for k in start.free])
+        self._size = parameter_scales(start)
+        self._values0 = np.array([start.values[k] for k in start.free])
+        unit = np.r_[self._size, scales.disturbance]
+        roles = (*model.inputs, *model.outputs)
+        self._io = np.array(
+            [
+                [start.operating_point.get(r, 0.0) for r in roles],
+                np.r_[np.ones(len(model.inputs)), sensor],
+                np.ones(len(roles)),
+            ]
+        )
+        self._C = np.ascontiguousarray(model.matrices(start.values).C * scales.state / sensor[:, None])
+        self._dist = disturbance / scales.disturbance
+        self._wide = np.full(len(model.states), _WIDE)
+        whole = int(np.floor(start.delay))
+        self._fraction = float(start.delay - whole)
+        self._past = np.zeros((whole + 2, len(model.inputs)))
+        s = len(model.states) + n_d
+        self._z = np.r_[np.zeros(s), np.where(self._logs, 0.0, self._values0 / self._size)]
+        given = np.array([start.offset_sd.get(r, 0.0) for r in model.disturbances])
+        offset = np.where(given > 0, given, np.where(disturbance > 0, 10 * disturbance, scales.disturbance))
+        P = np.diag(np.r_[self._wide, offset / scales.disturbance, np.zeros(p)] ** 2)
+        P[s:, s:] = start.covariance / np.outer(self._size, self._size)
+        self._F = factors_of(P)
+        rates = np.array([start.rates.get(k, 0.0) for k in self.names]) / unit * np.sqrt(EVERY / start.rate_hz)
+        rest = np.maximum(np.sqrt(np.diag(P)), np.r_[np.zeros(s), np.full(p, _LARGEST)])
+        self._walk = np.array([np.r_[np.zeros(s - n_d), rates[p:], rates[:p]], rest])
+        self._counts = np.zeros(9, dtype=np.int64)
+        self._counts[5] = 1
+
+    @classmethod
+    def from_estimate(
+        cls,
+        estimate: Estimate,
+        rate_hz: float,
+        *,
+        rates: Mapping[str, float] | None = None,
+        offset_sd: Mapping[str, float] | None = None,
+        sensor_sd: Mapping[str, float] | None = None,
+        disturbance_sd: Mapping[str, float] | None = None,
+        **settings: Any,
+    ) -> Self:
+        """Return a filter that starts from an off-line estimate.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            Parameters, covariance, delay, noise levels and operating point are taken from it.
+        rate_hz : float
+            Of the samples that will come.
+        rates, offset_sd : Mapping[str, float], optional
+            As in `JointStart`.
+        sensor_sd, disturbance_sd : Mapping[str, float], optional
+            In place of the estimate's.
+        **settings : object
+            Of the filter.
+
+        Returns
+        -------
+        JointFilter
+
+        Raises
+        ------
+        EstimationError
+            If the estimate failed, is of another rate, has its noise as a free gain and no levels are given, or breaks
+            a rule of `JointStart`.
+        """
+        start = start_from(
+            estimate, rate_hz, rates=rates, offset_sd=offset_sd, sensor_sd=sensor_sd, disturbance_sd=disturbance_sd
+        )
+        return cls(start, **settings)
+
+    @property
+    def estimate(self) -> Array:
+        """Parameters and offsets, shape (p,), SI; a copy."""
+        q = self._scaled_parameters
+        q = np.where(self._logs, self._values0 * np.exp(np.where(self._logs, q, 0.0)), q * self._size)
+        return np.asarray(np.r_[q, self._z[self._wide.size : -q.size] * self._disturbance])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of `estimate`, shape (p, p), SI; a copy. To first order where a logarithm is carried."""
+        n, p = self._wide.size, self._logs.size
+        last = np.roll(np.arange(len(self.names)), p)  # offsets stand before the parameters
+        unit = self._unit()
+        return np.asarray(covariance_of(self._F[n:, n:])[np.ix_(last, last)] * np.outer(unit, unit))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters of the model, those that stand still too, SI."""
+        return {**self.start.values, **dict(zip(self.start.free, self.estimate.tolist(), strict=False))}
+
+    @property
+    def state(self) -> Array:
+        """Plant state before the next sample, shape (n_states,), SI deviations from the operating point; a copy."""
+        return np.asarray(self._z[: self._wide.size] * self._state)
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used, those included that only filled the memory of inputs."""
+        return int(self._counts[1])
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples without input, without any output, or with an absurd innovation."""
+        return int(self._counts[2])
+
+    @property
+    def n_partial(self) -> int:
+        """Used samples of which an output was missing."""
+        return int(self._counts[3])
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the innovations over what the filter expects of them, over about 1000 samples.
+
+        One where model and noise levels are right. It does not show every wrong estimate: sixty thousand innovations
+        can be ordinary to a per cent and yet speak against an estimate by many standard deviations.
+        """
+        return float(np.sqrt(np.mean(self._io[2, self._past.shape[1] :])))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader has to know before using the numbers; empty where nothing is known against them."""
+        error = self.error
+        if self.n_used < _SETTLED or abs(error - 1.0) < _OFF:
+            return ()
+        kind = "small" if error > 1.0 else "large"
+        return (
+            f"innovations are {error:.2f} times what the filter expects: its noise levels are too {kind}, and its "
+            "standard deviations with them; where the plant is hardly excited, its parameters are moved too",
+        )
+
+    @property
+    def _scaled_parameters(self) -> Array:
+        """View of the parameters as they are carried, shape (n_free,)."""
+        return np.asarray(self._z[-self._logs.size :])
+
+    def _relative_sd(self) -> Array:
+        """Standard deviation of the parameters as they are carried, shape (n_free,)."""
+        s = self._z.size - self._logs.size
+        return np.asarray(np.sqrt(np.diag(covariance_of(self._F[s:, s:]))))
+
+    def _unit(self) -> Array:
+        """Derivative of `estimate` by the scaled numbers."""
+        q = np.where(self._logs, self._scaled_parameters, 0.0)
+        return np.asarray(np.r_[np.where(self._logs, self._values0 * np.exp(q), self._size), self._disturbance])
+
+    def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+            SI; a number, or (n_samples,), where there is one input.
+        outputs : array_like, shape (n_outputs,), or (n_samples, n_outputs) for a block
+            SI; a number, or (n_samples,), where there is one output.
+
+        Returns
+        -------
+        ndarray, shape of `outputs`
+            Innovations, made before each sample was used; NaN where nothing was predicted.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        u, y, shape = as_blocks("joint filter", inputs, outputs, self._past.shape[1], self._C.shape[0])
+        e = np.empty(y.shape)
+        self._run(u, y, e)
+        return e.reshape(shape)
+
+    def _run(self, u: Array, y: Array, e: Array) -> None:
+        raise NotImplementedError
+
+    def copy(self) -> Self:
+        """Return an independent filter in the same state."""
+        twin = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(twin, name, value.copy())
+        return twin
+
+
+class JointEkf(JointFilter):
+    """Joint extended Kalman filter.
+
+    Consistent under feedback where the noise levels are right and the start lies where the plant is about linear in its
+    parameters: an off-line estimate is such a start. It leaves out how its own gain depends on the parameters, and is
+    therefore biased where the levels are wrong and the noise itself is what moves the plant (Ljung 1979): on the
+    unstable bearing without excitation, a force level three times too low moves the mass by 12 % while 2 % are claimed;
+    with excitation far above the noise a factor of ten does not move it. Where the start is wrong by more than the
+    plant is linear (20 % on that bearing, 5 % on a lightly damped resonance), it settles beside the truth and claims a
+    standard deviation that is far too small; `warnings` says so where it must be feared. `JointUkf` keeps the second
+    order. The recursive prediction error method of `ambid.track.rpem`, whose noise is estimated off-line with the
+    parameters and whose gain knows of them, is the one to prefer.
+
+    Parameters
+    ----------
+    start : JointStart
+    corrected : bool
+        Add the dependence of the stationary gain on the parameters to the sensitivity of the state (Ljung 1979). The
+        filter is then a recursive prediction error method with given noise levels: where these are right, standard
+        deviations shrink by what the colour of the noise says (a few per cent, a fifth for the mass without
+        excitation); where they are wrong the parameters make up for them: disturbances ten times too large move the
+        mass by 21 % even with excitation. Hence only for levels that are known.
+
+    Attributes
+    ----------
+    start : JointStart
+    names : tuple of str
+        Parameters, then offsets of the disturbances.
+    n_renewed : int
+        Times that the matrices were renewed at a new linearisation point.
+    """
+
+    def __init__(self, start: JointStart, *, corrected: bool = False) -> None:
+        from ambid.recursive.joint_kernels import ekf_block
+
+        super().__init__(start)
+        self._kernel = ekf_block
+        self._corrected = corrected
+        n, n_y, p = self._wide.size, self._C.shape[0], self._logs.size
+        wide = n + 2 * self._past.shape[1] + self._dist.size
+        self._at = self._scaled_parameters.copy()
+        self._begun = self._relative_sd()
+        self._M, self._dM, self._dG = np.zeros((n, wide)), np.zeros((p, n, wide)), np.zeros((p, n, n_y))
+        self.n_renewed = -1
+        self._renew()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader has to know before using the numbers; empty where nothing is known against them.
+
+        A relative error d at the start leaves an error of order d^2 in the first linearisations, which the filter takes
+        for measured. On four benches it came to a tenth of that at most: once less is claimed, it may be what is left.
+        """
+        now = self._relative_sd()
+        lost = _CURVED * self._begun**2 / now
+        worst = int(np.argmax(lost))
+        if lost[worst] <= 1.0:
+            return super().warnings
+        return (
+            f"{self.start.free[worst]} began with a standard deviation of {self._begun[worst]:.2%} and is claimed to "
+            f"{now[worst]:.2%}: linearising about the start may have left an error of {lost[worst] * now[worst]:.2%}. "
+            "Start from an off-line estimate, or use JointUkf",
+            *super().warnings,
+        )
+
+    def _run(self, u: Array, y: Array, e: Array) -> None:
+        done = 0
+        while True:
+            done = self._kernel(
+                done, u, y, e, self._z, self._F, self._at, self._M, self._dM, self._dG, self._C, self._dist, self._walk,
+                self._io, self._wide, self._past, self._counts, EVERY, _AMOUNT,
+            )  # fmt: skip
+            if self._counts[6]:
+                self._renew()
+                self._counts[6] = 0
+            if done == u.shape[0]:
+                return
+
+    def _renew(self) -> None:
+        """Put the linearisation point at the estimate: exact matrices, exact derivatives by the scaled parameters."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            now, slopes = self._discrete()
+        if not all(np.isfinite(d.A).all() and np.isfinite(d.E).all() for d in (now, *slopes)):
+            return  # an estimate beyond all numbers: the last matrices stay, innovations say the rest
+        self._at[:] = self._scaled_parameters
+        self._M[:] = np.hstack([now.A, now.B, now.B_late, now.E])
+        for j, d in enumerate(slopes):
+            self._dM[j] = np.hstack([d.A, d.B, d.B_late, d.E])
+        if self._corrected:
+            self._correct(now, slopes)
+        self.n_renewed += 1
+
+    def _discrete(self) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
+        """Discrete matrices at the estimate and their derivatives, in scaled units."""
+        model, theta, unit = self.start.model, self.values, self._unit()
+        spaces = [model.matrices(theta), *(model.derivative(theta, name) for name in self.start.free)]
+        scaled = [
+            StateSpace(
+                A=k * s.A * self._state / self._state[:, None],
+                B=k * s.B / self._state[:, None],
+                E=k * s.E * self._disturbance / self._state[:, None],
+                C=s.C,
+            )
+            for k, s in zip(np.r_[1.0, unit[: len(self.start.free)]], spaces, strict=True)
+        ]
+        now, slopes = discretise(scaled[0], 1.0 / self.start.rate_hz, fraction=self._fraction, derivatives=scaled[1:])
+        return now, slopes[: len(self.start.free)]
+
+    def _correct(self, now: DiscreteSpace, slopes: tuple[DiscreteSpace, ...]) -> None:
+        """Sensitivity of the stationary gain: of K = A K_f the filter sees dA K_f already, A dK_f is what it lacks."""
+        power = self._dist**2
+        try:
+            at = predictor_gain(now.A, self._C, (now.E * power) @ now.E.T, np.eye(self._C.shape[0]))
+        except (np.linalg.LinAlgError, ValueError):
+            return  # no stationary gain here (no disturbance, say): the last sensitivity, at first none, stays
+        dA, dE = np.array([d.A for d in slopes]), np.array([d.E for d in slopes])
+        half = (dE * power) @ now.E.T
+        dR = np.zeros((len(slopes), *at.S.shape))
+        dK = gain_derivatives(now.A, self._C, at, dA, half + np.swapaxes(half, 1, 2), dR)
+        self._dG[:] = dK - dA @ np.linalg.solve(now.A, at.K)
+
+
+class JointUkf(JointFilter):
+    """Joint unscented Kalman filter.
+
+    Of the augmented state only the parameters enter nonlinearly, so that points are needed along their columns alone;
+    along the others (states, offsets) the points of the full transform are known in closed form, and the result is that
+    of all 2 n + 1 points. Measurements are linear and are taken in exactly. It converges from farther than `JointEkf`
+    (5 % on a lightly damped resonance) at about a quarter of its speed; near the truth they agree to a hundredth of a
+    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.track.rpem`.
+
+    Parameters
+    ----------
+    start : JointStart
+    alpha : float
+        Spread of the points: sqrt(n) alpha standard deviations, n the length of the augmented state. At 1 all weights
+        are positive; well below, the covariance is downdated, and a downdate that leaves nothing positive is left out
+        and counted.
+    beta : float
+        What is known of the distribution's kurtosis; 2 for a Gaussian one.
+
+    Attributes
+    ----------
+    start : JointStart
+    names : tuple of str
+        Parameters, then offsets of the disturbances.
+
+    Raises
+    ------
+    EstimationError
+        If alpha is not positive, the model is no product of powers, or its sampling too slow for the series.
+    """
+
+    def __init__(self, start: JointStart, *, alpha: float = 1.0, beta: float = 2.0) -> None:
+        from ambid.recursive.joint_kernels import ukf_block
+
+        super().__init__(start)
+        if not (np.isfinite(alpha) and alpha > 0 and np.isfinite(beta)):
+            raise EstimationError(f"alpha {alpha} must be positive and beta {beta} a number. Correct them")
+        self._kernel = ukf_block
+        square = alpha**2 * self._z.size
+        mean_0 = 1.0 - self._z.size / square
+        self._scaled = np.array([square, mean_0, mean_0 + 1.0 - alpha**2 + beta, self._fraction])
+        self._logs = self._logs.astype(np.int64)
+        self._place, self._entry, self._first, self._factor = self._matrices()
+        self._terms = self._series()
+
+    @property
+    def n_refused(self) -> int:
+        """Downdates of the covariance that were left out because nothing positive would have been left."""
+        return int(self._counts[7])
+
+    def _matrices(self) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]:
+        """[A, B, E] T in scaled units as products of powers of the followed numbers; the others are taken in."""
+        model, start = self.start.model, self.start
+        found, names = powers_of(model), [p.name for p in model.parameters]
+        columns = np.r_[self._state, np.ones(len(model.inputs)), self._disturbance]
+        size = found.size * columns[found.place[:, 1]] / self._state[found.place[:, 0]] / start.rate_hz
+        # a followed number stands in units of its start (a logarithm) or of its size
+        unit = dict(zip(start.free, np.where(self._logs, self._values0, self._size), strict=True))
+        kept, first = [], [0]
+        for i in range(size.size):
+            for j, power in found.factor[found.start[i] : found.start[i + 1]]:
+                name = names[j]
+                if name in unit:
+                    size[i] *= unit[name] ** float(power)
+                    kept.append((start.free.index(name), power))
+                else:
+                    size[i] *= start.values[name] ** float(power)
+            first.append(len(kept))
+        factor = np.array(kept, dtype=np.int64).reshape(-1, 2)
+        return found.place, size, np.array(first, dtype=np.int64), factor
+
+    def _series(self) -> int:
+        """Terms of the Taylor series that leave nothing, with parameters twice as large as at the start."""
+        n = self._wide.size
+        A = np.zeros((n, n))
+        for i, (row, column) in enumerate(self._place):
+            if column < n:
+                q = self._factor[self._first[i] : self._first[i + 1]]
+                start = np.where(self._logs, 1.0, self._scaled_parameters)
+                A[row, column] = self._entry[i] * np.prod(start[q[:, 0]] ** q[:, 1].astype(float))
+        norm = 2.0 * float(np.abs(A).sum(axis=1).max())
+        term = 1.0
+        for order in range(1, _MOST_TERMS + 1):
+            term *= norm / order
+            if order > norm and term < _REST:
+                return order
+        raise EstimationError(
+            f"at {self.start.rate_hz:g} Hz the plant moves too far in a sample (|A| T = {norm / 2:.3g}) for the "
+            "unscented filter's series. Use JointEkf, or sample faster"
+        )
+
+    def _run(self, u: Array, y: Array, e: Array) -> None:
+        self._kernel(
+            u, y, e, self._z, self._F, self._logs, self._place, self._entry, self._first, self._factor, self._C,
+            self._dist, self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._scaled,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Powers:
+    """Entries of [A, B, E] that are not zero, each `size` times parameters to their powers."""
+
+    place: Ints  # (n_entries, 2), row and column
+    size: Array  # (n_entries,)
+    start: Ints  # (n_entries + 1,), factors of entry i are start[i] <= c < start[i + 1]
+    factor: Ints  # (n_factors, 2), place of a parameter, and its exponent
+
+    def matrix(self, values: Array, shape: tuple[int, int]) -> Array:
+        """Return [A, B, E] at parameters.
+
+        `values`: (n_parameters,).
+        """
+        out = np.zeros(shape)
+        for i, (row, column) in enumerate(self.place):
+            factors = self.factor[self.start[i] : self.start[i + 1]]
+            out[row, column] = self.size[i] * np.prod(values[factors[:, 0]] ** factors[:, 1].astype(float))
+        return out
+
+
+def powers_of(model: LinearModel) -> Powers:
+    """Return the matrices of a model as products of powers, in SI units and the order of the model's parameters."""
+    names = [p.name for p in model.parameters]
+    point = np.linspace(1.5, 2.5, len(names))
+    here = _joined(model.matrices(dict(zip(names, point, strict=True))))
+    slopes = np.array([_joined(model.derivative(dict(zip(names, point, strict=True)), name)) for name in names])
+    rows, columns = np.nonzero(here)
+    exponents = np.rint(point[:, None] * slopes[:, rows, columns] / here[rows, columns]).astype(np.int64)
+    size = here[rows, columns] / np.prod(point[:, None] ** exponents, axis=0)
+    counted = [[(j, int(k)) for j, k in enumerate(column) if k] for column in exponents.T]
+    found = Powers(
+        place=np.column_stack([rows, columns]).astype(np.int64),
+        size=size,
+        start=np.cumsum([0, *map(len, counted)]).astype(np.int64),
+        factor=np.array([pair for entry in counted for pair in entry], dtype=np.int64).reshape(-1, 2),
+    )
+    for other in (point[::-1].copy(), -0.7 * point, 3.1 * point**2):
+        exact = _joined(model.matrices(dict(zip(names, other, strict=True))))
+        if not np.allclose(found.matrix(other, here.shape), exact, rtol=1e-12, atol=0.0):
+            raise EstimationError(
+                f"the matrices of model {model.name!r} are not products of powers of its parameters; the unscented "
+                "filter wants that. Use JointEkf"
+            )
+    return found
+
+
+def _joined(space: StateSpace) -> Array:
+    return np.hstack([space.A, space.B, space.E])

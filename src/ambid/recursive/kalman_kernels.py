@@ -1,0 +1,301 @@
+"""Compiled recursions of the streaming filters: one pass over a block, state moved along in place.
+
+A value that is not finite is missing: the filter predicts over it. Every recursion returns how many were missing.
+"""
+
+from __future__ import annotations
+
+from math import cos, isfinite, sin, sqrt
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+from ambid.recursive.square_root_kernels import project, propagate, shrink, variance, widen
+
+_SAME = 2e-15  # relative change of a root of a covariance that is rounding
+
+
+@compiled
+def _begin(y: Array, out: Array, j: int, x: float, first: float) -> tuple[int, float]:
+    """Pass over what is missing before the first sample, which gives the state where none was given (x is NaN)."""
+    k = 0
+    while x != x and k < y.shape[0]:
+        if isfinite(y[k, j]):
+            x = first * y[k, j]
+        else:
+            out[k, j] = x
+            k += 1
+    return k, x
+
+
+@compiled(fastmath={"contract"})
+def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
+    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x. `state` (m, 1)."""
+    decay, forward, alone, first = constants
+    missing = 0
+    for j in range(y.shape[1]):
+        begun, x = _begin(y, out, j, state[j, 0], first)
+        missing += begun
+        for k in range(begun, y.shape[0]):
+            v = y[k, j]  # before out, which may be the same array
+            out[k, j] = x
+            if isfinite(v):
+                x = decay * x + forward * v
+            else:
+                x *= alone
+                missing += 1
+        state[j, 0] = x
+    return missing
+
+
+@compiled(fastmath={"contract"})
+def riccati_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
+    """Kalman-Bucy filter whose variance follows the Riccati equation exactly over each sample. `state` (m, 2): x, S.
+
+    With g = c²/r, v² = a² + g w² q, t = tanh(v T)/v: V = 1 - a t + g S t is what exp(∫ (g S - a)) comes to, apart from
+    cosh, and S+ = (w² q t + S (1 + a t))/V. Both stay positive.
+    """
+    a, g, drive, per_c, t, sech, area, alone, far = constants
+    missing = 0
+    for j in range(y.shape[1]):
+        begun, x = _begin(y, out, j, state[j, 0], per_c)
+        S = state[j, 1]
+        missing += begun
+        for k in range(begun, y.shape[0]):
+            v = y[k, j]  # before out, which may be the same array
+            out[k, j] = x
+            if isfinite(v):
+                short = 1.0 / (1.0 - a * t + g * S * t)
+                level = v * per_c  # the state that this sample points to, held
+                x = level + short * (sech * (x - level) + a * level * (t + (g * S - a) * area))
+                S = (drive * t + S * (1.0 + a * t)) * short
+            else:
+                x *= alone
+                S = alone * alone * S + far
+                missing += 1
+        state[j, 0], state[j, 1] = x, S
+    return missing
+
+
+@compiled(fastmath={"contract"})
+def scalar_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
+    """Discrete scalar Kalman filter. `state` (m, 3): predicted x and P, whether P has stopped changing."""
+    rho, c, q, r, predicted = constants
+    missing = 0
+    for j in range(y.shape[1]):
+        begun, x = _begin(y, out, j, state[j, 0], 1.0 / c)
+        missing += begun
+        P, settled = state[j, 1], state[j, 2] > 0.0
+        gain = c * P / (c * c * P + r)
+        for k in range(begun, y.shape[0]):
+            v = y[k, j]
+            if isfinite(v):
+                if settled:
+                    now = x + gain * (v - c * x)
+                else:
+                    s = 1.0 / (c * c * P + r)
+                    gain = c * P * s
+                    now = x + gain * (v - c * x)
+                    new = rho * rho * (P * r * s) + q
+                    settled = abs(new - P) <= _SAME * P
+                    P = new
+            else:
+                now = x
+                P = rho * rho * P + q
+                settled = False
+                missing += 1
+            out[k, j] = x if predicted > 0.0 else now
+            x = rho * now
+        state[j, 0], state[j, 1], state[j, 2] = x, P, 1.0 if settled else 0.0
+    return missing
+
+
+@compiled(fastmath={"contract"})
+def state_scan(
+    y: Array, u: Array, out: Array, innovations: Array, model: Array, memory: Array, work: Array, tally: Array
+) -> None:
+    """Kalman filter over the square-root core: outputs one by one, what their noises have in common taken off first.
+
+    `model`: A, B, C, G with G Gᵀ = Q, and R, one behind the other. `memory`: factors of the covariance, predicted
+    state; L with L Lᵀ = R, H = L⁻¹ C, gains and variances of the whitened outputs of the last sample. `tally`: whether
+    the covariance has stopped changing, whether predictions are wanted, values missing, values used, their squared
+    normalised innovations. `innovations` gets y - C x, or NaN.
+    """
+    (n_samples, m), n, n_u = y.shape, out.shape[1], u.shape[1]
+    A, at = model[: n * n].reshape(n, n), n * n
+    B, at = model[at : at + n * n_u].reshape(n, n_u), at + n * n_u
+    C, at = model[at : at + m * n].reshape(m, n), at + m * n
+    G, R = model[at : at + n * n].reshape(n, n), model[at + n * n :].reshape(m, m)
+    F, x = memory[: n * n].reshape(n, n), memory[n * n : n * n + n]
+    rest = memory[n * n + n :].reshape(m, 2 * n + m + 2)
+    W, w = work[: 2 * n * n].reshape(n, 2 * n), work[2 * n * n : 2 * n * n + 2 * n]
+    f, before = work[2 * n * n + 2 * n :][:n], work[2 * n * n + 3 * n :].reshape(n, n)
+    J, settled, predicted, k = np.empty((n, 0)), tally[0] > 0.0, tally[1] > 0.0, 0
+    while k < n_samples:
+        if settled and n == 2 and m == 1 and n_u == 0:
+            k = _steady(k, y, out, innovations, A, C, x, rest, predicted, tally)
+            if k == n_samples:
+                break
+        seen = 0
+        for i in range(m):
+            e = y[k, i]
+            for j in range(n):
+                e -= C[i, j] * x[j]
+            innovations[k, i] = e if isfinite(e) else np.nan
+            seen += isfinite(e)
+        tally[2] += m - seen
+        tally[3] += seen
+        if predicted:
+            out[k] = x
+        steady = settled and seen == m
+        tally[4] += _correct(innovations[k], C, R, F, x, rest, f, steady)
+        if not predicted:
+            out[k] = x
+        for i in range(n):
+            f[i] = 0.0
+            for j in range(n):
+                f[i] += A[i, j] * x[j]
+            for j in range(n_u):
+                f[i] += B[i, j] * u[k, j]
+        x[:] = f
+        if not steady:
+            propagate(F, A, J, G, W, w)
+            settled = seen == m
+            for j in range(n):
+                settled = settled and abs(F[j, j] - before[j, j]) <= 2.0 * _SAME * F[j, j]
+                for i in range(j):
+                    change = F[j, i] - before[j, i]
+                    settled = settled and F[j, j] * change * change <= _SAME * _SAME * variance(F, i)
+            before[:] = F
+        k += 1
+    tally[0] = 1.0 if settled else 0.0
+
+
+@compiled(fastmath={"contract"})
+def _correct(e: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: Array, steady: bool) -> float:
+    """x += K e of what was measured, with the gains of before where these are steady; return eᵀ S⁻¹ e.
+
+    A row of `rest` holds one of L, of H = L⁻¹ C and of the gains P Hᵀ, and the variance of its whitened innovation.
+    """
+    (m, n), row, total, one = C.shape, 0, 0.0, 1.0
+    for i in range(m):
+        if not isfinite(e[i]):
+            continue
+        own = rest[row]
+        h, gain = own[m : m + n], own[m + n : m + 2 * n]
+        if not steady:
+            h[:] = C[i]
+            before, left = 0, R[i, i]
+            for j in range(i):
+                if isfinite(e[j]):
+                    v = R[i, j]
+                    for c in range(before):
+                        v -= own[c] * rest[before, c]
+                    own[before] = v / rest[before, before]
+                    left -= own[before] * own[before]
+                    for c in range(n):
+                        h[c] -= own[before] * rest[before, m + c]
+                    before += 1
+            own[row] = sqrt(left)
+            for c in range(n):
+                h[c] /= own[row]
+            project(F, h, f)
+            own[m + 2 * n] = shrink(F, f, one, gain)
+        v = e[i]
+        for c in range(row):
+            v -= own[c] * rest[c, m + 2 * n + 1]
+        v /= own[row]
+        rest[row, m + 2 * n + 1] = v
+        row += 1
+    for r in range(row):  # H moves with the outputs before
+        own = rest[r]
+        v = own[m + 2 * n + 1]
+        for c in range(n):
+            v -= own[m + c] * f[c] if r > 0 else 0.0
+        v /= own[m + 2 * n]
+        total += v * v * own[m + 2 * n]
+        for c in range(n):
+            f[c] = own[m + n + c] * v + (f[c] if r > 0 else 0.0)
+    if row > 0:
+        for c in range(n):
+            x[c] += f[c]
+    return total
+
+
+@compiled(fastmath={"contract"})
+def _steady(
+    k: int, y: Array, out: Array, innovations: Array, A: Array, C: Array, x: Array, rest: Array, predicted: bool,
+    tally: Array,
+) -> int:  # fmt: skip
+    """Two states, one output, a constant gain: one linear recursion in registers, up to the first missing value."""
+    a00, a01, a10, a11, c0, c1 = A[0, 0], A[0, 1], A[1, 0], A[1, 1], C[0, 0], C[0, 1]
+    part = 1.0 / (rest[0, 0] * rest[0, 5])
+    k0, k1, weight = rest[0, 3] * part, rest[0, 4] * part, part / rest[0, 0]
+    l0, l1 = a00 * k0 + a01 * k1, a10 * k0 + a11 * k1
+    b00, b01, b10, b11 = a00 - l0 * c0, a01 - l0 * c1, a10 - l1 * c0, a11 - l1 * c1
+    p0, p1, squares, first = x[0], x[1], tally[4], k
+    while k < y.shape[0] and isfinite(y[k, 0]):
+        v = y[k, 0]
+        e = v - (c0 * p0 + c1 * p1)
+        innovations[k, 0] = e
+        squares += e * e * weight
+        if predicted:
+            out[k, 0], out[k, 1] = p0, p1
+        else:
+            out[k, 0], out[k, 1] = p0 + k0 * e, p1 + k1 * e
+        p0, p1 = l0 * v + (b00 * p0 + b01 * p1), l1 * v + (b10 * p0 + b11 * p1)
+        k += 1
+    x[0], x[1], tally[4] = p0, p1, squares
+    tally[3] += k - first
+    return k
+
+
+@compiled(fastmath={"contract"})
+def synchronous_scan(y: Array, phase: Array, out: Array, state: Array, constants: Array) -> int:
+    """Follow cos φ, sin φ and an offset, all in random walks, and take the rotation off.
+
+    `state` (m, 18): cosine, sine, offset; factors of their covariance over that of the noise (row by row, 9); sums of
+    cos φ e and sin φ e over a batch, samples in it; noise density at the rotation; batches; samples seen.
+    """
+    walk, most, longest, start = constants[0], constants[1], constants[2], constants[3]
+    taper = constants[4:]  # against leakage of stronger noise at other frequencies
+    h, f, gain, one = np.ones(3), np.empty(3), np.empty(3), 1.0
+    missing = 0
+    for j in range(y.shape[1]):
+        s = state[j]
+        F = s[3:12].reshape(3, 3)
+        for k in range(y.shape[0]):
+            v, c, d = y[k, j], cos(phase[k]), sin(phase[k])
+            if not (isfinite(v) and isfinite(c)):
+                out[k, j] = v if not isfinite(v) else np.nan
+                missing += 1
+                continue
+            if s[17] == 0.0:
+                s[2] = v
+                s[3], s[7], s[11] = start, start, start
+            s[17] += 1.0
+            out[k, j] = v - s[0] * c - s[1] * d
+            e = out[k, j] - s[2]
+            h[0], h[1] = c, d
+            project(F, h, f)
+            alpha = shrink(F, f, one, gain)
+            for i in range(3):
+                s[i] += gain[i] * (e / alpha)
+            e *= taper[int(s[14])] / sqrt(alpha)
+            s[12] += c * e
+            s[13] += d * e
+            s[14] += 1.0
+            if s[14] >= taper.size:  # the mean squared sum is the density of the noise around the rotation
+                s[16] = min(s[16] + 1.0, longest)
+                s[15] += ((s[12] * s[12] + s[13] * s[13]) / s[14] - s[15]) / s[16]
+                s[12], s[13], s[14] = 0.0, 0.0, 0.0
+            total = 0.0
+            for i in range(3):
+                total += variance(F, i)
+            if total < most:  # without rotation nothing bounds the covariance but this
+                for i in range(3):
+                    f[:] = 0.0
+                    f[i] = 1.0
+                    widen(F, f[: i + 1], walk)
+    return missing
