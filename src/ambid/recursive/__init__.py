@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from ambid.recursive.blocks import OnlineThreeBlocks as OnlineThreeBlocks
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
     from ambid.recursive.fusion.fusion import SensorFusion as SensorFusion
+    from ambid.recursive.fusion.motion import Motion as Motion
     from ambid.recursive.fusion.motion import free_motion as free_motion
     from ambid.recursive.fusion.motion import levitated_motion as levitated_motion
     from ambid.recursive.fusion.sensor import FusedSensor as FusedSensor

@@ -165,7 +165,12 @@ class RecursiveInstrumentalVariables(Recursion):
     def scale_instruments(self, first: int, factor: float) -> None:
         """Count what the first instruments have told as if they had been larger; the estimate stays.
 
-        `first`: how many.
+        Parameters
+        ----------
+        first : int
+            How many.
+        factor : float
+            By which they are larger.
         """
         part, by = self._parts(), np.ones(self._m)
         by[:first] = factor

@@ -109,30 +109,10 @@ class JointFilter:
         disturbance_sd: Mapping[str, float] | None = None,
         **settings: Any,
     ) -> Self:
-        """Return a filter that starts from an off-line estimate.
+        """Return a filter that starts from an off-line estimate of the same rate.
 
-        Parameters
-        ----------
-        estimate : Estimate
-            Parameters, covariance, delay, noise levels and operating point are taken from it.
-        rate_hz : float
-            Of the samples that will come.
-        rates, offset_sd : Mapping[str, float], optional
-            As in `JointStart`.
-        sensor_sd, disturbance_sd : Mapping[str, float], optional
-            In place of the estimate's.
-        **settings : object
-            Of the filter.
-
-        Returns
-        -------
-        JointFilter
-
-        Raises
-        ------
-        EstimationError
-            If the estimate failed, is of another rate, has its noise as a free gain and no levels are given, or breaks
-            a rule of `JointStart`.
+        `rates` and `offset_sd` as in `JointStart`; `sensor_sd` and `disturbance_sd` in place of the estimate's levels;
+        `settings` of the filter.
         """
         start = start_from(
             estimate, rate_hz, rates=rates, offset_sd=offset_sd, sensor_sd=sensor_sd, disturbance_sd=disturbance_sd
@@ -216,25 +196,7 @@ class JointFilter:
         return np.asarray(np.r_[np.where(self._logs, self._values0 * np.exp(q), self._size), self._disturbance])
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
-        """Take in one sample or a block.
-
-        Parameters
-        ----------
-        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
-            SI; a number, or (n_samples,), where there is one input.
-        outputs : array_like, shape (n_outputs,), or (n_samples, n_outputs) for a block
-            SI; a number, or (n_samples,), where there is one output.
-
-        Returns
-        -------
-        ndarray, shape of `outputs`
-            Innovations, made before each sample was used; NaN where nothing was predicted.
-
-        Raises
-        ------
-        EstimationError
-            If the shapes do not fit.
-        """
+        """Take in one sample or a block, SI; return innovations made before each sample was used, NaN where none."""
         u, y, shape = as_blocks("joint filter", inputs, outputs, self._past.shape[1], self._C.shape[0])
         e = np.empty(y.shape)
         self._run(u, y, e)

@@ -18,11 +18,20 @@ from ambid.recursive.kalman import LinearState, constant_velocity, linear_state
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Motion:
-    """A sampled linear motion with one position, and what is known of it when fusion begins."""
+    """A sampled linear motion with one position, and what is known of it when fusion begins.
 
-    state: LinearState  # its one output is the position in m; R is not used. Inputs, if any, are measured signals.
-    start: Array  # (n_states,)
-    start_sd: Array  # (n_states,), all positive
+    Attributes
+    ----------
+    state : LinearState
+        Its one output is the position in m; R is not used. Inputs, if any, are measured signals.
+    start : ndarray, shape (n_states,)
+    start_sd : ndarray, shape (n_states,)
+        All positive.
+    """
+
+    state: LinearState
+    start: Array
+    start_sd: Array
 
     def __post_init__(self) -> None:
         """Refuse what fusion cannot start from."""
@@ -80,15 +89,32 @@ def levitated_motion(
     start_sd: ArrayLike = (1e-3, 1.0, 100.0),
     start: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Motion:
-    """Return the bench's own motion with the measured current as input, exactly sampled (held from sample to
-    sample).
+    """Return the bench's own motion with the measured current as input, exactly sampled (held from sample to sample).
 
     The third state is a slow force per mass, m/s²: gravity, the bias of the current, a load. Without it the model
     would take the offset that all sensors share for an unbalanced force.
 
-    `rate_hz`: sampling rate in Hz; `m`, `k_i`, `k_x`, `c`: mass kg, N/A, N/m (negative for an attracting magnet), N
-    s/m; `force_walk`: the slow force walks: standard deviation after one second, N/√s; over 0; `start_sd`, `start`:
-    (3,), in m, m/s, m/s².
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    m, k_i, k_x, c : float
+        Mass kg, N/A, N/m (negative for an attracting magnet), N s/m.
+    force : float
+        Density of the white force that the model does not know, N/√Hz (two-sided), from inaccurate parameters too.
+    force_walk : float
+        The slow force walks: standard deviation after one second, N/√s; over 0.
+    start_sd, start : array_like, shape (3,)
+        In m, m/s, m/s².
+
+    Returns
+    -------
+    Motion
+
+    Raises
+    ------
+    EstimationError
+        If a number is not finite, or mass or noise not positive.
     """
     numbers = np.array([rate_hz, m, k_i, k_x, c, force, force_walk])
     if not (np.isfinite(numbers).all() and min(rate_hz, m, force, force_walk) > 0.0):
