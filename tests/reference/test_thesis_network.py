@@ -7,7 +7,7 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.networks.nn import nn
+from ambid.nonlinear.nn import nn
 from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.simulate.bench import simulate_preset

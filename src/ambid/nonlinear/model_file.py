@@ -16,8 +16,8 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "narmax": "ambid.nonlinear.narmax.model:PolynomialNarmax.from_json",
         "hybrid": "ambid.nonlinear.hybrid.model:HybridNarmax.from_json",
         "rbf": "ambid.nonlinear.rbf_network:read_model",
-        "nn": "ambid.nonlinear.networks.state_model:StateNetwork.from_json",
-        "nn-magnitude": "ambid.nonlinear.networks.magnitude_model:MagnitudeNetwork.from_json",
+        "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
+        "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:read_model",
         "lpv": "ambid.nonlinear.lpv.model:LpvModel.from_json",
     }

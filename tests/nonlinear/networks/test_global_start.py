@@ -7,10 +7,10 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.estimation.global_search import global_search
+from ambid.nonlinear import nn as home
+from ambid.nonlinear import state_start
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.networks import global_start
-from ambid.nonlinear.networks import nn as home
-from ambid.nonlinear.networks.nn import nn
+from ambid.nonlinear.nn import nn
 from tests.nonlinear.networks.test_state_network import bearing, linearised, sampled
 
 
@@ -68,8 +68,8 @@ def test_it_is_not_called_where_ordinary_starts_work(monkeypatch: pytest.MonkeyP
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a global search where none is needed")
 
-    monkeypatch.setattr(home, "global_start", refuse)
-    monkeypatch.setattr(global_start, "global_search", refuse)
+    monkeypatch.setattr(home, "search_start", refuse)
+    monkeypatch.setattr(state_start, "global_search", refuse)
     quiet = bearing(4000, 1.0, 1)
     fit = nn([quiet], {"delay": 1, "descent": 0})
     assert fit.status == "converged"
@@ -90,11 +90,11 @@ def test_an_interrupted_global_search_ends_without_a_model_or_with_the_best(nois
 
 
 def test_the_cost_over_shots_is_least_at_the_plant() -> None:
-    from ambid.nonlinear.networks.global_start import shot_cost
     from ambid.nonlinear.records import scaled_records
+    from ambid.nonlinear.state_start import shot_cost
 
     data = scaled_records("nn", [bearing(2000, 1.0, 3, quiet=0.1)], lag=40)
-    cost = shot_cost(data, 1 / 20_000.0, (0, 2), "thesis")
+    cost = shot_cost(data, 1 / 20_000.0, (0, 2))
     true = linearised()
     span = 4.5 * np.log(10.0)
     names = cost.layout.names

@@ -8,10 +8,9 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.model_file import model_from_json, model_to_json
-from ambid.nonlinear.networks.magnitude_model import MagnitudeNetwork
-from ambid.nonlinear.networks.magnitude_problem import FoldedLayout, slopes, states
-from ambid.nonlinear.networks.magnitude_start import folded_starts
-from ambid.nonlinear.networks.nn import nn
+from ambid.nonlinear.nn import nn
+from ambid.nonlinear.nn_magnitude import grid_starts
+from ambid.nonlinear.state_network import StateNetwork, run
 from tests.measured import ABSENT, BENCHMARKS
 
 DATA = BENCHMARKS
@@ -46,27 +45,6 @@ def rubbing(n: int = 400, *, noise: float = 0.0, friction: float = 0.05, seed: i
     return io(u, np.abs(y + noise * rng.standard_normal(n))), y
 
 
-def random_network(seed: int = 3) -> tuple[FoldedLayout, np.ndarray, np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    layout = FoldedLayout(n=3, n_inputs=2, neurons=2, step=0.4)
-    theta = 0.3 * rng.standard_normal(layout.n_theta)
-    theta[:3], theta[layout.n_linear - 1] = (-0.2, -0.5, 0.5), 0.25
-    return layout, theta, rng.standard_normal((60, 2)), np.array([0.4, -0.3, 0.2, 0.5])
-
-
-def test_slopes_are_those_of_differences() -> None:
-    layout, theta, u, x0 = random_network()
-    exact = slopes(layout, theta, u, states(layout, theta, u, x0))
-    v, step = np.concatenate([theta, x0]), 1e-6
-    for k in range(v.size):
-        ends = []
-        for sign in (1.0, -1.0):
-            w = v.copy()
-            w[k] += sign * step
-            ends.append(states(layout, w[: theta.size], u, w[theta.size :])[:-1, -1])
-        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), exact[:, k], atol=3e-7 * np.max(np.abs(exact)))
-
-
 def test_starts_are_the_models_of_the_grid() -> None:
     from scipy.signal import lfilter
 
@@ -75,12 +53,12 @@ def test_starts_are_the_models_of_the_grid() -> None:
     A = np.convolve(np.array([1.0, -1.4, 0.81]), [1.0, -0.7])
     y = np.abs(lfilter([0.0, 0.5], A, u[:, 0]))
     for n in (1, 2, 3, 4):
-        layout, theta = folded_starts(((y, u),), n, 1)[0]
-        X = states(layout, theta, u, np.zeros(n + 1))
-        poles = np.linalg.eigvals(layout.A(theta))
-        run = lfilter([0.0, 1.0], np.real(np.poly(poles)), u[:, 0])
-        gain = (run @ X[:-1, 0]) / (run @ run)
-        np.testing.assert_allclose(X[:-1, 0], gain * run, atol=1e-9 * np.max(np.abs(X)))
+        layout, theta = grid_starts(((y[:, None], u),), n, 1, 0.02)[0]
+        X, _ = run(layout, layout.matrices(theta), y[:, None], np.hstack([u, np.ones_like(u)]), np.zeros(n + 1))
+        poles = np.linalg.eigvals(layout.matrices(theta).A)
+        filtered = lfilter([0.0, 1.0], np.real(np.poly(poles)), u[:, 0])
+        gain = (filtered @ X[:-1, 0]) / (filtered @ filtered)
+        np.testing.assert_allclose(X[:-1, 0], gain * filtered, atol=1e-9 * np.max(np.abs(X)))
 
 
 def test_a_plant_with_friction_is_found_and_goes_on_unseen() -> None:
@@ -88,8 +66,9 @@ def test_a_plant_with_friction_is_found_and_goes_on_unseen() -> None:
     settings = {"output": "magnitude", "states": 3, "starts": 4}
     linear = nn([data.part(0, 300)], {**settings, "neurons": 0})
     found = nn([data.part(0, 300)], {**settings, "neurons": 1})
-    assert isinstance(linear.model, MagnitudeNetwork)
-    assert isinstance(found.model, MagnitudeNetwork)
+    assert isinstance(linear.model, StateNetwork)
+    assert isinstance(found.model, StateNetwork)
+    assert found.model.kind == "nn-magnitude"
     off = [float(np.std((m.simulate(data.u, data.y)[:, 0] - true)[300:])) for m in (linear.model, found.model)]
     assert off[1] < 0.006  # the noise is 0.005
     assert off[0] > 4 * off[1]
@@ -150,7 +129,7 @@ def test_what_makes_no_sense_is_refused() -> None:
     data, _ = rubbing(100)
     for settings, word in (
         ({"noise": "innovations"}, "noise"),
-        ({"shooting": 10}, "shooting"),
+        ({"evaluations": 10}, "evaluations"),
         ({"states": 5}, "states"),
     ):
         with pytest.raises(EstimationError, match=word):

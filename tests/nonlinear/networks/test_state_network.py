@@ -1,4 +1,4 @@
-"""State-space networks: exact slopes, shots and penalties, canonical weights, delay, feedback, grey residual model."""
+"""State-space networks: exact slopes, canonical weights, delay, feedback, grey residual model."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.networks.layout import Layout, free_entries, one_axis_entries
-from ambid.nonlinear.networks.nn import nn
-from ambid.nonlinear.networks.residual import Ridge, orthogonal_to_physics
-from ambid.nonlinear.networks.segments import StateProblem, shots
-from ambid.nonlinear.networks.state_model import StateNetwork
+from ambid.nonlinear.nn import nn
+from ambid.nonlinear.nn_magnitude import magnitude_layout
+from ambid.nonlinear.state_network import ONE_AXIS, Layout, StateNetwork, StateProblem, free_entries
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
@@ -22,38 +20,35 @@ from ambid.simulate.bench import simulate_preset
 from tests.nonlinear.systems import smooth
 
 
-def one_axis(neurons: int, *, anchored: bool, gain: bool) -> Layout:
+def one_axis(neurons: int, *, gain: bool) -> Layout:
     return Layout(
-        form="one-axis", dt=0.05, n_inputs=1, heads=(2, 0), steps=(), entries=one_axis_entries("all"),
-        scale=(1.0, 2.0, 0.5, 3.0), rates=(1.5, 0.7), rows=(1, 2), gain=gain, neurons=neurons, anchored=anchored,
+        form="one-axis", dt=0.05, n_inputs=1, heads=(2, 0), steps=(), entries=ONE_AXIS,
+        scale=(1.0, 2.0, 0.5, 3.0), rates=(1.5, 0.7), rows=(1, 2), gain=gain, neurons=neurons,
     )  # fmt: skip
 
 
 def free(neurons: int, *, gain: bool) -> Layout:
     return Layout(
         form="free", dt=0.05, n_inputs=2, heads=(0, 2), steps=(0.3, 0.0, 0.0), entries=free_entries((2, 1), 2),
-        scale=(1.0,) * 5, rates=(1.0,) * 3, rows=(0, 1, 2), gain=gain, neurons=neurons, anchored=False,
+        scale=(1.0,) * 5, rates=(1.0,) * 3, rows=(0, 1, 2), gain=gain, neurons=neurons,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     "layout",
-    [one_axis(2, anchored=True, gain=False), one_axis(2, anchored=False, gain=True), free(0, gain=True),
-     free(2, gain=True)],
-    ids=["anchored", "orthogonal", "free", "free with network"],
+    [one_axis(2, gain=False), one_axis(2, gain=True), free(0, gain=True), free(2, gain=True),
+     magnitude_layout(3, 2, 2, 0.05), magnitude_layout(1, 1, 0, 0.05)],
+    ids=["one-axis", "one-axis with gain", "free", "free with network", "magnitude", "magnitude, linear"],
 )  # fmt: skip
-def test_the_triangle_holds_slopes_of_errors_jumps_and_penalties(layout: Layout) -> None:
+def test_the_triangle_holds_slopes_of_errors_and_of_the_prior(layout: Layout) -> None:
     rng = np.random.default_rng(3)
-    y, u = rng.standard_normal((60, 2)), rng.standard_normal((60, layout.n_inputs))
-    penalties = [Ridge(layout=layout, prior=2.0)] if layout.neurons else []
-    if layout.neurons and not layout.anchored:
-        penalties.append(orthogonal_to_physics(layout, [rng.standard_normal((60, 3))], [u], np.full(3, 0.5)))
+    y, u = rng.standard_normal((40, layout.p)), rng.standard_normal((40, layout.n_inputs + 1))
+    u[:, -1] = 1.0
     problem = StateProblem(
-        layout=layout, shots=shots(((y[:40], u[:40]), (y[40:], u[40:])), 15),
-        weight=np.array([[1.3, 0.4], [0.0, 0.8]]), jump=np.array([2.0, 3.0, 0.5]), penalties=penalties,
+        layout=layout, parts=((y[:15], u[:15]), (y[25:], u[25:])),
+        weight=np.array([[1.3, 0.4], [0.0, 0.8]])[: layout.p, : layout.p], prior=2.0,
     )  # fmt: skip
-    assert [s.goes_on for s in problem.shots] == [False, True, True, False, True]
-    v = 0.3 * rng.standard_normal(layout.n_theta + 15)
+    v = 0.3 * rng.standard_normal(layout.n_theta + 2 * layout.width)
     R = problem.triangle(v)
     assert np.sum(R[:, -1] ** 2) == pytest.approx(problem.cost(v), rel=1e-10)
     slope = -2 * R[:, :-1].T @ R[:, -1]
@@ -64,6 +59,8 @@ def test_the_triangle_holds_slopes_of_errors_jumps_and_penalties(layout: Layout)
         assert (problem.cost(v + e) - problem.cost(v - e)) / (2 * step) == pytest.approx(
             slope[k], rel=1e-5, abs=1e-5 * np.abs(slope).max()
         )
+    rows = np.concatenate([*(x.reshape(-1, v.size + 1) for x in problem.sample_rows(v)), problem.prior_rows(v)])
+    np.testing.assert_allclose(rows.T @ rows, R.T @ R, atol=1e-9 * np.abs(R.T @ R).max())
 
 
 def sampled(n: int, seed: int, *, noise: float = 0.0, delay: int = 0) -> tuple[IOData, np.ndarray, np.ndarray]:
@@ -249,21 +246,8 @@ def free_runs(fit: NonlinearFit, record: IOData, length: int = 60) -> float:
     return float(np.sqrt(np.mean(np.square(left))))
 
 
-def test_orthogonal_network_leaves_the_best_linear_approximation_to_physics(swung: IOData) -> None:
-    short = swung.part(0, 3000)
-    alone = nn([short], {"delay": 1, "descent": 0})
-    grey = nn([short], {"delay": 1, "descent": 0, "neurons": 4, "starts": 1, "residual": "orthogonal"})
-    assert grey.noise_covariance[1, 1] < 0.95 * alone.noise_covariance[1, 1]
-    one, other = (dict(zip(f.model.names, f.model.theta, strict=True)) for f in (alone, grey))  # type: ignore[union-attr]
-    for name in ("a32", "b3"):  # 1.7 % from the linearisation, but the same with and without the network
-        assert other[name] == pytest.approx(one[name], rel=0.01)
-
-
-def test_multiple_shooting_holds_an_unstable_plant() -> None:
-    small = bearing(4000, 1.0, 3)  # nearly linear
-    fit = nn([small], {"delay": 1, "shooting": 100})
-    shooting = next(c for c in fit.curves if "shooting" in c.method)
-    assert shooting.training[-1] < 0.7 * shooting.training[0]
+def test_an_unstable_plant_is_held_by_its_predictor() -> None:
+    fit = nn([bearing(4000, 1.0, 3)], {"delay": 1})  # nearly linear
     relative, in_sd = off(fit)
     assert np.max(np.abs(in_sd)) < 4
     assert np.max(np.abs(relative)) < 0.05

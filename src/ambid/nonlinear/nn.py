@@ -1,0 +1,327 @@
+"""State-space network from records (thesis eqs 5.1-5.2, fig. 5.9): its weights are A and B, beside a network G(x, u).
+
+Delay -> subspace start -> the thesis's training beside Gauss-Newton (for the learning curves) -> Levenberg-Marquardt on
+simulation errors -> hidden layer (option) -> predictor gain, where errors are not white -> global search, where all
+that failed, and training again -> covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.progress import Tick, part_of, portions, silent
+from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.nn_magnitude import nn_of_magnitude
+from ambid.nonlinear.records import Scaled, scaled_records
+from ambid.nonlinear.settings import checked
+from ambid.nonlinear.state_start import (
+    LARGEST,
+    NO_START,
+    SHORT,
+    convert_to_continuous,
+    find_delay,
+    guess_delay,
+    search_start,
+    shift_inputs,
+    start_free,
+    start_one_axis,
+    train_one_step,
+)  # fmt: skip
+from ambid.nonlinear.state_training import (
+    FAR,
+    Fitting,
+    Interrupted,
+    State,
+    add_gain,
+    add_units,
+    finish,
+    is_white,
+    misfit,
+    train,
+)  # fmt: skip
+
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "states": (1, 20),
+    "delay": (0, 1000),
+    "neurons": (0, 40),
+    "starts": (1, 20),
+    "prior": (0.01, 1e6),
+    "descent": (0, 10_000),
+    "iterations": (1, 2000),
+    "evaluations": (0, 1_000_000),
+}
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "form": ("auto", "one-axis", "free"),
+    "noise": ("auto", "output", "innovations"),
+    "output": ("signed", "magnitude"),
+    "uncertainty": ("auto", "laplace", "sandwich", "bootstrap", "none"),
+}
+_DEFAULTS: Mapping[str, object] = {
+    "form": "auto",
+    "output": "signed",
+    "neurons": 0,
+    "prior": 3.0,
+    "starts": 3,
+    "noise": "auto",
+    "descent": 10,
+    "iterations": 50,
+    "evaluations": 2000,
+    "uncertainty": "auto",
+}
+_UNITS = {"m": 0, "m/s": 1, "A": 2}
+_LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
+_BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
+_MORE = 2  # states beyond the outputs, for the delay
+_LARGEST = 5  # states beyond the outputs that are tried
+_DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues are rare
+    (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0),
+)  # fmt: skip
+
+
+def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+    """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9).
+
+    In the form ``one-axis`` (position, current and perhaps velocity from a voltage) the weights are entries of thesis
+    eq. 4.8. Consistent under feedback as far as the predictor gain holds the noise. Where all starts of that form fail,
+    there is a global search. The form ``free`` has none: its states have no fixed meaning, so that nothing bounds the
+    entries; its starts come from subspace models of several horizons.
+    """
+    given = checked("nn", settings, _RANGES, _CHOICES, auto=("states", "delay", "neurons"))
+    if given.get("output") == "magnitude":
+        return nn_of_magnitude(records, given, seed, tick)
+    s: dict[str, Any] = {**_DEFAULTS, **given}
+    whole = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))
+    s["form"] = _choose_form(str(s["form"]), records[0])
+    fitting, reason = Fitting(data=whole), ""
+    try:
+        reason = _start(s, whole, records[0], fitting, tick)
+        if not reason:
+            _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
+        reason = _rescue(s, whole, records[0], fitting, seed, tick, reason)
+    except KeyboardInterrupt as stop:
+        if isinstance(stop, Interrupted):
+            fitting.state = stop.state
+        fitting.status = "stalled"
+        fitting.warnings.insert(0, "interrupted: the best model so far")
+        reason = reason or "interrupted before there was a network"
+    except np.linalg.LinAlgError as error:
+        reason = f"the training broke down: {error}"
+        fitting.state = None
+    state = fitting.state
+    if state is not None and s["form"] == "free":
+        m = state.layout.matrices(state.theta)
+        both = convert_to_continuous(state.layout, m.A, m.B[:, :-1])
+        fitting.details["continuous"] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
+    used = {**s, "delay": fitting.delay}
+    return finish(records, used, fitting, reason, seed=seed, how=s["uncertainty"], tick=part_of(tick, *_SPREAD))
+
+
+def _choose_form(asked: str, first: IOData) -> str:
+    """``one-axis`` where the units are those of thesis eq. 4.8, or it was asked for."""
+    units = [first.units.get(x) for x in first.outputs]
+    fits = (
+        [first.units.get(x) for x in first.inputs] == ["V"]
+        and {"m", "A"} <= set(units) <= set(_UNITS)
+        and len(set(units)) == len(units)
+    )
+    if asked == "one-axis" and not fits:
+        raise EstimationError(
+            "nn: form one-axis wants one input in V and outputs in m and A (and m/s); here "
+            f"{', '.join(f'{x} [{first.units.get(x)}]' for x in (*first.inputs, *first.outputs))}. Choose form free"
+        )
+    return "one-axis" if fits and asked != "free" else "free"
+
+
+def _heads(record: IOData) -> tuple[int, ...]:
+    return tuple(_UNITS[record.units[x]] for x in record.outputs)
+
+
+# --- start -----------------------------------------------------------------------------------------------------------
+
+
+def _start(s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting, tick: Tick | None) -> str:
+    """Find the delay and a first network; return the reason where there is none."""
+    began = perf_counter()
+    fitting.delay = int(s["delay"]) if "delay" in s else guess_delay(whole)
+    fitting.data = shift_inputs(whole, fitting.delay)
+    reason = _find_first(s, record, fitting)
+    fitting.timing_s["start"] = perf_counter() - began
+    if "delay" in s or fitting.state is None:
+        return reason
+    began = perf_counter()
+    begun: State | str = fitting.state
+    if s["form"] == "free" and "states" not in s:  # more than are needed: fewer would pass for a delay
+        begun = start_free(fitting.data, record.dt, fitting.data.y_level.size + _MORE)
+    if isinstance(begun, str):
+        return reason
+    before = fitting.delay
+    _find_delay(s, begun, whole, fitting, part_of(tick, *_DELAY))
+    if fitting.delay != before:
+        fitting.state = None
+        reason = _find_first(s, record, fitting)
+    fitting.timing_s["delay"] = perf_counter() - began
+    return reason
+
+
+def _find_delay(s: Mapping[str, Any], state: State, whole: Scaled, fitting: Fitting, tick: Tick | None) -> None:
+    """Find the delay by short trainings from a first network."""
+    rather_late = s["form"] == "free" and "states" not in s
+    fitting.delay, errors = find_delay(state, whole, fitting.delay, tick, rather_late=rather_late)
+    fitting.data = shift_inputs(whole, fitting.delay)
+    fitting.details["tried_delays"] = [{"delay": k, "log_det_errors": v} for k, v in errors.items()]
+    if fitting.delay == LARGEST:
+        fitting.warnings.append(
+            f"the delay that fits best is the largest looked for, {LARGEST} samples: give delay if inputs act later"
+        )
+
+
+def _find_first(s: Mapping[str, Any], record: IOData, fitting: Fitting) -> str:
+    """Find a first network; return the reason where there is none."""
+    reason, data = "", fitting.data
+    for past in (SHORT, *_LONG):
+        if s["form"] == "one-axis":
+            found = start_one_axis(data, record.dt, _heads(record), past)
+        else:
+            found = start_free(data, record.dt, s.get("states") or data.y_level.size, past)
+        if isinstance(found, str):
+            reason = reason or found
+            continue
+        if fitting.state is None or found.score < fitting.state.score:
+            fitting.state = found
+        if found.widen(gain=False).simulates(data):
+            break
+        reason = reason or NO_START
+    return "" if fitting.state is not None else reason
+
+
+# --- training --------------------------------------------------------------------------------------------------------
+
+
+def _train_all(s: Mapping[str, Any], fitting: Fitting, seed: int, tick: Tick | None) -> None:
+    """Train the first network: number of states, physics, hidden layer, gain."""
+    chosen, starts, most = s["form"] == "free" and "states" not in s, int(s["starts"]), int(s["iterations"])
+    choice, physics, hidden, gain = portions(
+        tick, (_LARGEST if chosen else 0, 3, 3 * starts * (s["neurons"] > 0), 3)
+    )  # fmt: skip
+    began, data = perf_counter(), fitting.data
+    if chosen:
+        _choose_states(fitting, choice)
+    assert fitting.state is not None
+    first = fitting.state
+    if s["descent"]:
+        curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
+        fitting.curves.extend(curves)
+        fitting.timing_s["one-step training"] = perf_counter() - began
+        began = perf_counter()
+    if s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
+        bare = first.widen(gain=False)
+        fitting.take(train(bare, data, stage="simulation errors", iterations=most, tick=physics), even_worse=True)
+    if s["neurons"]:
+        base = fitting.state
+        for k in range(starts):
+            begun = add_units(base, int(s["neurons"]), float(s["prior"]), [seed, k])
+            share = part_of(hidden, k / starts, (k + 1) / starts)
+            found = train(begun, data, stage="hidden layer", iterations=most, tick=share)
+            fitting.take(found)
+            fitting.rivals += [found.state] if found else []
+    _train_gain(s, fitting, first, gain)
+    fitting.timing_s["training"] = perf_counter() - began
+
+
+def _train_gain(s: Mapping[str, Any], fitting: Fitting, first: State, tick: Tick | None) -> None:
+    """Go on with a predictor gain where the simulation errors are not white (the simplest noise that does)."""
+    state, data = fitting.state, fitting.data
+    assert state is not None
+    if s["noise"] == "output" or (s["noise"] == "auto" and not state.layout.gain and is_white(state, data)):
+        return
+    wide = state if state.layout.gain else add_gain(state, data, first.K)
+    if wide is None:
+        fitting.warnings.append("no predictor gain was found that keeps the predictor finite")
+        return
+    found = train(wide, data, stage="prediction errors", iterations=int(s["iterations"]), tick=tick)
+    fitting.take(found, even_worse=True)
+
+
+def _choose_states(fitting: Fitting, tick: Tick | None) -> None:
+    """Try more and more states; keep the number that Bayes' criterion likes best."""
+    data, best = fitting.data, fitting.state
+    assert best is not None
+    p, tried, best_bic, dt = data.y_level.size, dict[int, float](), np.inf, best.layout.dt
+    for n in range(p, p + _LARGEST + 1):
+        own = part_of(tick, (n - p) / (_LARGEST + 1), (n - p + 1) / (_LARGEST + 1))
+        if own is not None:
+            own("choice of states", 0.0)
+        begun = start_free(data, dt, n)
+        after = None
+        if not isinstance(begun, str):
+            after = train(begun, data, stage="choice of states", iterations=6, tick=own)
+        if after is None:
+            continue
+        tried[n] = after.state.bic
+        if tried[n] < best_bic:
+            best, best_bic = after.state, tried[n]
+        elif n >= 2 + best.layout.n:
+            break
+    fitting.state = best
+    fitting.details["tried_states"] = [{"states": n, "bic": b} for n, b in tried.items()]
+
+
+# --- rescue ----------------------------------------------------------------------------------------------------------
+
+
+def _rescue(
+    s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting, seed: int, tick: Tick | None, reason: str
+) -> str:
+    """Search globally where ordinary starts failed, and train what was found; return what is left of the reason."""
+    before, why = fitting.state, reason
+    if before is not None:
+        unexplained = misfit(before, fitting.data)
+        if unexplained > FAR:
+            why = f"a linear regression on the past explains {100 * unexplained:.0f} % of the errors' variance"
+    if not why or s["form"] != "one-axis" or not s["evaluations"]:
+        return reason
+    began, second = perf_counter(), Fitting(data=fitting.data, delay=fitting.delay)
+    try:
+        second.state, found = search_start(
+            fitting.data, record.dt, _heads(record), seed=seed, evaluations=int(s["evaluations"]),
+            tick=part_of(tick, *_RESCUE) or silent,
+        )  # fmt: skip
+        if second.state is not None:
+            if "delay" not in s:
+                _find_delay(s, second.state, whole, second, None)
+                if second.delay != fitting.delay:
+                    again = State.of(second.state.layout, second.state.theta, second.data)
+                    second.state = add_gain(again, second.data, second.state.K) or second.state
+            _train_all({**s, "descent": 0}, second, seed, part_of(tick, *_AGAIN))
+    except KeyboardInterrupt as stop:
+        after = stop.state if isinstance(stop, Interrupted) else second.state
+        fitting.state = after if _is_better(after, before) else before
+        raise KeyboardInterrupt from stop
+    fitting.timing_s["global search"] = perf_counter() - began
+    after = second.state
+    better = _is_better(after, before)
+    fitting.details["global_search"] = {
+        "why": why, "failed_starts": 1 + len(_LONG), "evaluations": found.evaluations, "seconds": found.seconds,
+        "log_det_errors_before": None if before is None else before.score,
+        "log_det_errors_after": None if after is None else after.score, "taken": better,
+    }  # fmt: skip
+    said = f"{1 + len(_LONG)} ordinary starts failed ({why}): differential evolution, {found.evaluations} evaluations, "
+    if not better or after is None:
+        fitting.warnings.append(said + "found nothing better. Check channels, their signs and units, and the delay")
+        return reason
+    gained = f"improved the errors from {before.size:.3g} to" if before else "found a network whose errors have"
+    fitting.warnings.append(said + f"{gained} {after.size:.3g} of the outputs' deviations")
+    for name in ("state", "status", "data", "delay", "rivals"):
+        setattr(fitting, name, getattr(second, name))
+    fitting.curves += second.curves
+    return ""
+
+
+def _is_better(after: State | None, before: State | None) -> bool:
+    return after is not None and (before is None or after.score < before.score - _BETTER)

@@ -1,0 +1,619 @@
+"""A state-space network whose weights are A and B: layout of its weights, errors over records, model.
+
+x+ = A x + B u + c + K e + G f(x, u), y = x[heads] + e (thesis eq. 5.1, fig. 5.9). In the form ``one-axis`` the weights
+are entries of the continuous A and B of thesis eq. 4.8 (position, velocity, current); A, B, G of a sample follow by the
+matrix exponential. In the form ``free`` they are those of the sampled A and B; a state that is not measured is the
+scaled difference of the state before it, x_j+ = x_j + step x_(j+1) + .., which makes the weights unique. Where a sensor
+sees no sign, the output is |x1| behind a low pass, and the network is odd: a sign that is not measured leaves nothing
+to tell the directions apart by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.linear import triangle_of
+from ambid.estimation.search import search
+from ambid.nonlinear.cloud import Cloud
+from ambid.nonlinear.records import Parts
+from ambid.nonlinear.signals import finite, scaled, with_head
+
+Table = NDArray[np.int64]
+
+ONE_AXIS = ((1, 0), (1, 2), (2, 1), (2, 2), (2, 3), (1, 4), (2, 4))
+"""Free weights of thesis eq. 4.8 in [A | B | c]: a21, a23, a32, a33, b3, and constants of force and voltage."""
+
+_ROWS = 2048  # that are joined and reduced at once: they stay in the cache
+_SIGNS = (0.0, 1.0, -1.0)  # of the state that a search behind a sensor without sign begins at, in sizes of the output
+
+# --- weights and matrices --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Matrices:
+    """What the recursions want, in scaled signals; d* are derivatives by the first weights, first axis n_directions."""
+
+    A: Array
+    B: Array  # the last column is the constant
+    K: Array
+    G: Array
+    W1: Array
+    b1: Array
+    W2: Array
+    rho: float  # pole of a sensor without sign
+    dA: Array
+    dB: Array
+    dK: Array
+    dG: Array
+
+    def without_gain(self, *, hidden: bool = True) -> Matrices:
+        """Return the matrices without gain, and without slopes by it; `hidden` false leaves out the units as well."""
+        bare = replace(self, K=np.zeros_like(self.K), dK=np.zeros_like(self.dK))
+        return bare if hidden else replace(bare, G=np.zeros_like(self.G), dG=np.zeros_like(self.dG))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layout:
+    """Which weights are free, and what they are in matrices."""
+
+    form: str
+    dt: float  # s
+    n_inputs: int
+    heads: tuple[int, ...]  # state that each output is
+    # by state, form ``free``: what the next state enters with; 0 for the last of a chain. Empty for ``one-axis``.
+    steps: tuple[float, ...]
+    entries: tuple[tuple[int, int], ...]  # free weights in [A | B | c]
+    scale: tuple[float, ...]  # of states, then of inputs, in SI
+    rates: tuple[float, ...]  # size of G's output of 1, by row that it acts on
+    rows: tuple[int, ...]  # states that G acts on
+    gain: bool = False  # whether K is estimated; else it is 0
+    neurons: int = 0
+    sensor: bool = False  # whether the output is |x1| behind a low pass, which is the last state
+
+    @property
+    def n(self) -> int:
+        """Number of states, without that of a sensor."""
+        return len(self.scale) - self.n_inputs
+
+    @property
+    def p(self) -> int:
+        """Number of outputs."""
+        return len(self.heads)
+
+    @property
+    def width(self) -> int:
+        """Number of states with that of a sensor."""
+        return self.n + self.sensor
+
+    @property
+    def n_directions(self) -> int:
+        """Weights that are entries of the matrices, or the pole of a sensor."""
+        return len(self.entries) + self.gain * self.n * self.p + self.sensor
+
+    @property
+    def hidden_sizes(self) -> tuple[int, int, int]:
+        """Numbers of weights in W1, b1, W2. Units behind a sensor without sign have no bias: they are odd."""
+        biases = 0 if self.sensor else self.neurons
+        return self.neurons * (self.n + self.n_inputs), biases, self.neurons * len(self.rows)
+
+    @property
+    def n_theta(self) -> int:
+        """All weights."""
+        return self.n_directions + sum(self.hidden_sizes)
+
+    @property
+    def anchored(self) -> bool:
+        """Whether hidden units have neither value nor slope at the operating point: A and B are the slope there."""
+        return not self.sensor
+
+    @cached_property
+    def head_table(self) -> Table:
+        """`heads` as the recursions want them, shape (n_outputs,)."""
+        return np.array(self.heads, dtype=np.int64)
+
+    @cached_property
+    def unit(self) -> Array:
+        """What a scaled weight of 1 is in SI, shape (n_theta,); 1 for gains and hidden layer."""
+        size = np.array((*self.scale, 1.0))
+        out = np.ones(self.n_theta)
+        out[: len(self.entries)] = [size[r] / size[c] for r, c in self.entries]
+        return out
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all weights."""
+        n, m, units = self.n, self.n_inputs, range(self.neurons)
+        out = []
+        for r, c in self.entries:
+            out.append(f"a{r + 1}{c + 1}" if c < n else f"c{r + 1}" if c == n + m else self._input_name(r, c - n))
+        if self.gain:
+            out += [f"k{i + 1}{j + 1}" for i in range(n) for j in range(self.p)]
+        if self.sensor:
+            out.append("sensor pole")
+        z = [f"x{j + 1}" for j in range(n)] + [f"u{j + 1}" for j in range(m)]
+        out += [f"unit {k + 1}: {x}" for k in units for x in z]
+        if not self.sensor:
+            out += [f"unit {k + 1}: 1" for k in units]
+        return (*out, *(f"x{r + 1}: unit {k + 1}" for r in self.rows for k in units))
+
+    def _input_name(self, row: int, column: int) -> str:
+        return f"b{row + 1}" if self.n_inputs == 1 else f"b{row + 1}{column + 1}"
+
+    def widen(self, theta: Array, **changes: Any) -> tuple[Layout, Array]:
+        """Return the layout with another ``gain`` or number of ``neurons``, and its weights; new ones are zero."""
+        new = replace(self, **changes)
+        out = np.zeros(new.n_theta)
+        k = len(self.entries)
+        out[:k] = theta[:k]
+        if self.gain == new.gain:
+            out[k : new.n_directions] = theta[k : self.n_directions]
+        if self.neurons == new.neurons:
+            out[new.n_directions :] = theta[self.n_directions :]
+        return new, out
+
+    def matrices(self, theta: Array) -> Matrices:
+        """Return the matrices of a sample and their derivatives; `theta` is scaled."""
+        n, h, k, P1 = self.n, self.neurons, len(self.entries), self.n_directions
+        A, B, G, dA, dB, dG = self._continuous(theta) if self.form == "one-axis" else self._sampled(theta)
+        K, dK = np.zeros((n, self.p)), np.zeros((P1, n, self.p))
+        if self.gain:
+            K = theta[k:P1].reshape(n, self.p).copy()
+            dK[np.arange(k, P1), np.repeat(np.arange(n), self.p), np.tile(np.arange(self.p), n)] = 1.0
+        W1, b1, W2 = np.split(theta[P1:], np.cumsum(self.hidden_sizes)[:2])
+        return Matrices(
+            A=A, B=B, K=K, G=G, W1=W1.reshape(h, n + self.n_inputs).copy(), b1=b1.copy() if b1.size else np.zeros(h),
+            W2=W2.reshape(len(self.rows), h).copy(), rho=float(theta[k]) if self.sensor else 0.0,
+            dA=dA, dB=dB, dK=dK, dG=dG,
+        )  # fmt: skip
+
+    def weights(self, theta: Array) -> Array:
+        """Return [A | B | c] with all weights in, continuous in the form ``one-axis``.
+
+        `theta`: (n_theta,), scaled. Returns (n, n + n_inputs + 1), scaled.
+        """
+        n = self.n
+        M = np.zeros((n, n + self.n_inputs + 1))
+        if self.form == "one-axis":
+            M[0, 1] = self.scale[1] / self.scale[0]
+        else:
+            for j, step in enumerate(self.steps):
+                if step:
+                    M[j, j], M[j, j + 1] = 1.0, step
+        for value, (r, c) in zip(theta, self.entries, strict=False):
+            M[r, c] = value
+        return M
+
+    def _sampled(self, theta: Array) -> tuple[Array, ...]:
+        n, q = self.n, len(self.rows)
+        M = self.weights(theta)
+        D = np.zeros((self.n_directions, *M.shape))
+        for j, (r, c) in enumerate(self.entries):
+            D[j, r, c] = 1.0
+        G = np.zeros((n, q))
+        G[list(self.rows), range(q)] = self.rates
+        return (
+            np.ascontiguousarray(M[:, :n]), np.ascontiguousarray(M[:, n:]), G,
+            np.ascontiguousarray(D[:, :, :n]), np.ascontiguousarray(D[:, :, n:]), np.zeros((D.shape[0], n, q)),
+        )  # fmt: skip
+
+    def _continuous(self, theta: Array) -> tuple[Array, ...]:
+        """Exponential of [[A, B, G], [0, 0, 0]] dt; derivatives from the doubled matrix (Mathias 1996)."""
+        from scipy.linalg import expm
+
+        n, m, q, k = self.n, self.n_inputs + 1, len(self.rows), len(self.entries)
+        size = n + m + q
+        block = np.zeros((k, 2 * size, 2 * size))
+        block[:, :n, : n + m] = self.weights(theta)
+        block[:, list(self.rows), range(n + m, size)] = self.rates
+        block[:, size:, size:] = block[:, :size, :size]
+        for j, (r, c) in enumerate(self.entries):
+            block[j, r, size + c] = 1.0
+        full = expm(block * self.dt)
+        M = full[0, :n, :size]
+        D = np.zeros((self.n_directions, n, size))
+        D[:k] = full[:, :n, size:]
+        cut = (slice(0, n), slice(n, n + m), slice(n + m, size))
+        return (
+            *(np.ascontiguousarray(M[:, c]) for c in cut),
+            *(np.ascontiguousarray(D[:, :, c]) for c in cut),
+        )  # fmt: skip
+
+
+def free_entries(chains: tuple[int, ...], n_inputs: int, *, constants: bool = True) -> tuple[tuple[int, int], ...]:
+    """Return the free weights of the form ``free``, of which `chains` counts the states of each output."""
+    n = sum(chains)
+    ends = np.cumsum(chains) - 1
+    heads = np.cumsum((0, *chains))[:-1]
+    out = [(int(r), c) for r in ends for c in range(n)]
+    out += [(r, n + c) for r in range(n) for c in range(n_inputs)]
+    return (*out, *((int(r), n + n_inputs) for r in heads if constants))
+
+
+# --- runs and errors -------------------------------------------------------------------------------------------------
+
+
+def run(layout: Layout, m: Matrices, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
+    """Return states (n_samples + 1, width) and innovations (n_samples, p), NaN from a divergence on.
+
+    `u` has a last column of ones, `x0` is the first state.
+    """
+    from ambid.nonlinear.state_kernels import run_states
+
+    X, E = np.empty((u.shape[0] + 1, layout.width)), np.empty((u.shape[0], layout.p))
+    run_states(
+        m.A, m.B, m.K, layout.head_table, m.G, m.W1, m.b1, m.W2, int(layout.anchored), m.rho, u, y,
+        np.ascontiguousarray(x0), X, E,
+    )  # fmt: skip
+    return X, E
+
+
+def slopes(layout: Layout, m: Matrices, u: Array, X: Array, E: Array, s: Array) -> Array:
+    """Return the slopes of the predictions (n_samples, p, n_columns) along what `run` returned.
+
+    `s` (width, n_columns) is changed from the first state's slopes to the last's.
+    """
+    from ambid.nonlinear.state_kernels import slope_states
+
+    out = np.empty((u.shape[0], layout.p, s.shape[1]))
+    D = np.ascontiguousarray(np.moveaxis(np.concatenate([m.dA, m.dB, m.dK, m.dG], axis=2), 0, 2))
+    used = np.any(D != 0.0, axis=2).astype(np.int64)
+    slope_states(
+        m.A, m.K, layout.head_table, m.G, m.W1, m.b1, m.W2, int(layout.anchored), m.rho, D, used, u, X, E, s, out
+    )  # fmt: skip
+    return out
+
+
+def largest_pole(layout: Layout, theta: Array) -> float:
+    """Return the largest modulus of the poles of the linear predictor, A - K C; infinite where it is not finite."""
+    m = layout.matrices(theta)
+    F = m.A.copy()
+    if layout.gain:
+        F[:, layout.head_table] -= m.K
+    return float(np.max(np.abs(np.linalg.eigvals(F)))) if np.all(np.isfinite(F)) else np.inf
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateProblem:
+    """Weighted errors of a state-space network over records; unknown are (weights, first state of every record)."""
+
+    layout: Layout
+    parts: Parts  # inputs with a last column of ones
+    weight: Array  # (n_outputs, n_outputs), errors times it have unit covariance
+    prior: float | None = None  # deviation of the hidden layer's weights before the data
+    held: slice = field(default_factory=lambda: slice(0, 0))  # weights that are not searched for
+    # modulus that no pole of the linear predictor A - K C may reach. Without it the search creeps towards a predictor
+    # that runs away from its first state on: on a plant without process noise that fits the sample a little better.
+    farthest: float = np.inf
+
+    def split(self, v: Array) -> tuple[Array, Array]:
+        """Return weights (n_theta,) and first states (n_records, width)."""
+        return v[: self.layout.n_theta], v[self.layout.n_theta :].reshape(len(self.parts), self.layout.width)
+
+    def errors(self, v: Array) -> tuple[list[Array], list[Array]]:
+        """Return states and errors of every record."""
+        theta, x0 = self.split(v)
+        m = self.layout.matrices(theta)
+        found = [run(self.layout, m, y, u, x) for (y, u), x in zip(self.parts, x0, strict=True)]
+        return [X for X, _ in found], [E for _, E in found]
+
+    def prior_rows(self, v: Array) -> Array:
+        """Return rows -w / prior for each weight w of the hidden layer, with their slopes before them."""
+        kept = np.arange(self.layout.n_directions, self.layout.n_theta) if self.prior else np.arange(0)
+        rows = np.zeros((kept.size, v.size + 1))
+        rows[np.arange(kept.size), kept] = 1.0 / (self.prior or 1.0)
+        rows[:, -1] = -v[kept] / (self.prior or 1.0)
+        return rows
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squares of all rows; infinite where the model diverges."""
+        weights = self.split(theta)[0]
+        if not np.all(np.isfinite(theta)) or np.max(np.abs(weights)) > 1e12:
+            return np.inf
+        with np.errstate(over="ignore", invalid="ignore"):
+            if np.isfinite(self.farthest) and not largest_pole(self.layout, weights) < self.farthest:
+                return np.inf
+            found = sum(float(np.sum((e @ self.weight) ** 2)) for e in self.errors(theta)[1])
+            found += float(np.sum(self.prior_rows(theta)[:, -1] ** 2))
+        return found if np.isfinite(found) else np.inf
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | r] of all rows."""
+        rows = [self.prior_rows(theta)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, (J, E) in enumerate(self._slopes(theta)):
+                small = triangle_of(
+                    [self._weighted(J[a : a + _ROWS], E[a : a + _ROWS]) for a in range(0, J.shape[0], _ROWS)]
+                )
+                rows.append(self._spread(small, k, theta.size))
+        whole = np.concatenate(rows)
+        whole[:, self.held] = 0.0
+        return triangle_of([whole])
+
+    def sample_rows(self, v: Array) -> list[Array]:
+        """Return slopes and errors of every sample, joined to ones of unit variance: (n_samples, p, v.size + 1)."""
+        out = []
+        for k, (J, E) in enumerate(self._slopes(v)):
+            both = self._weighted(J, E).reshape(self.layout.p, E.shape[0], -1)
+            out.append(np.moveaxis(self._spread(both, k, v.size), 0, 1))
+        return out
+
+    def _slopes(self, v: Array) -> Iterator[tuple[Array, Array]]:
+        """Slopes by (weights, own first state) and errors, of each record."""
+        theta, x0 = self.split(v)
+        layout, m = self.layout, self.layout.matrices(theta)
+        for (y, u), x in zip(self.parts, x0, strict=True):
+            X, E = run(layout, m, y, u, x)
+            s = np.hstack([np.zeros((layout.width, theta.size)), np.eye(layout.width)])
+            yield slopes(layout, m, u, X, E, s), E
+
+    def _spread(self, rows: Array, k: int, size: int) -> Array:
+        """Rows of record `k` over all unknown: other records' first states do not enter."""
+        P, n = self.layout.n_theta, self.layout.width
+        wide = np.zeros((*rows.shape[:-1], size + 1))
+        wide[..., :P], wide[..., P + k * n : P + (k + 1) * n] = rows[..., :P], rows[..., P:-1]
+        wide[..., -1] = rows[..., -1]
+        return wide
+
+    def _weighted(self, J: Array, E: Array) -> Array:
+        """Slopes and errors of all outputs, joined to ones of unit variance."""
+        out = np.empty((self.layout.p, J.shape[0], J.shape[2] + 1))
+        for q, row in enumerate(self.weight.T):
+            out[q, :, :-1] = row[q] * J[:, q]
+            out[q, :, -1] = E @ row
+            for o in range(q):  # the weight is triangular
+                out[q, :, :-1] += row[o] * J[:, o]
+        return out.reshape(-1, J.shape[2] + 1)
+
+
+# --- model -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateNetwork:
+    """A trained network with its scaling and the cloud of its training (implements `NonlinearModel`).
+
+    The state at the beginning is that which fits the first `lag` samples best, without G and K. Behind a sensor without
+    sign there is no one-step predictor: what is measured does not correct the state, and a prediction is the free run
+    from the state that fits best, of searches from rest and from both signs.
+    """
+
+    layout: Layout
+    theta: Array  # (n_theta,), weights; entries of A and B in SI, gains and hidden layer for scaled signals
+    u_level: Array  # (n_inputs,), SI, what deviations are taken from, and their size
+    u_scale: Array
+    y_level: Array  # (n_outputs,), SI
+    y_scale: Array
+    cloud: Cloud  # of states and inputs in training, scaled
+    delay: int = 0  # samples by which inputs act late
+
+    @property
+    def kind(self) -> str:
+        """``nn``, or ``nn-magnitude`` behind a sensor without sign."""
+        return "nn-magnitude" if self.layout.sensor else "nn"
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in s."""
+        return self.layout.dt
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return self.layout.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return self.layout.p
+
+    @property
+    def lag(self) -> int:
+        """Samples from which the first state is found."""
+        return self.delay + self._head
+
+    @property
+    def _head(self) -> int:
+        """Samples that the first state is fitted to."""
+        return 5 * self.layout.width if self.layout.sensor else max(3 * self.layout.n, 5)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the weights."""
+        return self.layout.names
+
+    @property
+    def A(self) -> Array:
+        """Weights of the states, shape (n, n), SI; continuous in the form ``one-axis``, else of a sample."""
+        size = np.array(self.layout.scale)[: self.layout.n]
+        found: Array = self._weights[:, : self.layout.n] * size[:, None] / size
+        return found
+
+    @property
+    def B(self) -> Array:
+        """Weights of the inputs, shape (n, n_inputs), SI; continuous in the form ``one-axis``, else of a sample."""
+        n, size = self.layout.n, np.array(self.layout.scale)
+        found: Array = self._weights[:, n:-1] * size[:n, None] / size[n:]
+        return found
+
+    @property
+    def _scaled(self) -> Array:
+        return self.theta / self.layout.unit
+
+    @property
+    def _weights(self) -> Array:
+        return self.layout.weights(self._scaled)
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other weights."""
+        return replace(self, theta=theta)
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.predict`; NaN from where the predictor diverges on."""
+        X = self.states(u, y)
+        out: Array = self.y_level + self.y_scale * X[:, self.layout.head_table]
+        out[: self.lag] = np.nan
+        return out
+
+    def states(self, u: Array, y: Array) -> Array:
+        """Return the predicted states, scaled: (n_samples, width).
+
+        The first `delay` rows are NaN, and all from where the predictor diverges on.
+        """
+        ys, us = self._late(u, y)
+        x0, _ = self._first_state(ys, us, derive=False)
+        out = np.full((np.asarray(u).shape[0], self.layout.width), np.nan)
+        out[self.delay :] = run(self.layout, self.layout.matrices(self._scaled), ys, us, x0)[0][:-1]
+        return out
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.jacobian`, that of the first state included."""
+        layout, m, (ys, us) = self.layout, self.layout.matrices(self._scaled), self._late(u, y)
+        x0, s = self._first_state(ys, us, derive=True)
+        X, E = run(layout, m, ys, us, x0)
+        out = np.zeros((np.asarray(u).shape[0], self.n_outputs, self.theta.size))
+        out[self.delay :] = slopes(layout, m, us, X, E, s) * (self.y_scale[:, None] / layout.unit)
+        out[: self.lag] = 0.0
+        return out
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.simulate`, from the state that these samples show."""
+        whole, head = with_head(self, u, y)
+        layout, m, (ys, us) = self.layout, self.layout.matrices(self._scaled), self._late(u, whole)
+        x0, _ = self._first_state(ys, us, derive=False)
+        k = min(self._head, us.shape[0])
+        x = run(layout, m, ys[:k], us[:k], x0)[0][-1]
+        rest = run(layout, m.without_gain(), ys[k:], us[k:], x)[0][:-1]
+        whole[head:] = self.y_level + self.y_scale * rest[:, layout.head_table]
+        return whole
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.novelty`, of predicted states and inputs (see `nonlinear.cloud`)."""
+        out = np.full(np.asarray(u).shape[0], np.nan)
+        out[self.lag :] = self.cloud.novelty(self.regressors(u, y))
+        return out
+
+    def regressors(self, u: Array, y: Array) -> Array:
+        """Return state and input one sample before each prediction, scaled: (n_samples - lag, width + n_inputs)."""
+        X, k = self.states(u, y), self.lag
+        us = (np.asarray(u, dtype=np.float64) - self.u_level) / self.u_scale
+        return np.hstack([X[k - 1 : -1], us[k - 1 - self.delay : us.shape[0] - 1 - self.delay]])
+
+    def _late(self, u: Array, y: Array) -> tuple[Array, Array]:
+        """Scaled outputs from `delay` on, each with the input that acts at its time and a one."""
+        ys, us = scaled(self, u, y)
+        us = us[: max(us.shape[0] - self.delay, 0)]
+        return np.ascontiguousarray(ys[self.delay :]), np.hstack([us, np.ones((us.shape[0], 1))])
+
+    def _first_state(self, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
+        """The first state that fits the first samples best, and its slopes by the weights."""
+        y, u = y[: self._head], u[: self._head]
+        if self.layout.sensor:
+            return _search_first_state(self.layout, self._scaled, y, u)
+        return _solve_first_state(self.layout, self.layout.matrices(self._scaled), y, u, derive=derive)
+
+    def as_json(self) -> dict[str, Any]:
+        """As `NonlinearModel.as_json`."""
+        x = self.layout
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        layout = {
+            "form": x.form,
+            "n_inputs": x.n_inputs,
+            "heads": list(x.heads),
+            "steps": list(x.steps),
+            "entries": [list(e) for e in x.entries],
+            "scale": list(x.scale),
+            "rates": list(x.rates),
+            "rows": list(x.rows),
+            "gain": x.gain,
+            "neurons": x.neurons,
+            "anchored": x.anchored,
+        }
+        return {"dt_s": x.dt, "delay": self.delay, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back from what `as_json` made."""
+        try:
+            given = found["layout"]
+            layout = Layout(
+                dt=float(found["dt_s"]),
+                form=str(given["form"]),
+                n_inputs=int(given["n_inputs"]),
+                heads=tuple(int(k) for k in given["heads"]),
+                steps=tuple(float(k) for k in given["steps"]),
+                entries=tuple((int(r), int(c)) for r, c in given["entries"]),
+                scale=tuple(float(k) for k in given["scale"]),
+                rates=tuple(float(k) for k in given["rates"]),
+                rows=tuple(int(k) for k in given["rows"]),
+                gain=bool(given["gain"]),
+                neurons=int(given["neurons"]),
+                sensor=not given["anchored"],
+            )
+            m, p = layout.n_inputs, layout.p
+            places = [*layout.rows, *(r for r, _ in layout.entries)]
+            columns = [c for _, c in layout.entries]
+            inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
+            inside = inside and max(columns) <= layout.n + m and max(layout.heads) < layout.width
+            if layout.form not in ("one-axis", "free") or not inside:
+                raise EstimationError("no state network: its states are not those of one. Write the file again")
+            arrays: dict[str, Any] = {
+                k: finite(found[k], n, k)
+                for k, n in {"theta": layout.n_theta, "u_level": m, "u_scale": m, "y_level": p, "y_scale": p}.items()
+            }
+            cloud = Cloud.from_json(found["cloud"], layout.width + m)
+            return cls(layout=layout, cloud=cloud, delay=int(found["delay"]), **arrays)
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise EstimationError(
+                f"no state network ({type(error).__name__}: {error}). Write the file again"
+            ) from error
+
+
+def _solve_first_state(layout: Layout, m: Matrices, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
+    """Least squares without hidden layer and gain, O x0 = y - (forced response), and its slopes by the weights.
+
+    With r what is left: dx0 = (O'O)^-1 (dO' r - O' d(O x0 + forced)).
+    """
+    n, P, heads, linear = layout.n, layout.n_theta, layout.head_table, m.without_gain(hidden=False)
+    still = np.zeros_like(y), np.zeros_like(u)
+    runs = [run(layout, linear, *still, e) for e in np.eye(n)]
+    forced = run(layout, linear, y, u, np.zeros(n))[0][:-1, heads].ravel()
+    O = np.stack([X[:-1, heads].ravel() for X, _ in runs], axis=1)  # noqa: E741
+    x0: Array = np.asarray(np.linalg.lstsq(O, y.ravel() - forced, rcond=None)[0], dtype=np.float64)
+    if not derive:
+        return x0, np.empty((n, 0))
+    X, E = run(layout, linear, y, u, x0)
+    D = slopes(layout, linear, u, X, E, np.zeros((n, P))).reshape(-1, P)
+    left = y.ravel() - forced - O @ x0
+    bent = np.stack([left @ slopes(layout, linear, still[1], X, E, np.zeros((n, P))).reshape(-1, P) for X, E in runs])
+    s: Array = np.ascontiguousarray(np.linalg.solve(O.T @ O, bent - O.T @ D), dtype=np.float64)
+    return x0, s
+
+
+def _search_first_state(layout: Layout, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
+    """Best of searches from rest and from both signs; slopes as least squares has them (Gauss-Newton).
+
+    They are exact where the first samples are fitted exactly, else to first order in what is left over.
+    """
+    P, first = layout.n_theta, float(y[0, 0]) if y.size else 0.0
+    problem = StateProblem(layout=layout, parts=((y, u),), weight=np.eye(1), held=slice(0, P))
+    best = None
+    for sign in _SIGNS:
+        x0 = np.zeros(layout.width)
+        x0[0], x0[-1] = sign * first, first
+        found = search(problem, np.concatenate([theta, x0]), stage="", most=30, tolerance=1e-10)
+        if best is None or found.cost < best.cost:
+            best = found
+    assert best is not None
+    J = np.concatenate([r[:, 0] for r in replace(problem, held=slice(0, 0)).sample_rows(best.theta)])
+    s = np.zeros((layout.width, P))
+    if np.all(np.isfinite(J)):
+        s = -np.linalg.lstsq(J[:, P:-1], J[:, :P], rcond=1e-10)[0]
+    return best.theta[P:], np.ascontiguousarray(s)

@@ -1,0 +1,474 @@
+"""First weights of a state-space network: delay, subspace model, the thesis's own training, and global search.
+
+A predictor-based subspace estimate (PBSID-opt) stands for any stability and under feedback. Its states are turned into
+those of the network: measured outputs, and rates (``one-axis``; after the matrix logarithm) or differences (``free``).
+Where it leads nowhere, differential evolution looks for the free entries of A, in the logarithm of their size with
+sign: over short shots the first state, B and the constants enter linearly and are solved for (variable projection,
+Golub and Pereyra 1973). Nothing runs away over a short shot, so that unstable plants have a finite cost everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.global_search import STAGE, GlobalFound, global_search
+from ambid.estimation.linear import triangle_of
+from ambid.estimation.progress import Tick, guessed, silent
+from ambid.estimation.scaling import noise_floor
+from ambid.estimation.search import search
+from ambid.nonlinear.fit import LearningCurve
+from ambid.nonlinear.records import Scaled
+from ambid.nonlinear.state_network import ONE_AXIS, Layout, free_entries, largest_pole
+from ambid.nonlinear.state_training import State, add_gain
+
+NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
+SHORT = 6  # samples of past that a subspace model looks back: enough where the plant is stable and sampled well
+
+LARGEST = 20  # samples of delay that are looked for
+_HISTORY = 12  # past outputs in the first guess of a delay
+_TAPS = 3  # inputs behind a delay
+_MOST = 5000  # samples that the first guess looks at
+_SHORT = 5  # iterations of a short training
+_WORTH = 2.0  # gain of the log likelihood, times two, for which a neighbour is taken
+_TRAINED = 3000  # samples that short trainings look at
+
+_SHOT = 128  # samples
+_SHOTS = 8192  # samples of a record that are cut into shots
+_DECADES = 4.5  # that rates may span, from the Nyquist frequency down
+_TRIED = 3  # members of the last generation that are tried as starts
+_PROCESS = (1e-8, 1e-5, 1e-2)  # variance of process noise over that of the states' steps, tried for the gain
+
+# --- subspace models -------------------------------------------------------------------------------------------------
+
+
+def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], past: int = SHORT) -> State | str:
+    """Return a first network of the form ``one-axis``, or the reason why there is none.
+
+    `heads` are the states (position, velocity, current) that outputs are; `past` samples the first model looks back.
+    """
+    found = _subspace(data, 3, past)
+    if isinstance(found, str):
+        return found
+    A, B, C, K = found
+    continuous = _logarithm(A, B, dt)
+    if continuous is None:
+        return "the sampled model has no continuous one (a pole on the negative real axis): sample faster"
+    Ac, Bc = continuous
+    at = {s: C[o] for o, s in enumerate(heads)}
+    if 0 not in at or 2 not in at:
+        return "position and current are needed as outputs"
+    velocity = at[1] if 1 in at else at[0] @ Ac
+    unit = 1.0 if 1 in at else float(np.linalg.norm(velocity)) or 1.0
+    T = np.stack([at[0], velocity / unit, at[2]])
+    if not np.linalg.cond(T) < 1e10:
+        return "position, velocity and current cannot be told apart in the record: excite more"
+    M = _in_states(T, Ac, Bc)
+    return _begin(one_axis_layout(data, dt, heads, unit, M), M, T @ K, data)
+
+
+def one_axis_layout(data: Scaled, dt: float, heads: tuple[int, ...], unit: float, M: Array) -> Layout:
+    """Return the layout of the form ``one-axis``.
+
+    A velocity that is not measured is scaled so that x1' = x2 in SI, `unit` being its size; `M` is [A | B | c].
+    """
+    scale = np.empty(3)
+    for o, s in enumerate(heads):
+        scale[s] = data.y_scale[o]
+    if 1 not in heads:
+        scale[1] = scale[0] * unit
+    return Layout(
+        form="one-axis", dt=dt, n_inputs=1, heads=heads, steps=(), entries=ONE_AXIS,
+        scale=(*scale.tolist(), *data.u_scale.tolist()),
+        rates=tuple(float(np.linalg.norm(M[r, :4])) or 1.0 for r in (1, 2)), rows=(1, 2),
+    )  # fmt: skip
+
+
+def start_free(data: Scaled, dt: float, n: int, past: int = SHORT) -> State | str:
+    """Return a first network of `n` states of the form ``free``, or the reason why there is none."""
+    p, m = data.y_level.size, data.u_level.size
+    if n < p:
+        raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
+    found = _subspace(data, n, past)
+    if isinstance(found, str):
+        return found
+    A, B, C, K = found
+    chains = tuple(n // p + (o < n % p) for o in range(p))
+    rows, steps = [], []
+    for o, length in enumerate(chains):
+        row = C[o]
+        for j in range(length):
+            rows.append(row)
+            ahead = row @ A - row
+            step = float(np.linalg.norm(ahead)) / max(float(np.linalg.norm(row)), 1e-300) if j + 1 < length else 0.0
+            steps.append(step)
+            row = ahead / step if step else row
+    T = np.stack(rows)
+    if not np.linalg.cond(T) < 1e10:
+        return "the outputs do not show all states: lower states, or excite more"
+    layout = Layout(
+        form="free", dt=dt, n_inputs=m, heads=tuple(int(x) for x in np.cumsum((0, *chains))[:-1]), steps=tuple(steps),
+        entries=free_entries(chains, m), scale=(*np.repeat(data.y_scale, chains).tolist(), *data.u_scale.tolist()),
+        rates=(1.0,) * n, rows=tuple(range(n)),
+    )  # fmt: skip
+    return _begin(layout, _in_states(T, A, B), T @ K, data)
+
+
+def _in_states(T: Array, A: Array, B: Array) -> Array:
+    """[A | B | 0] in the states T x."""
+    return np.hstack([T @ A @ np.linalg.inv(T), T @ B, np.zeros((T.shape[0], 1))])
+
+
+def _begin(layout: Layout, M: Array, K: Array, data: Scaled) -> State | str:
+    """The network with weights [A | B | c] = M and its gain, if it runs."""
+    theta = np.array([M[r, c] for r, c in layout.entries])
+    state = add_gain(State.of(layout, theta, data), data, K)
+    return NO_START if state is None else state
+
+
+def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Array] | str:
+    """Predictor-based subspace model of the longest record, in scaled signals."""
+    from ambid.blackbox.subspace import pbsid
+
+    y, u = max(data.parts, key=lambda part: part[0].shape[0])
+    names = tuple(f"u{k}" for k in range(u.shape[1])), tuple(f"y{k}" for k in range(y.shape[1]))
+    past = max(2 * -(-n // y.shape[1]), past)
+    past = min(past, max(y.shape[0] // (3 * (y.shape[1] + u.shape[1])) - 2, 2))
+    try:
+        io = IOData(u=u, y=y, dt=1.0, inputs=names[0], outputs=names[1], units=dict.fromkeys(names[0] + names[1], "1"))
+        model = pbsid(io, {"n": n}, past=past, horizon=past, feedthrough=False).model
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        return f"no first model: {error}"
+    found = tuple(np.asarray(getattr(model, k), dtype=np.float64) for k in "ABCK")
+    if not all(np.all(np.isfinite(x)) for x in found):
+        return "no first model: its matrices are not finite"
+    return found  # type: ignore[return-value]
+
+
+def _logarithm(A: Array, B: Array, dt: float) -> tuple[Array, Array] | None:
+    """Continuous A and B whose zero-order hold is A and B; None where there is no real one."""
+    from scipy.linalg import logm
+
+    n, m = B.shape
+    poles = np.linalg.eigvals(A)
+    if np.any((poles.real <= 0) & (np.abs(poles.imag) < 1e-9 * np.abs(poles))):
+        return None
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:], block[n:, n:] = A, B, np.eye(m)
+    found = np.asarray(logm(block))
+    if np.iscomplexobj(found):
+        if np.max(np.abs(found.imag)) > 1e-6 * np.max(np.abs(found.real)):
+            return None
+        found = found.real
+    return found[:n, :n] / dt, found[:n, n:] / dt
+
+
+def convert_to_continuous(layout: Layout, A: Array, B: Array) -> tuple[Array, Array] | None:
+    """Return continuous A and B in SI of sampled, scaled ones; None where there is no real logarithm."""
+    found = _logarithm(A, B, layout.dt)
+    return None if found is None else in_si(layout, *found)
+
+
+def in_si(layout: Layout, A: Array, B: Array) -> tuple[Array, Array]:
+    """Return scaled A (n, n) and B (n, n_inputs) in SI."""
+    n, size = layout.n, np.array(layout.scale)
+    return A * size[:n, None] / size[:n], B * size[:n, None] / size[n:]
+
+
+# --- delay -----------------------------------------------------------------------------------------------------------
+
+
+def shift_inputs(data: Scaled, delay: int) -> Scaled:
+    """Put each output beside the input that acts at its time, `delay` samples late."""
+    if not delay:
+        return data
+    return replace(data, parts=tuple((y[delay:], u[:-delay]) for y, u in data.parts))
+
+
+def guess_delay(data: Scaled) -> int:
+    """Return what two readings of a long linear fit on past outputs and inputs agree on at least.
+
+    The delay behind which a few inputs explain most, and the number of leading inputs that Bayes' criterion does
+    without; 0 where inputs explain nothing. Where inputs act weakly within a sample (fast sampling, much noise) this
+    cannot tell neighbours apart, and the network itself is trained a little way beside them (`find_delay`).
+    """
+    m, p = data.u_level.size, data.y_level.size
+    share = _MOST // len(data.parts)
+    parts = [(y[-share:], u[-share:]) for y, u in data.parts]
+    n, shortest = sum(y.shape[0] for y, _ in parts), min(y.shape[0] for y, _ in parts)
+    history = min(_HISTORY, n // (8 * (m + p)))
+    largest = min(LARGEST, n // (5 * max(m, 1)) - 2 * history, shortest - history - 10)
+    if not m or history < _TAPS or largest < 1:
+        return 0
+    lag, blocks = history + largest, []
+    for y, u in parts:
+        k = y.shape[0]
+        past = [y[lag - j : k - j] for j in range(1, history + 1)]
+        inputs = [u[lag - j : k - j] for j in range(1, lag + 1)]
+        blocks.append(np.hstack([np.ones((k - lag, 1)), *past, *inputs, y[lag:]]))
+    R, n = triangle_of(blocks), sum(b.shape[0] for b in blocks)
+    R = R[1 + history * p :, 1 + history * p :]
+
+    def error(first: int, last: int) -> float:
+        """Log determinant of what inputs of these lags leave, times the samples."""
+        columns = np.r_[(first - 1) * m : (last - 1) * m, R.shape[1] - p : R.shape[1]]
+        left = np.asarray(np.linalg.qr(R[:, columns], mode="r"))[(last - first) * m :, -p:]
+        return float(n * np.linalg.slogdet(left.T @ left / n + 1e-14 * np.eye(p))[1])
+
+    price = m * p * float(np.log(n))
+    if error(1, 1) - error(1, lag + 1) < lag * price:
+        return 0
+    few = int(np.argmin([error(k + 1, k + 1 + _TAPS) for k in range(largest + 1)]))
+    leading = int(np.argmin([error(k + 1, lag + 1) - k * price for k in range(largest + 1)]))
+    return min(few, leading)
+
+
+def find_delay(
+    state: State, whole: Scaled, delay: int, tick: Tick | None, *, rather_late: bool = False
+) -> tuple[int, dict[int, float]]:
+    """Go from a guess to a neighbour as long as a short training ends with smaller errors there.
+
+    `state` is a first network at `delay`, `whole` not yet shifted. The second value is the logarithm of the determinant
+    of the errors' covariance after a short training, by delay.
+    """
+    share = _TRAINED // len(whole.parts)
+    cut = replace(whole, parts=tuple((y[:share], u[:share]) for y, u in whole.parts))
+    n = sum(y.shape[0] for y, _ in cut.parts)
+    largest = min(LARGEST, min(y.shape[0] for y, _ in cut.parts) // 4) if whole.u_level.size else 0
+    errors = dict[int, float]()
+
+    def error(trial: int) -> float:
+        nonlocal state
+        if trial not in errors:
+            after = _train_shortly(state, shift_inputs(cut, trial))
+            errors[trial] = np.inf if after is None else after.score
+            if after is not None and errors[trial] <= min(errors.values()):
+                state = after
+            if tick is not None:
+                tick("delay", guessed(len(errors), 3.0))
+        return errors[trial]
+
+    for step in (1, -1):
+        worth = -step * float(np.log(n)) if rather_late else _WORTH
+        while 0 <= delay + step <= largest and n * (error(delay) - error(delay + step)) > worth:
+            delay += step
+    return delay, {k: v for k, v in sorted(errors.items()) if np.isfinite(v)}
+
+
+def _train_shortly(state: State, data: Scaled) -> State | None:
+    at = State.of(state.layout, state.theta, data)
+    begun = at.at(at.problem(data), at.vector)
+    if begun is None:
+        return None
+    problem = replace(begun.problem(data), farthest=max(1.0, 1.001 * largest_pole(begun.layout, begun.theta)))
+    found = search(problem, begun.vector, stage="", most=_SHORT, tolerance=0.0, damping=1e-6)
+    return begun.at(problem, found.theta)
+
+
+# --- the thesis's training ------------------------------------------------------------------------------------------
+
+
+def train_one_step(
+    state: State, data: Scaled, iterations: int
+) -> tuple[tuple[LearningCurve, LearningCurve], dict[str, object]]:
+    """Train one-step errors of the network's states as the thesis does, and by Gauss-Newton, from weights of zero.
+
+    J = sum |x(k+1) - A x(k) - B u(k) - c|^2 with measured states where all are, else predicted ones; v <- v - eta dJ/dv
+    (thesis eqs 5.1, 5.2). Noise on the states biases what both converge to. A and B, in SI and continuous in the form
+    ``one-axis``, are given by training.
+    """
+    problem, layout = state.problem(data), state.layout
+    X = [x[:-1] for x in problem.errors(state.vector)[0]]
+    if layout.p == layout.n:
+        X = [y[:, np.argsort(layout.heads)] for y, _ in data.parts]
+    began = perf_counter()
+    size = np.maximum(np.concatenate(X).std(axis=0), 1e-300)
+    rows = [np.hstack([x[:-1] / size, u[:-1], x[1:] / size]) for x, (_, u) in zip(X, problem.parts, strict=True)]
+    n, d = layout.n, layout.n + layout.n_inputs + 1
+    N = sum(r.shape[0] for r in rows)
+    R = triangle_of(rows)
+    known, target = R[:, :d], R[:, d:]
+    prepared = perf_counter() - began
+
+    def rms(v: Array) -> float:
+        return float(np.sqrt(np.sum((target - known @ v) ** 2) / (N * n)))
+
+    curvature = float(np.linalg.svd(known, compute_uv=False)[0] ** 2)
+    v = np.zeros((d, n))
+    seconds, errors = [prepared], [rms(v)]
+    for _ in range(iterations):
+        v = v + known.T @ (target - known @ v) / curvature
+        seconds.append(perf_counter() - began)
+        errors.append(rms(v))
+    again = perf_counter()
+    solved: Array = np.asarray(np.linalg.lstsq(known, target, rcond=1e-13)[0], dtype=np.float64)
+    curves = (
+        LearningCurve(
+            method="steepest descent (thesis eq. 5.2), one-step errors of the states",
+            seconds=np.array(seconds),
+            training=np.array(errors),
+        ),
+        LearningCurve(
+            method="Gauss-Newton, one-step errors of the states",
+            seconds=np.array([prepared, prepared + perf_counter() - again]),
+            training=np.array([errors[0], rms(solved)]),
+        ),
+    )
+    back = np.concatenate([1.0 / size, np.ones(d - n)])
+    found: dict[str, object] = {}
+    for name, w in (("steepest descent", v), ("Gauss-Newton", solved)):
+        M = (w * back[:, None] * size).T
+        convert = convert_to_continuous if layout.form == "one-axis" else in_si
+        both = convert(layout, M[:, :n], M[:, n:-1])
+        found[name] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
+    return curves, found
+
+
+# --- global search ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShotCost:
+    """Cost of the free entries of A over short shots, everything linear solved for."""
+
+    layout: Layout  # form ``one-axis``
+    Y: Array  # (n_shots, n_samples, n_outputs), outputs over their noise
+    u: Array  # (n_shots, n_samples)
+    noise: Array  # (n_outputs,), outputs' noise, scaled
+
+    @property
+    def searched(self) -> list[tuple[int, int]]:
+        """Entries of A that are free."""
+        return [(r, c) for r, c in self.layout.entries if c < 3]
+
+    @property
+    def fastest(self) -> float:
+        """Largest rate that is looked for, 1/s: a decay within a sample."""
+        return 2.0 / self.layout.dt
+
+    def entries(self, z: Array) -> Array:
+        """Return rates in 1/s from numbers in -1 .. 1: sign, and logarithm of the size."""
+        whole = _DECADES * np.log(10.0)
+        out: Array = self.fastest * np.sinh(whole * z) / np.sinh(whole)
+        return out
+
+    def __call__(self, z: Array) -> float:
+        """Return the logarithm of the determinant of the errors' covariance; infinite where numbers overflow."""
+        found = self.solve(z)
+        return np.inf if found is None else found[1]
+
+    def solve(self, z: Array) -> tuple[Array, float, Array] | None:
+        """Return all weights, the cost, and the errors' covariance, all scaled."""
+        from scipy.linalg import expm, toeplitz
+
+        layout, (S, N, p) = self.layout, self.Y.shape
+        theta = np.zeros(layout.n_theta)
+        a = dict(zip(self.searched, self.entries(z), strict=True))
+        for k, at in enumerate(layout.entries):
+            theta[k] = a.get(at, 0.0)
+        linear = [(k, r, c) for k, (r, c) in enumerate(layout.entries) if c >= 3]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            block = np.zeros((6, 6))
+            block[:3, :3], block[:3, 3:] = layout.weights(theta)[:, :3], np.eye(3)
+            sampled = expm(block * layout.dt)
+            if not np.all(np.isfinite(sampled)):
+                return None
+            powers = np.empty((N, 3, 3))  # from the first state to the outputs of each sample
+            powers[0] = np.eye(3)
+            for t in range(1, N):
+                powers[t] = powers[t - 1] @ sampled[:3, :3]
+            seen = powers[:, list(layout.heads)] / self.noise[:, None]
+            if not np.all(np.isfinite(seen)) or np.max(np.abs(seen)) > 1e100:
+                return None
+            O = seen.reshape(N * p, 3)  # noqa: E741
+            Q = np.linalg.qr(O / np.maximum(np.linalg.norm(O, axis=0), 1e-300))[0]
+            columns = []
+            for _, r, c in linear:
+                h = np.vstack([np.zeros((1, p)), seen[:-1] @ sampled[:3, 3 + r]])
+                if c == 4:
+                    columns.append(np.broadcast_to(np.cumsum(h, axis=0), (S, N, p)))
+                else:
+                    columns.append(np.stack([self.u @ toeplitz(h[:, o], np.zeros(N)).T for o in range(p)], axis=2))
+            flat = [x.reshape(S, N * p) for x in (self.Y, *columns)]
+            target, *forced = (x - (x @ Q) @ Q.T for x in flat)
+            F = np.stack([x.ravel() for x in forced], axis=1)
+            if not np.all(np.isfinite(F)):
+                return None
+            size = np.maximum(np.linalg.norm(F, axis=0), 1e-300)
+            weights = np.linalg.lstsq(F / size, target.ravel(), rcond=1e-10)[0] / size
+            left = (target.ravel() - F @ weights).reshape(S * N, p)
+        for (k, _, _), w in zip(linear, weights, strict=True):
+            theta[k] = w
+        noise = left.T @ left / (S * N)
+        if not np.all(np.isfinite(noise)):
+            return None
+        return theta, float(np.linalg.slogdet(noise + 1e-12 * np.eye(p))[1]), noise * self.noise[:, None] * self.noise
+
+
+def shot_cost(data: Scaled, dt: float, heads: tuple[int, ...]) -> ShotCost:
+    """Cut records into short shots; `heads` are the states (position, velocity, current) that outputs are."""
+    shortest = min(y.shape[0] for y, _ in data.parts)
+    length = max(min(_SHOT, shortest // 3), 8)
+    Y, u = [], []
+    for y, v in data.parts:
+        last = min(y.shape[0], max(_SHOTS // len(data.parts), length)) // length * length
+        Y.append(y[:last].reshape(-1, length, y.shape[1]))
+        u.append(v[:last, 0].reshape(-1, length))
+    # a velocity of the size that entries of A then have in the middle of what is searched
+    layout = one_axis_layout(data, dt, heads, 2.0 / dt * 10.0 ** (-_DECADES / 2.0), np.zeros((3, 5)))
+    noise = np.maximum(noise_floor(np.concatenate([y for y, _ in data.parts])), 1e-9)
+    return ShotCost(layout=layout, Y=np.concatenate(Y) / noise, u=np.concatenate(u), noise=noise)
+
+
+def search_start(
+    data: Scaled, dt: float, heads: tuple[int, ...], *, seed: int, evaluations: int, tick: Tick = silent
+) -> tuple[State | None, GlobalFound]:
+    """Search globally for a network of form ``one-axis`` that runs on the records, a predictor gain with it.
+
+    There is no state where no gain keeps the predictor finite.
+    """
+    cost = shot_cost(data, dt, heads)
+    n = len(cost.searched)
+    found = global_search(
+        cost, -np.ones(n), np.ones(n), seed=[seed, 5], evaluations=evaluations, tick=tick, stage=STAGE
+    )
+    best: State | None = None
+    for z in (found.vector, *found.best[1:_TRIED]):
+        state = _add_kalman_gain(cost, z, data)
+        if state is not None and (best is None or state.score < best.score):
+            best = state
+    return best, found
+
+
+def _add_kalman_gain(cost: ShotCost, z: Array, data: Scaled) -> State | None:
+    """The network with the Kalman gain of a guessed process noise, the best of several guesses."""
+    from scipy.linalg import solve_discrete_are
+
+    solved = cost.solve(z)
+    if solved is None:
+        return None
+    theta, _, noise = solved
+    layout = replace(
+        cost.layout, rates=tuple(float(np.linalg.norm(cost.layout.weights(theta)[r, :4])) or 1.0 for r in (1, 2))
+    )
+    bare = State.of(layout, theta, data)
+    m: Any = layout.matrices(theta)
+    C = np.eye(3)[list(layout.heads)]
+    step = np.maximum(np.abs(m.A - np.eye(3)).sum(axis=1), 1e-9) ** 2
+    best: State | None = None
+    for q in _PROCESS:
+        try:
+            P = solve_discrete_are(m.A.T, C.T, q * np.diag(step), noise + 1e-12 * np.eye(layout.p))
+            K = np.linalg.solve(C @ P @ C.T + noise, C @ P @ m.A.T).T
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        state = add_gain(bare, data, K)
+        if state is not None and (best is None or state.score < best.score):
+            best = state
+    return best

@@ -1,0 +1,441 @@
+"""Training of a state-space network: weights and first states by Levenberg-Marquardt, gain, hidden layer, covariance.
+
+The hidden layer's weights are N(0, prior^2), its output 1 being the size of the linear part of its row. Units are
+anchored, without value and slope at the operating point, so that A and B are the linearisation there (thesis eq. 4.9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.estimation.linear import information_inverse
+from ambid.estimation.progress import Tick, part_of
+from ambid.estimation.search import search
+from ambid.estimation.uncertainty import bootstrapped, sandwich
+from ambid.nonlinear.cloud import cloud_of
+from ambid.nonlinear.failed import failed_fit, provenance
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.records import Scaled
+from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
+
+_ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
+_SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
+_ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
+_LAGS = 20  # of the test for whiteness
+_PAST = 10  # samples of errors and inputs that a regression of the errors looks at
+_LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
+FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed
+_AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class State:
+    """A network on its way."""
+
+    layout: Layout
+    theta: Array  # (n_theta,), scaled
+    x0: Array  # (n_records, width), scaled, first states
+    noise: Array  # (n_outputs, n_outputs), scaled, covariance of its errors
+    n_rows: int  # samples in all
+    prior: float | None = None  # deviation of the hidden layer's weights before the data
+
+    @classmethod
+    def of(cls, layout: Layout, theta: Array, data: Scaled) -> State:
+        """Return a network that starts each record from its first outputs."""
+        x0 = np.zeros((len(data.parts), layout.width))
+        for k, (y, _) in enumerate(data.parts):
+            x0[k, layout.head_table] = y[0]
+        n = sum(y.shape[0] for y, _ in data.parts)
+        return cls(layout=layout, theta=theta, x0=x0, noise=np.eye(layout.p), n_rows=n)
+
+    @property
+    def vector(self) -> Array:
+        """Weights and first states, shape (n_theta + n_records width,)."""
+        return np.concatenate([self.theta, self.x0.ravel()])
+
+    @property
+    def K(self) -> Array:
+        """Gain, shape (n, n_outputs)."""
+        return self.layout.matrices(self.theta).K
+
+    @property
+    def score(self) -> float:
+        """Logarithm of the determinant of the errors' covariance: what maximum likelihood makes small."""
+        return float(np.linalg.slogdet(self.noise + _LEAST**2 * np.eye(self.layout.p))[1])
+
+    @property
+    def size(self) -> float:
+        """Errors in deviations of the outputs, the geometric mean over outputs."""
+        return float(np.exp(self.score / self.layout.p / 2.0))
+
+    @property
+    def bic(self) -> float:
+        """Bayes' criterion."""
+        return self.n_rows * self.score + self.layout.n_theta * float(np.log(self.n_rows))
+
+    @property
+    def stable(self) -> bool:
+        """Whether no pole lies outside the unit circle, integrators allowed."""
+        return bool(np.max(np.abs(np.linalg.eigvals(self.layout.matrices(self.theta).A))) < 1.0 + 1e-4)
+
+    def simulates(self, data: Scaled) -> bool:
+        """Return whether it runs freely with errors no larger than twice the outputs' deviations."""
+        at = self.at(self.problem(data), self.vector)
+        return at is not None and bool(np.all(np.diag(at.noise) < 4.0))
+
+    def widen(self, **changes: Any) -> State:
+        """Return the same network with another ``gain`` or number of ``neurons``; new weights are zero."""
+        layout, theta = self.layout.widen(self.theta, **changes)
+        return replace(self, layout=layout, theta=theta)
+
+    def problem(self, data: Scaled) -> StateProblem:
+        """Return the problem whose errors have unit covariance here."""
+        noise = self.noise + _LEAST**2 * np.eye(self.layout.p)
+        return StateProblem(
+            layout=self.layout,
+            parts=tuple(
+                (np.ascontiguousarray(y), np.hstack([u, np.ones((u.shape[0], 1))])) for y, u in data.parts
+            ),
+            weight=np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(noise)).T),
+            prior=self.prior,
+        )  # fmt: skip
+
+    def at(self, problem: StateProblem, v: Array) -> State | None:
+        """Return the network at another vector, with the covariance of its errors; None where it diverges."""
+        theta, x0 = problem.split(v)
+        with np.errstate(over="ignore", invalid="ignore"):
+            e = np.concatenate(problem.errors(v)[1])
+            noise = e.T @ e / e.shape[0]
+        return replace(self, theta=theta, x0=x0, noise=noise) if np.all(np.isfinite(noise)) else None
+
+
+class Interrupted(KeyboardInterrupt):
+    """An interruption in the middle of a search, with the best network of that search."""
+
+    def __init__(self, state: State) -> None:
+        super().__init__()
+        self.state = state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Training:
+    """What a training came to."""
+
+    state: State
+    curve: LearningCurve
+    converged: bool
+
+
+# --- training --------------------------------------------------------------------------------------------------------
+
+
+def train(
+    state: State, data: Scaled, *, stage: str, iterations: int, tick: Tick | None, damping: float | None = None
+) -> Training | None:
+    """Search for weights and first states over whole records; None where the start diverges."""
+    at = state.at(state.problem(data), state.vector)
+    if at is None:
+        return None
+    seconds, errors, converged = [0.0], list[float](), False
+    if damping is None:  # physics alone begins near: Gauss-Newton at once
+        damping = 1e-3 if state.layout.neurons else 1e-9
+    for k in range(_ROUNDS):
+        before, problem, best = at, at.problem(data), [at.vector]
+        if at.layout.gain:  # a start that is not stable may stay so
+            problem = replace(problem, farthest=max(1.0, largest_pole(at.layout, at.theta) * (1.0 + 1e-9)))
+        try:
+            found = search(
+                problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
+                damping=damping, tick=part_of(tick, *_SHARES[k : k + 2]), keep=best.append,
+            )  # fmt: skip
+        except KeyboardInterrupt as stop:
+            raise Interrupted(at.at(problem, best[-1]) or at) from stop
+        seconds += [seconds[-1] + t for t in found.seconds]
+        errors += [before.size * float(np.sqrt(c / (at.n_rows * at.layout.p))) for c in found.costs]
+        converged = found.converged
+        after = at.at(problem, found.theta)
+        if after is None:
+            break
+        at = after
+        if abs(before.score - at.score) < 0.02:
+            break
+    what = "prediction" if state.layout.gain else "simulation"
+    curve = LearningCurve(
+        method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds[1:]), training=np.array(errors)
+    )
+    return Training(state=at, curve=curve, converged=converged)
+
+
+def add_gain(state: State, data: Scaled, K: Array) -> State | None:
+    """Return the network with a predictor gain near `K` (n, p), scaled; None if it diverges with every try."""
+    wide = state.widen(gain=True)
+    layout, problem = wide.layout, wide.problem(data)
+    k = len(layout.entries)
+    heads = np.zeros((layout.n, layout.p))
+    heads[layout.head_table, range(layout.p)] = 0.5
+    best: State | None = None
+    for gain in (K, 0.5 * K, heads, 0.0 * K):
+        v = wide.vector
+        v[k : layout.n_directions] = gain.ravel()
+        tried = wide.at(problem, v)
+        if tried is not None and (best is None or tried.score < best.score):
+            best = tried
+    return best
+
+
+def add_units(state: State, neurons: int, prior: float, seed: list[int]) -> State:
+    """Put a hidden layer on the physics, in place of one that may be there, with random directions and no effect."""
+    new = state.widen(neurons=0).widen(neurons=neurons)
+    layout, rng = new.layout, np.random.default_rng(seed)
+    k, (n_W1, n_b1, _) = layout.n_directions, layout.hidden_sizes
+    size = 1.0 if layout.sensor else np.sqrt(layout.n + layout.n_inputs)
+    new.theta[k : k + n_W1] = rng.standard_normal(n_W1) / size
+    new.theta[k + n_W1 : k + n_W1 + n_b1] = rng.standard_normal(n_b1)
+    return replace(new, prior=prior)
+
+
+# --- judgement -------------------------------------------------------------------------------------------------------
+
+
+def is_white(state: State, data: Scaled) -> bool:
+    """Return whether the errors are white (Ljung and Box 1978, all outputs together)."""
+    from scipy.stats import chi2
+
+    problem = state.problem(data)
+    total, p = 0.0, state.layout.p
+    for e in problem.errors(state.vector)[1]:
+        w = (e - e.mean(axis=0)) @ problem.weight
+        n = w.shape[0]
+        for lag in range(1, _LAGS + 1):
+            r = w[lag:].T @ w[:-lag] / n
+            total += n * (n + 2) * float(np.sum(r**2)) / (n - lag)
+    freedom = _LAGS * p**2 * len(data.parts)
+    return total < float(chi2.ppf(0.999, freedom))
+
+
+def misfit(state: State, data: Scaled) -> float:
+    """Return the part of the errors' variance that a linear regression on the past explains, 1 where it diverges.
+
+    On past errors and inputs; on past inputs alone for a network without gain, whose errors may be coloured. About 0
+    where a search ended well: a linear model of high order predicts no better. Corrected for chance.
+    """
+    rows, targets = [], []
+    problem = state.problem(data)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = problem.errors(state.vector)[1]
+    for e, (_, u) in zip(errors, problem.parts, strict=True):
+        known = np.hstack([e, u[:, :-1]]) if state.layout.gain else u[:, :-1]
+        n = e.shape[0]
+        past = [known[_PAST - k : n - k] for k in range(1, _PAST + 1)]
+        rows.append(np.hstack([*past, np.ones((n - _PAST, 1))]))
+        targets.append(e[_PAST:])
+    Z, E = np.concatenate(rows), np.concatenate(targets)
+    if not np.all(np.isfinite(E)):
+        return 1.0
+    left = E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]
+    n, p = E.shape
+    before, after = E.T @ E / n, left.T @ left / max(n - Z.shape[1], 1)
+    tiny = 1e-14 * np.eye(p)
+    gained = float(np.linalg.slogdet(after + tiny)[1] - np.linalg.slogdet(before + tiny)[1])
+    return 1.0 - float(np.exp(gained / p))
+
+
+# --- standard deviations ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spread:
+    """Spread of the weights."""
+
+    covariance: Array | None  # (n_theta, n_theta), or None, in the units of the model's weights
+    origin: str  # for `NonlinearFit.covariance_from`
+    condition: float  # of the scaled information's root
+    warnings: tuple[str, ...] = ()
+
+
+def estimate_spread(
+    state: State, data: Scaled, how: str, seed: int, tick: Tick | None, rivals: Sequence[State] = ()
+) -> Spread:
+    """Return the spread of trained weights, the first states counted; `rivals` are what other starts came to."""
+    problem, v = state.problem(data), state.vector
+    P, condition = information_inverse(problem.triangle(v)[:, :-1])
+    if how == "none" or P is None:
+        reason = (
+            "no covariance was asked for, and so there are no standard deviations"
+            if how == "none"
+            else f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
+            "Fewer states or neurons, or more excitation"
+        )
+        return Spread(covariance=None, origin="", condition=condition, warnings=(reason,))
+    origin = "laplace" if state.layout.neurons else "information"
+    if how == "auto":
+        how = "laplace" if is_white(state, data) else "sandwich"
+    if how == "sandwich":
+        rows = problem.sample_rows(v)
+        scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
+        prior = problem.prior_rows(v)[:, :-1]
+        P, _ = sandwich(problem.triangle(v)[:, :-1], scores, prior.T @ prior, [r[:, :, :-1] for r in rows])
+        assert P is not None
+        origin = "sandwich"
+    elif how == "bootstrap":
+        P, origin = bootstrapped(problem.sample_rows(v), problem.prior_rows(v), seed, tick), "bootstrap"
+    unit, k = state.layout.unit, state.theta.size
+    covariance = P[:k, :k] * unit[:, None] * unit
+    extra, warnings = disagreement(state, rivals, covariance)
+    if state.layout.neurons and state.layout.anchored:
+        warnings = (
+            "A and B are the slope that the network gives at the operating point; what its units cannot follow of the "
+            "plant is not in their standard deviations. Compare a fit with more neurons, or with a smaller swing",
+            *warnings,
+        )
+    return Spread(covariance=covariance + extra, origin=origin, condition=condition, warnings=warnings)
+
+
+def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return what starts that fit about as well disagree by, to be added to the covariance, and what to say of it.
+
+    A hidden layer of few units only comes near to what the plant does: where other starts end with errors as small but
+    other A and B, the likelihood alone is too sure of them. `covariance` is in the units of the model's weights.
+    """
+    k = len(state.layout.entries)
+    unit, extra = state.layout.unit[:k], np.zeros_like(covariance)
+    close = [r for r in rivals if r.score < state.score + _AS_GOOD * state.layout.p and r.layout.neurons]
+    if len(close) < 2:
+        return extra, ()
+    apart = np.array([(r.theta[:k] - state.theta[:k]) * unit for r in close])
+    extra[:k, :k] = apart.T @ apart / (len(close) - 1.0)
+    ratio = np.sqrt(np.diag(extra)[:k] / np.maximum(np.diag(covariance)[:k], 1e-300))
+    if not np.max(ratio) > 1.0:
+        return extra, ()
+    worst = int(np.argmax(ratio))
+    return extra, (
+        f"starts of the hidden layer that fit about as well disagree about {state.layout.names[worst]} by "
+        f"{ratio[worst]:.1f} of the deviations that the likelihood gives; standard deviations count that. More neurons "
+        "or starts, or a smaller swing, settle it",
+    )
+
+
+# --- the fit ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Fitting:
+    """What a fit has come to, so that an interruption loses nothing."""
+
+    data: Scaled  # each output beside the input that acts at its time
+    delay: int = 0
+    state: State | None = None  # the best network so far; None before the first
+    status: Literal["converged", "stalled"] = "converged"
+    rivals: list[State] = field(default_factory=list)  # what every start of a hidden layer came to
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def take(self, found: Training | None, *, even_worse: bool = False) -> None:
+        """Take over a network if it is better, or of another size, and its learning curve."""
+        if found is None:
+            return
+        self.curves.append(found.curve)
+        self.keep(found, even_worse=even_worse)
+
+    def keep(self, found: Training, *, even_worse: bool = False) -> None:
+        """Take over a network if it is better, or of another size."""
+        at, now = found.state, self.state
+        if even_worse or now is None or at.layout.neurons != now.layout.neurons or at.score < now.score:
+            self.state, self.status = at, "converged" if found.converged else "stalled"
+
+
+def finish(
+    records: Sequence[IOData],
+    used: Mapping[str, Any],
+    fitting: Fitting,
+    reason: str,
+    *,
+    seed: int,
+    how: str = "laplace",
+    tick: Tick | None = None,
+) -> NonlinearFit:
+    """Return the fit of a trained network; failed where there is none, or none that runs on its own records.
+
+    `used` are the settings, `how` is where standard deviations come from, `reason` why there is no network.
+    """
+    state, data = fitting.state, fitting.data
+    if state is None:
+        return failed_fit("nn", records, {"states": 0, **used}, seed, reason, fitting.timing_s)
+    used = {**used, "states": state.layout.n}
+    state = state.at(state.problem(data), state.vector)
+    model = None if state is None else _make_model(records, data, state, fitting.delay)
+    if state is None or model is None:
+        reason = "the network does not stay finite on the records that it was trained on: check the columns"
+        return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
+    began = perf_counter()
+    spread = estimate_spread(state, data, how, seed, tick, fitting.rivals)
+    fitting.timing_s["standard deviations"] = perf_counter() - began
+    fitting.timing_s["all"] = sum(fitting.timing_s.values())
+    freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
+    noise = state.noise * state.n_rows / freedom
+    return NonlinearFit(
+        structure="nn",
+        settings=used,
+        model=model,
+        covariance=spread.covariance,
+        covariance_from=spread.origin,
+        n_estimated=int(state.theta.size),
+        noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
+        seed=seed,
+        status=fitting.status,
+        curves=tuple(fitting.curves),
+        warnings=(*fitting.warnings, *_caution(records, state), *spread.warnings),
+        timing_s=dict(fitting.timing_s),
+        details={**fitting.details, **_details(state, model), "condition": spread.condition},
+        **provenance(records),
+    )
+
+
+def _make_model(records: Sequence[IOData], data: Scaled, state: State, delay: int) -> StateNetwork | None:
+    """The model with the cloud of its own states in training; None where it leaves the finite numbers there."""
+    model = StateNetwork(
+        layout=state.layout,
+        theta=state.theta * state.layout.unit,
+        u_level=data.u_level,
+        u_scale=data.u_scale,
+        y_level=data.y_level,
+        y_scale=data.y_scale,
+        cloud=cloud_of(np.zeros((1, state.layout.width + state.layout.n_inputs))),
+        delay=delay,
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        z = np.concatenate([model.regressors(x.u, x.y) for x in records])
+    if not np.all(np.isfinite(z)) or not np.all(np.isfinite(model.theta)):
+        return None
+    return replace(model, cloud=cloud_of(z))
+
+
+def _caution(records: Sequence[IOData], state: State) -> tuple[str, ...]:
+    if not records[0].n_inputs or all(x.open_loop for x in records) or state.layout.gain:
+        return ()
+    way_out = "say " if state.layout.sensor else "say noise = innovations, or "
+    return (
+        "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
+        f"records are open loop: {way_out}--open-loop if there was no feedback",
+    )
+
+
+def _details(state: State, model: StateNetwork) -> dict[str, object]:
+    if state.layout.sensor:
+        return {"poles": [[float(p.real), float(p.imag)] for p in np.linalg.eigvals(model.A)]}
+    return {
+        "form": state.layout.form,
+        "gain": state.layout.gain,
+        "A": model.A.tolist(),
+        "B": model.B.tolist(),
+        "K": state.K.tolist(),
+    }
