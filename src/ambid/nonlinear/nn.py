@@ -34,7 +34,6 @@ from ambid.nonlinear.state_start import (
     train_one_step,
 )  # fmt: skip
 from ambid.nonlinear.state_training import (
-    FAR,
     Fitting,
     Interrupted,
     State,
@@ -103,7 +102,9 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         reason = _start(s, whole, records[0], fitting, tick)
         if not reason:
             _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
-        reason = _rescue(s, whole, records[0], fitting, seed, tick, reason)
+        reason = _rescue(s, whole, records[0], fitting, seed, tick, reason, asked=bool(given.get("evaluations")))
+        if fitting.state is not None:
+            fitting.warnings += _suspect(s, fitting)
     except KeyboardInterrupt as stop:
         if isinstance(stop, Interrupted):
             fitting.state = stop.state
@@ -276,14 +277,25 @@ def _choose_states(fitting: Fitting, tick: Tick | None) -> None:
 
 
 def _rescue(
-    s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting, seed: int, tick: Tick | None, reason: str
+    s: Mapping[str, Any],
+    whole: Scaled,
+    record: IOData,
+    fitting: Fitting,
+    seed: int,
+    tick: Tick | None,
+    reason: str,
+    *,
+    asked: bool,
 ) -> str:
-    """Search globally where ordinary starts failed, and train what was found; return what is left of the reason."""
+    """Search globally where ordinary starts failed, and train what was found; return what is left of the reason.
+
+    Where the search was `asked` for, errors that are suspect are enough.
+    """
     before, why = fitting.state, reason
     if before is not None:
-        unexplained = misfit(before, fitting.data)
-        if unexplained > FAR:
-            why = f"a linear regression on the past explains {100 * unexplained:.0f} % of the errors' variance"
+        left = misfit(before, fitting.data)
+        if left.failed or (asked and left.suspect):
+            why = str(left)
     if not why or s["form"] != "one-axis" or not s["evaluations"]:
         return reason
     began, second = perf_counter(), Fitting(data=fitting.data, delay=fitting.delay)
@@ -321,6 +333,19 @@ def _rescue(
         setattr(fitting, name, getattr(second, name))
     fitting.curves += second.curves
     return ""
+
+
+def _suspect(s: Mapping[str, Any], fitting: Fitting) -> list[str]:
+    """Say so where a linear regression finds more in the errors than chance puts there."""
+    assert fitting.state is not None
+    left = misfit(fitting.state, fitting.data)
+    if not left.suspect:
+        return []
+    searchable = s["form"] == "one-axis" and "global_search" not in fitting.details
+    return [
+        f"{left}: the training ended in a wrong minimum, or the plant has more to it than this network"
+        + (". Say evaluations=2000 for a global search" if searchable else "")
+    ]
 
 
 def _is_better(after: State | None, before: State | None) -> bool:

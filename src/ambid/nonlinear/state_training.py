@@ -31,7 +31,9 @@ _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
 _LAGS = 20  # of the test for whiteness
 _PAST = 10  # samples of errors and inputs that a regression of the errors looks at
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
-FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed
+_FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
+_SUSPECT = 0.005  # .. and from which it is worth a warning, if it is more than chance
+_CHANCE = 1e-3
 _AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
 
 
@@ -220,12 +222,34 @@ def is_white(state: State, data: Scaled) -> bool:
     return total < float(chi2.ppf(0.999, freedom))
 
 
-def misfit(state: State, data: Scaled) -> float:
-    """Return the part of the errors' variance that a linear regression on the past explains, 1 where it diverges.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Misfit:
+    """What a linear regression on the past makes of the errors; little where a search ended well."""
 
-    On past errors and inputs; on past inputs alone for a network without gain, whose errors may be coloured. About 0
-    where a search ended well: a linear model of high order predicts no better. Corrected for chance.
+    share: float  # of the errors' variance that it explains, corrected for chance; 1 where the network diverges
+    p: float  # chance of so much where the past says nothing
+
+    @property
+    def failed(self) -> bool:
+        """Whether the training went nowhere."""
+        return self.share > _FAR
+
+    @property
+    def suspect(self) -> bool:
+        """Whether the training may have ended in a wrong minimum."""
+        return self.share > _SUSPECT and self.p < _CHANCE
+
+    def __str__(self) -> str:
+        return f"a linear regression on the past explains {100 * self.share:.2g} % of the errors' variance"
+
+
+def misfit(state: State, data: Scaled) -> Misfit:
+    """Regress errors on past errors and inputs; on past inputs alone without gain, where errors may be coloured.
+
+    A linear model of high order predicts no better than a network that is at its best, unless the plant has more to it.
     """
+    from scipy.stats import chi2
+
     rows, targets = [], []
     problem = state.problem(data)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -238,13 +262,13 @@ def misfit(state: State, data: Scaled) -> float:
         targets.append(e[_PAST:])
     Z, E = np.concatenate(rows), np.concatenate(targets)
     if not np.all(np.isfinite(E)):
-        return 1.0
+        return Misfit(share=1.0, p=0.0)
     left = E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]
-    n, p = E.shape
-    before, after = E.T @ E / n, left.T @ left / max(n - Z.shape[1], 1)
+    n, p, k = *E.shape, Z.shape[1]
     tiny = 1e-14 * np.eye(p)
-    gained = float(np.linalg.slogdet(after + tiny)[1] - np.linalg.slogdet(before + tiny)[1])
-    return 1.0 - float(np.exp(gained / p))
+    gained = float(np.linalg.slogdet(E.T @ E / n + tiny)[1] - np.linalg.slogdet(left.T @ left / n + tiny)[1])
+    by_chance = -p * float(np.log(max(1.0 - k / n, 1e-12)))
+    return Misfit(share=1.0 - float(np.exp((by_chance - gained) / p)), p=float(chi2.sf(n * gained, p * k)))
 
 
 # --- standard deviations ---------------------------------------------------------------------------------------------

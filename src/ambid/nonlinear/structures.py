@@ -93,7 +93,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
             "noise": "output, innovations (predictor gain), auto (gain where errors are not white); auto",
             "descent": "iterations of the thesis's steepest descent, shown beside; 10",
             "iterations": "of each training, at most; 50",
-            "evaluations": "of the global search of one-axis, where ordinary starts fail; 0 for none; 2000",
+            "evaluations": "of a global search (one-axis) where starts fail; given, where errors are suspect too; 2000",
             "uncertainty": "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich if not white); auto",
         },
         home="ambid.nonlinear.nn:nn",
