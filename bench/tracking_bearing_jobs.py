@@ -11,9 +11,8 @@ import numpy as np
 from ambid.physics.loop import Noise
 from ambid.physics.models import model
 from ambid.physics.presets import preset
-from ambid.recursive.fusion.fusion import SensorFusion
-from ambid.recursive.fusion.motion import free_motion
-from ambid.recursive.fusion.sensor import FusedSensor
+from ambid.recursive.fusion import SensorFusion, free_motion
+from ambid.recursive.fusion_sensor import FusedSensor
 from ambid.recursive.joint import JointEkf, JointUkf
 from ambid.recursive.joint_start import JointStart
 from ambid.track.evidence import Samples

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.fusion.fusion import SensorFusion
-from ambid.recursive.fusion.motion import Motion, free_motion, levitated_motion
-from ambid.recursive.fusion.sensor import still_samples
+from ambid.recursive.fusion import Motion, SensorFusion, free_motion, levitated_motion
+from ambid.recursive.fusion_sensor import still_samples
 from ambid.recursive.kalman import KalmanFilter, linear_state
-from tests.recursive.fusion.benches import GAIN, NOISE, RATE, SIGMA, Q, fusion, readings, sensors, vibration
+from tests.recursive.fusion_benches import GAIN, NOISE, RATE, SIGMA, Q, fusion, readings, sensors, vibration
 
 DRIFT = 0.2  # V/√s: fast, so that offsets walk in single samples
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.fusion.fusion import SensorFusion
-from ambid.recursive.fusion.motion import free_motion
-from ambid.recursive.fusion.sensor import FusedSensor
+from ambid.recursive.fusion import SensorFusion, free_motion
+from ambid.recursive.fusion_sensor import FusedSensor
 
 RATE = 20_000.0
 GAIN = 4000.0  # V/m

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.recursive.fusion.fusion import SensorFusion
-from ambid.recursive.fusion.motion import free_motion
-from ambid.recursive.fusion.sensor import FusedSensor
-from tests.recursive.fusion.benches import GAIN, NOISE, RATE, Q, vibration
+from ambid.recursive.fusion import SensorFusion, free_motion
+from ambid.recursive.fusion_sensor import FusedSensor
+from tests.recursive.fusion_benches import GAIN, NOISE, RATE, Q, vibration
 
 PER_KELVIN = 1e-6 * GAIN  # V/K
 N = 40_000

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.recursive.fusion.benches import GAIN, NOISE, RATE, fusion, vibration
+from tests.recursive.fusion_benches import GAIN, NOISE, RATE, fusion, vibration
 
 N = 200_000
 DRIFT = 2e-3

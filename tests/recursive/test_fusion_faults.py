@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.recursive.fusion.benches import GAIN, NOISE, RATE, fusion, readings, vibration
+from tests.recursive.fusion_benches import GAIN, NOISE, RATE, fusion, readings, vibration
 
 N, AT = 4000, 2000
 SETTINGS = {"drift_rate": 2e-3, "offset_sd": 2e-3, "limits": (-10.0, 10.0)}

@@ -14,7 +14,7 @@ OUT, LAST, SAME, GONE, RAILED, UP, DOWN, LOUD, LOSS, EVIDENCE, UP_0, DOWN_0, LOU
 SUM_T, SUM_ABS, SUM_TT, JUMPS, LAST_T, MEAN_R, SQUARE_R, NEED, SINCE = range(14, 23)
 COUNT, R, RR, RX, X, XX, GATED, TESTED, SQUARES, DOUBT, ONSET, WAS_OUT, ZERO, BETWEEN = range(23, 37)
 # entries of `settings`
-HEIGHT, INSTANT, RESTORE_N, SPARE, HOLD_N, GONE_N, LOSS_PART, SPAN, STRIDE = range(9)
+HEIGHT, INSTANT, RESTORE_N, STATES, HOLD_N, GONE_N, LOSS_PART, SPAN, STRIDE = range(9)
 # entries of `clock`
 NOW, OLD, NEW, FRESH, HELD, COMMON, NOTES, DISPUTED, STREAK, AGREED = range(10)
 # what a row of `notes` tells first
@@ -39,6 +39,7 @@ _SLOW = 1.0 / 16.0  # weight of the newest residual in its running mean
 
 @compiled
 def note(notes: Array, clock: Array, code: int, i: int, onset: float, a: float, b: float) -> None:
+    """Write what happened, for `ambid.recursive.fusion_sensor.reason`."""
     row = int(clock[NOTES])
     if row < notes.shape[0]:
         notes[row, 0], notes[row, 1], notes[row, 2], notes[row, 3], notes[row, 4] = code, i, onset, a, b
@@ -214,6 +215,7 @@ def forget(watch: Array, i: int) -> None:
 
 @compiled
 def score(watch: Array, i: int) -> float:
+    """Return the highest of all sums of a sensor."""
     return float(max(alarmed(watch, i), watch[i, EVIDENCE]))
 
 
@@ -228,6 +230,7 @@ def kind(watch: Array, i: int) -> int:
 
 @compiled
 def onset(watch: Array, i: int) -> float:
+    """Return when the highest of the sums began."""
     first, high = watch[i, UP_0], watch[i, UP]
     for k in range(1, 4):
         if watch[i, UP + k] > high:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass
 from math import isfinite, log
 from typing import Literal, Self
 
@@ -18,11 +19,12 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.physics.discretise import zero_order_hold
 from ambid.recursive.estimator import as_block, check_channels
-from ambid.recursive.fusion.motion import Motion
-from ambid.recursive.fusion.reasons import reason
-from ambid.recursive.fusion.sensor import FusedSensor, sensor_table
+from ambid.recursive.fusion_sensor import FusedSensor, reason, sensor_table
+from ambid.recursive.kalman import LinearState, constant_velocity, linear_state
 from ambid.recursive.lines import Event
+from ambid.recursive.square_root import covariance_of, root_of
 
 _TESTS = 4.0  # cumulative sums of each sensor
 _LOSS = 0.2  # part of the gain whose loss is looked for
@@ -97,7 +99,7 @@ class SensorFusion:
         give: Literal["filtered", "instant"] = "filtered",
         start_s: float = 0.0,
     ) -> None:
-        from ambid.recursive.fusion._kernels import fuse_scan
+        from ambid.recursive.fusion_kernels import fuse_scan
 
         check_channels("sensor fusion", rate_hz, len(sensors))
         self.rate_hz, self.start_s, self.sensors, self.motion = rate_hz, start_s, tuple(sensors), motion
@@ -110,13 +112,13 @@ class SensorFusion:
         quiet = rate_hz * 3600.0 / false_alarms_per_hour * m
         self._table = sensor_table(self.sensors, rate_hz, quiet)
         state = motion.state
-        self._model = np.hstack([state.A, state.B, _root(state.Q)])
+        self._model = np.concatenate([state.A.ravel(), state.B.ravel(), root_of(state.Q).ravel()])
         self._settings = np.array(
             [log(quiet * _TESTS), float(give == "instant"), max(1.0, restore_s * rate_hz),
-             0.0, rate_hz, _GONE, _LOSS, _SPAN, self._stride()]
+             n, rate_hz, _GONE, _LOSS, _SPAN, self._stride()]
         )  # fmt: skip
-        self._memory = np.zeros((size, size + 1))
-        self._memory[:n, size] = motion.start
+        self._memory = np.zeros((size + 1, size))
+        self._memory[size, :n] = motion.start
         offsets = [max(abs(s.offset_sd / s.gain), 1e-6 * s.noise_sd / abs(s.gain)) ** 2 for s in self.sensors]
         start_temperature = [max(temperature_rate**2 / rate_hz, 1e-12)] if warm else []
         np.fill_diagonal(self._memory, [*motion.start_sd**2, *start_temperature, *offsets])
@@ -130,8 +132,7 @@ class SensorFusion:
         self._clock = np.zeros(10)
         self._clock[3] = 1.0  # states to go back to begin with the first sample
         self._ring = np.full((2 * _SPAN, 2 * m + n_u), np.nan)
-        self._kept = np.zeros((2, size, size + 1))
-        self._work = np.zeros((10 + 3 * m + n, max(2 * n, size)))
+        self._kept = np.zeros((2, size + 1, size))
         self._notes = np.zeros((2 * m + 2, 5))
         self._scan = fuse_scan
         self._none = np.empty((1, 0))
@@ -179,7 +180,7 @@ class SensorFusion:
         while done < y.shape[0]:
             done = self._scan(
                 done, y, u, out, self._model, self._seen, self._walk, self._table, self._settings, self._memory,
-                self._watch, self._clock, self._ring, self._kept, self._work, self._notes,
+                self._watch, self._clock, self._ring, self._kept, self._notes,
             )  # fmt: skip
             for row in self._notes[: int(self._clock[6])]:
                 self._events.append(reason(row, self.sensors, self.working, self.rate_hz, self.start_s))
@@ -232,29 +233,26 @@ class SensorFusion:
     @property
     def state(self) -> Array:
         """Predicted state at the next sample: motion, temperature in K if modelled, offsets in m, shape (n_states,)."""
-        return self._memory[:, -1].copy()
+        return np.asarray(self._memory[-1].copy())
 
     @property
     def covariance(self) -> Array:
         """Covariance of the error of `state`, shape (n_states, n_states)."""
-        F = self._memory[:, :-1]
-        U = np.triu(F, 1) + np.eye(F.shape[0])
-        P = (U * np.diag(F)) @ U.T
-        return np.asarray((P + P.T) / 2.0)
+        return covariance_of(self._memory[:-1])
 
     @property
     def offsets(self) -> Array:
         """How far each sensor's zero has walked and how sure that is, in its unit, shape (n_sensors, 2)."""
         gains = np.array([s.gain for s in self.sensors])
         sd = np.sqrt(np.diag(self.covariance)[self._first :]) * np.abs(gains)
-        return np.column_stack([self._memory[self._first :, -1] * gains, sd])
+        return np.column_stack([self._memory[-1, self._first :] * gains, sd])
 
     @property
     def temperature(self) -> tuple[float, float]:
         """Shared temperature since the start and its standard deviation, K; NaN where it is not modelled."""
         if self._first == self._n:
             return float("nan"), float("nan")
-        return float(self._memory[self._n, -1]), float(np.sqrt(self.covariance[self._n, self._n]))
+        return float(self._memory[-1, self._n]), float(np.sqrt(self.covariance[self._n, self._n]))
 
     @property
     def unobservable(self) -> Array:
@@ -263,7 +261,7 @@ class SensorFusion:
         Without a motion that knows where the position is; with `levitated_motion` its slow force balances it.
         """
         c = self.motion.state.C[0]
-        out = np.zeros(self._memory.shape[0])
+        out = np.zeros(self._memory.shape[1])
         out[: self._n] = np.linalg.lstsq(np.vstack([self.motion.state.A - np.eye(self._n), c]), _last(self._n), None)[0]
         out[self._first :] = -(c @ out[: self._n])
         return out
@@ -271,7 +269,7 @@ class SensorFusion:
     @property
     def relative_sd(self) -> float:
         """Standard deviation of the next predicted position against the mean of the working sensors' zeros, m."""
-        h = np.zeros(self._memory.shape[0])
+        h = np.zeros(self._memory.shape[1])
         h[: self._n] = self.motion.state.C[0]
         at_work = self._watch[:, 0] == 0.0
         if at_work.any():
@@ -294,7 +292,7 @@ class SensorFusion:
         EstimationError
             If there is no such sensor, or `offset_sd` is negative.
         """
-        from ambid.recursive.fusion._kernels import put_back
+        from ambid.recursive.fusion_kernels import put_back
 
         if name not in self.names or not (offset_sd is None or 0.0 <= offset_sd < np.inf):
             raise EstimationError(
@@ -303,7 +301,7 @@ class SensorFusion:
             )
         i = self.names.index(name)
         variance = ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
-        put_back(i, self._memory, self._watch, self._clock, variance, self._work[0], self._notes)
+        put_back(i, self._memory, self._watch, self._clock, variance, np.empty(self._memory.shape[1]), self._notes)
         self._events.append(
             Event(
                 kind="restored",
@@ -322,7 +320,7 @@ class SensorFusion:
         SensorFusion
         """
         other = copy(self)
-        for name in ("_memory", "_seen", "_watch", "_clock", "_ring", "_kept", "_work", "_notes"):
+        for name in ("_memory", "_seen", "_watch", "_clock", "_ring", "_kept", "_notes"):
             setattr(other, name, getattr(self, name).copy())
         other._one = (self._one[0].copy(), self._one[1].copy())
         other._events = self._events.copy()
@@ -336,11 +334,6 @@ class SensorFusion:
                 "Give all of them, or fuse with free_motion, which needs none"
             )
         return np.ascontiguousarray(given.reshape(n, self._n_u))
-
-
-def _root(Q: Array) -> Array:
-    values, vectors = np.linalg.eigh(Q)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _last(n: int) -> Array:
@@ -361,3 +354,125 @@ def _check(names: tuple[str, ...], alarms: float, restore_s: float, temperature_
         )
     if give not in ("filtered", "instant"):
         raise EstimationError(f"sensor fusion: give {give!r}; it is 'filtered' or 'instant'. Choose one of them")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Motion:
+    """A sampled linear motion with one position, and what is known of it when fusion begins.
+
+    Attributes
+    ----------
+    state : LinearState
+        Its one output is the position in m; R is not used. Inputs, if any, are measured signals.
+    start : ndarray, shape (n_states,)
+    start_sd : ndarray, shape (n_states,)
+        All positive.
+    """
+
+    state: LinearState
+    start: Array
+    start_sd: Array
+
+    def __post_init__(self) -> None:
+        """Refuse what fusion cannot start from."""
+        n = self.state.A.shape[0]
+        start, sd = np.array(self.start, dtype=np.float64), np.array(self.start_sd, dtype=np.float64)
+        if self.state.C.shape[0] != 1:
+            raise EstimationError(f"motion: {self.state.C.shape[0]} outputs; fusion wants one, the position. Give one")
+        if start.shape != (n,) or sd.shape != (n,) or not (np.isfinite(start).all() and np.isfinite(sd).all()):
+            raise EstimationError(
+                f"motion: start and start_sd must be {n} finite numbers each. Give one for each state"
+            )
+        if not (sd > 0.0).all():
+            raise EstimationError("motion: start_sd must be positive. Give what is not known of each state")
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "start_sd", sd)
+
+
+def free_motion(
+    rate_hz: float, *, q: float, start_sd: ArrayLike = (1e-3, 1.0), start: ArrayLike = (0.0, 0.0)
+) -> Motion:
+    """Return position and velocity under white acceleration.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    q : float
+        Intensity of the acceleration, (m/s²)²s. A motion of amplitude a and angular frequency ω needs about a² ω³.
+    start_sd : array_like, shape (2,)
+        In m and m/s.
+    start : array_like, shape (2,)
+
+    Returns
+    -------
+    Motion
+
+    Raises
+    ------
+    EstimationError
+        If a number is not positive.
+    """
+    state = constant_velocity(rate_hz, q=q, r=1.0)
+    return Motion(state=state, start=np.asarray(start), start_sd=np.asarray(start_sd))
+
+
+def levitated_motion(
+    rate_hz: float,
+    *,
+    m: float,
+    k_i: float,
+    k_x: float,
+    c: float = 0.0,
+    force: float,
+    force_walk: float,
+    start_sd: ArrayLike = (1e-3, 1.0, 100.0),
+    start: ArrayLike = (0.0, 0.0, 0.0),
+) -> Motion:
+    """Return the bench's own motion with the measured current as input, exactly sampled (held from sample to sample).
+
+    The third state is a slow force per mass, m/s²: gravity, the bias of the current, a load. Without it the model
+    would take the offset that all sensors share for an unbalanced force.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    m, k_i, k_x, c : float
+        Mass kg, N/A, N/m (negative for an attracting magnet), N s/m.
+    force : float
+        Density of the white force that the model does not know, N/√Hz (two-sided), from inaccurate parameters too.
+    force_walk : float
+        The slow force walks: standard deviation after one second, N/√s; over 0.
+    start_sd, start : array_like, shape (3,)
+        In m, m/s, m/s².
+
+    Returns
+    -------
+    Motion
+
+    Raises
+    ------
+    EstimationError
+        If a number is not finite, or mass or noise not positive.
+    """
+    numbers = np.array([rate_hz, m, k_i, k_x, c, force, force_walk])
+    if not (np.isfinite(numbers).all() and min(rate_hz, m, force, force_walk) > 0.0):
+        raise EstimationError(
+            "levitated motion: rate, m, force and force_walk must be positive, k_i, k_x and c finite. Mend them"
+        )
+    F = np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, 1.0], [0.0, 0.0, 0.0]])
+    A, B, Q = _sampled(F, np.array([[0.0], [k_i / m], [0.0]]), np.diag([0.0, force**2, force_walk**2]) / m**2, rate_hz)
+    state = linear_state(A, [[1.0, 0.0, 0.0]], Q, [[1.0]], B=B)
+    return Motion(state=state, start=np.asarray(start), start_sd=np.asarray(start_sd))
+
+
+def _sampled(F: Array, G: Array, intensity: Array, rate_hz: float) -> tuple[Array, Array, Array]:
+    """Exact step, held input and noise covariance (Van Loan 1978)."""
+    from scipy.linalg import expm
+
+    n = F.shape[0]
+    A, B = zero_order_hold(F, G, 1.0 / rate_hz)
+    both = expm(np.block([[-F, intensity], [np.zeros((n, n)), F.T]]) / rate_hz)
+    Q = A @ both[:n, n:]
+    return A, B, (Q + Q.T) / 2.0

@@ -1,1 +1,0 @@
-"""Several position sensors made into one position, with the faulty ones found and left out."""
