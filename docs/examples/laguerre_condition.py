@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.blackbox.frequency.laguerre import best_conditioned, block_rows_condition
+from ambid.blackbox.frequency_subspace import best_conditioned, block_rows_condition
 
 Array = NDArray[np.float64]
 

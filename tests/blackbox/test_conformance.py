@@ -11,7 +11,7 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json, fit_text
-from ambid.blackbox.spread import response_covariance
+from ambid.blackbox.model import response_covariance
 from ambid.blackbox.structures import STRUCTURES, Structure
 from ambid.errors import EstimationError
 from ambid.validate.blackbox import judged

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.orders import known_orders, left_open, long_enough, per_input, shown, single
+from ambid.blackbox.data import check_length, check_order_names, compact_order, left_open, order_per_input, single_order
 from ambid.blackbox.structures import STRUCTURES, Structure
 from ambid.errors import EstimationError
 from tests.blackbox import systems
@@ -77,30 +77,30 @@ def test_a_refinement_finds_its_delay_where_the_caller_says_auto() -> None:
 
 
 def test_numbers_are_spread_over_inputs_and_shown_as_one_where_they_agree() -> None:
-    assert per_input("arx", {"nb": 2}, "nb", 1, 3) == (2, 2, 2)
-    assert per_input("arx", {"nb": (1, np.int64(2))}, "nb", 1, 2) == (1, 2)  # type: ignore[dict-item]
-    assert per_input("frf-ml", {"nf": 0}, "nf", 0, 1, of="pair") == (0,)
-    assert single("arx", {"na": (2, 2)}, "na", 0) == 2
-    assert shown((2, 2)) == 2
-    assert shown((1, 2)) == (1, 2)
+    assert order_per_input("arx", {"nb": 2}, "nb", 1, 3) == (2, 2, 2)
+    assert order_per_input("arx", {"nb": (1, np.int64(2))}, "nb", 1, 2) == (1, 2)  # type: ignore[dict-item]
+    assert order_per_input("frf-ml", {"nf": 0}, "nf", 0, 1, of="pair") == (0,)
+    assert single_order("arx", {"na": (2, 2)}, "na", 0) == 2
+    assert compact_order((2, 2)) == 2
+    assert compact_order((1, 2)) == (1, 2)
     with pytest.raises(EstimationError, match="must be one whole number"):
-        single("arx", {"na": (1, 2)}, "na", 0)
+        single_order("arx", {"na": (1, 2)}, "na", 0)
     with pytest.raises(EstimationError, match=r"na = 0; it must be a whole number of at least 1\. Raise it"):
-        single("arx", {"na": 0}, "na", 1, remedy="Raise it")
+        single_order("arx", {"na": 0}, "na", 1, remedy="Raise it")
 
 
 def test_known_orders_may_be_left_out() -> None:
-    known_orders("pbsid", {}, ("n", "nk"))
+    check_order_names("pbsid", {}, ("n", "nk"))
     with pytest.raises(EstimationError, match=r"Did you mean 'nf'\? Leave it out"):
-        known_orders("oe", {"nff": 1}, ("nb", "nf", "nk"), ("nb",))
+        check_order_names("oe", {"nff": 1}, ("nb", "nf", "nk"), ("nb",))
 
 
 def test_records_that_are_too_short_or_stand_still_are_refused() -> None:
     data = systems.open_loop(inputs=True)
-    long_enough("iv4", data, 40, 10)
+    check_length("iv4", data, 40, 10)
     with pytest.raises(EstimationError, match="at least 44 rows are needed and 40 are left"):
-        long_enough("iv4", data, 40, 11)
+        check_length("iv4", data, 40, 11)
     with pytest.raises(EstimationError, match="at least 20 rows are needed and 0 are left"):
-        long_enough("iv4", data, -3, 1)
+        check_length("iv4", data, -3, 1)
     with pytest.raises(EstimationError, match="is constant; nothing can be learned"):
-        long_enough("iv4", replace(data, u=np.ones_like(data.u)), 100, 2)
+        check_length("iv4", replace(data, u=np.ones_like(data.u)), 100, 2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import freqz, lfilter
 
-from ambid.blackbox.frequency.measured import model_responses
+from ambid.bearing.measured import model_responses
 from ambid.errors import EstimationError
 from ambid.job import frf
 from ambid.physics.presets import preset

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.blackbox.polynomial.orders import Layout
+from ambid.blackbox.polynomial_predictor import Layout
 from ambid.recursive.polynomial_kernels import run
 from ambid.recursive.polynomial_state import Forgetting, new_state
 

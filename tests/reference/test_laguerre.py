@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency.laguerre import best_conditioned, block_rows_condition, laguerre_operator
+from ambid.blackbox.frequency_subspace import best_conditioned, block_rows_condition, laguerre_operator
 from ambid.errors import EstimationError
 
 ORDERS = np.arange(2, 21)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency.measured import Measured, model_responses
+from ambid.bearing.measured import Measured, model_responses
 from ambid.job import frf
 from ambid.report.fit_figures import frf_figure
 from ambid.report.fit_text import frf_text, pair_lines, response_unit, warnings_of

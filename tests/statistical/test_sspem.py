@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.subspace import pbsid, sspem
+from ambid.blackbox.state_space_search import sspem
+from ambid.blackbox.subspace import pbsid
 from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, modal, record
 from tests.statistical.test_subspace import real_numbers
 

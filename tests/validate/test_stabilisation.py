@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.response import states
+from ambid.blackbox.response import run_states
 from ambid.errors import EstimationError
 from ambid.report.fit_figures import stabilisation_figure
 from ambid.validate.stabilisation import assurance, stabilisation
@@ -28,7 +28,7 @@ def record(*, unstable=False, n=4000):
     C = np.array([[1.0, 0.3, 0.8, 0.0, 0.5], [0.5, -0.4, -1.0, 0.3, 0.5]])[:, :n_x]
     r, e = rng.standard_normal((n, 1)), 0.05 * rng.standard_normal((n, 2))
     if not unstable:
-        return io(r, states(A, B, r) @ C.T + e)
+        return io(r, run_states(A, B, r) @ C.T + e)
     A[4, 4] = np.exp(REAL * DT)
     x, u, y = np.zeros(n_x), np.zeros((n, 1)), np.zeros((n, 2))
     for k in range(n):

@@ -158,7 +158,7 @@ def three_blocks(
     EstimationError
         If the record is too short, does not move, or no blocks with a stable coil fit.
     """
-    from ambid.blackbox.instrumental.first_order import electric, mechanic, spread
+    from ambid.bearing.first_order import electric, mechanic, spread
 
     data = _data(voltage, current, position, rate_hz, reference, delay)
     with one_thread():
@@ -221,7 +221,7 @@ def _clean(data: IOData) -> Array:
     """Voltage, current and position without noise, shape (n_samples, 3): what voltage or reference make of them."""
     from dataclasses import replace
 
-    from ambid.blackbox.instrumental.reference import reference_part
+    from ambid.blackbox.instruments import reference_part
 
     u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
     if data.references:

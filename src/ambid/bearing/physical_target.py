@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.physical_weight import point_weight
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.model import response_covariance
 from ambid.blackbox.polynomial_model import PolynomialModel
-from ambid.blackbox.spread import response_covariance
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.start import Moments

@@ -1,4 +1,4 @@
-"""Black-box models from records and from frequency responses; one file or folder a method."""
+"""Black-box models from records and from frequency responses, one or two files a method."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ if TYPE_CHECKING:
     from ambid.blackbox.convert import to_scipy as to_scipy
     from ambid.blackbox.data import IOData as IOData
     from ambid.blackbox.fit import BlackBoxFit as BlackBoxFit
-    from ambid.blackbox.frequency.laguerre import best_conditioned as best_conditioned
-    from ambid.blackbox.frequency.laguerre import block_rows_condition as block_rows_condition
-    from ambid.blackbox.frequency.measured import Measured as Measured
-    from ambid.blackbox.frequency.rational import frf_ml as frf_ml
-    from ambid.blackbox.frequency.subspace import frf_subspace as frf_subspace
+    from ambid.blackbox.frequency_rational import frf_ml as frf_ml
+    from ambid.blackbox.frequency_subspace import best_conditioned as best_conditioned
+    from ambid.blackbox.frequency_subspace import block_rows_condition as block_rows_condition
+    from ambid.blackbox.frequency_subspace import frf_subspace as frf_subspace
+    from ambid.blackbox.impulse import correlation_analysis as correlation_analysis
+    from ambid.blackbox.impulse import impulse_response as impulse_response
+    from ambid.blackbox.impulse import step_response as step_response
     from ambid.blackbox.instrumental import cliv as cliv
-    from ambid.blackbox.instrumental import clsrivc as clsrivc
     from ambid.blackbox.instrumental import iv4 as iv4
-    from ambid.blackbox.instrumental import srivc as srivc
     from ambid.blackbox.instrumental import two_stage as two_stage
-    from ambid.blackbox.nonparametric import correlation_analysis as correlation_analysis
-    from ambid.blackbox.nonparametric import impulse_response as impulse_response
-    from ambid.blackbox.nonparametric import step_response as step_response
+    from ambid.blackbox.instrumental_continuous import clsrivc as clsrivc
+    from ambid.blackbox.instrumental_continuous import srivc as srivc
     from ambid.blackbox.polynomial import ararmax as ararmax
     from ambid.blackbox.polynomial import ararx as ararx
     from ambid.blackbox.polynomial import arma as arma
@@ -35,14 +34,13 @@ if TYPE_CHECKING:
     from ambid.blackbox.polynomial_model import PolynomialModel as PolynomialModel
     from ambid.blackbox.polynomial_model import Polynomials as Polynomials
     from ambid.blackbox.state_space import StateSpaceModel as StateSpaceModel
+    from ambid.blackbox.state_space_search import sspem as sspem
     from ambid.blackbox.subspace import cva as cva
     from ambid.blackbox.subspace import moesp as moesp
     from ambid.blackbox.subspace import n4sid as n4sid
     from ambid.blackbox.subspace import pbsid as pbsid
-    from ambid.blackbox.subspace import sspem as sspem
     from ambid.blackbox.subspace import subspace_models as subspace_models
     from ambid.blackbox.transfer_model import TransferModel as TransferModel
-    from ambid.blackbox.weakform import weak_parameters as weak_parameters
-    from ambid.blackbox.weakform import weakform as weakform
+    from ambid.blackbox.weak_form import weakform as weakform
 
 __getattr__, __dir__, __all__ = exports(__name__)

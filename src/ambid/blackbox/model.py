@@ -1,7 +1,7 @@
 """What a black-box model is: coefficients, frequency response, poles and zeros, each with its derivatives.
 
 Derivatives are by *all* coefficients, fixed ones included: a coefficient that was not estimated has a row and a column
-of zeros in the covariance. So every spread follows by the delta method, and no model has to know what was free.
+of zeros in the covariance. So every standard deviation follows by the delta method.
 """
 
 from __future__ import annotations
@@ -96,3 +96,39 @@ class BlackBoxModel(Protocol):
     def state_space(self) -> StateSpaceModel:
         """Return the model in innovations form."""
         ...
+
+
+def complex_covariance(derivative: Complex, covariance: Array) -> Array:
+    """Propagate a covariance of coefficients to complex numbers.
+
+    `derivative`: (..., n_theta), complex; `covariance`: (n_theta, n_theta). Returns (..., 2, 2), of real and imaginary
+    part.
+    """
+    parts = np.stack([derivative.real, derivative.imag], axis=-2)
+    return np.asarray(parts @ covariance @ np.swapaxes(parts, -1, -2))
+
+
+def pole_covariance(model: BlackBoxModel, covariance: Array) -> Array:
+    """Return the covariance of real and imaginary part of every pole, shape (n_poles, 2, 2).
+
+    `covariance`: (n_theta, n_theta). Returns (n_poles, 2, 2), in the order of ``model.poles()``. Not finite at multiple
+    poles, where no first-order spread exists.
+    """
+    return complex_covariance(model.pole_derivative(), covariance)
+
+
+def zero_covariance(model: BlackBoxModel, covariance: Array) -> Array:
+    """Return the covariance of real and imaginary part of every zero, shape (n_zeros, 2, 2).
+
+    `covariance`: (n_theta, n_theta). Returns (n_zeros, 2, 2), in the order of ``model.zeros()``.
+    """
+    return complex_covariance(model.zero_derivative(), covariance)
+
+
+def response_covariance(model: BlackBoxModel, covariance: Array, omega: Array) -> Array:
+    """Return the covariance of real and imaginary part of the frequency response.
+
+    `covariance`: (n_theta, n_theta); `omega`: (n_frequencies,), rad/s. Returns (n_frequencies, n_outputs, n_inputs, 2,
+    2).
+    """
+    return complex_covariance(model.frequency_response_derivative(omega), covariance)

@@ -25,7 +25,7 @@ def stable(p: Array) -> bool:
     return True
 
 
-def reflected(p: Array, radius: float = 0.98) -> Array:
+def reflect(p: Array, radius: float = 0.98) -> Array:
     """Return the polynomial with roots outside the unit circle reflected, for a start alone.
 
     `p`: (n + 1,); `radius`: roots are drawn in to at most this. Returns (n + 1,).

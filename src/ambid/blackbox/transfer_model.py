@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -237,3 +237,45 @@ class TransferModel:
         if not found:
             return np.empty(0, dtype=np.complex128), np.zeros((0, theta.size), dtype=np.complex128)
         return np.concatenate([r for r, _ in found]), np.vstack([d for _, d in found])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaledTransfer:
+    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input, group by group."""
+
+    theta: Array  # (n_theta,)
+    covariance: Array  # (n_theta, n_theta)
+    groups: tuple[tuple[int, tuple[int, ...]], ...]  # degree, and numerator coefficients of the inputs that share it
+    w0: float  # rad/s
+    gain: Array  # (n_inputs,), SI unit of a numerator coefficient
+
+    def in_s(self) -> tuple[list[Array], list[Array], Array]:
+        """Return numerators and denominators by input in s and SI, and their derivative by `theta`."""
+        num, den, rows, first = list[Array](), list[Array](), list[Array](), 0
+        unit = np.eye(self.theta.size)
+        for n, nb in self.groups:
+            worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
+            by_den = np.vstack([np.zeros(self.theta.size), (unit[first : first + n] * worth[:n, None])[::-1]])
+            first += n
+            for b in nb:
+                by_num = (unit[first : first + b] * (worth[:b] * self.gain[len(num)])[:, None])[::-1]
+                num.append(by_num @ self.theta)
+                den.append(np.append(1.0, by_den[1:] @ self.theta))
+                rows += [by_num, by_den]
+                first += b
+        return num, den, np.vstack(rows)
+
+
+def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]) -> tuple[TransferModel, Array]:
+    """Return the continuous model of all outputs in SI, and the covariance of all its coefficients."""
+    from scipy.linalg import block_diag
+
+    found = [one.in_s() for one in outputs]
+    model = TransferModel(
+        num=tuple(tuple(num) for num, _, _ in found),
+        den=tuple(tuple(den) for _, den, _ in found),
+        dt=None,
+        delay=delay,
+    )
+    slopes = zip(outputs, found, strict=True)
+    return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])

@@ -10,7 +10,7 @@ import typer
 from ambid.errors import EstimationError
 
 if TYPE_CHECKING:
-    from ambid.blackbox.orders import Orders
+    from ambid.blackbox.data import Orders
 
 Inputs = Annotated[
     list[str] | None,

@@ -26,7 +26,7 @@ from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.blackbox.orders import Orders
+    from ambid.blackbox.data import Orders
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
@@ -106,7 +106,7 @@ def command(
     With --reference (the loop's outer excitation) feedback does not bias it. With --rig, physical parameters come out,
     and inputs and outputs are the rig's.
     """
-    from ambid.blackbox.frequency.measured_file import measured_text
+    from ambid.bearing.measured import measured_text
     from ambid.job import frf
     from ambid.report.fit_text import frf_text
 

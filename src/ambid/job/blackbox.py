@@ -12,9 +12,8 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from ambid.blackbox.data import IOData, io_data
+from ambid.blackbox.data import IOData, Orders, io_data
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.orders import Orders
 from ambid.blackbox.structures import STRUCTURES, Structure, structure
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.progress import guessed
@@ -331,8 +330,8 @@ def _check_use(
         raise EstimationError(f"structure {of.name} needs an input. Give --input COLUMN, or use arma")
     if fixed and of.kind != "polynomial":
         raise EstimationError(f"structure {of.name} has no coefficients that can be fixed. Use a polynomial structure")
-    if at_rest and not of.takes_at_rest:
-        some = ", ".join(x.name for x in STRUCTURES.values() if x.takes_at_rest)
+    if at_rest and not of.prediction_error:
+        some = ", ".join(x.name for x in STRUCTURES.values() if x.prediction_error)
         raise EstimationError(
             f"structure {of.name} cannot be told that a record begins at rest; {some} can. Leave --at-rest out"
         )

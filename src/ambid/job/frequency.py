@@ -13,11 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.blackbox.data import IOData
+from ambid.bearing.frequency import FrequencyEstimate
+from ambid.bearing.measured import Measured
+from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.frequency.measured import Measured
-from ambid.blackbox.frequency.physical_estimate import FrequencyEstimate
-from ambid.blackbox.orders import Orders
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
 from ambid.job._progress import Tick, silent
@@ -213,8 +212,8 @@ def _fitted(
     delay: Delay,
 ) -> BlackBoxFit:
     """Fit the black-box model; its operating point is that of the record, which a response does not show."""
-    from ambid.blackbox.frequency.rational import frf_ml
-    from ambid.blackbox.frequency.subspace import frf_subspace
+    from ambid.blackbox.frequency_rational import frf_ml
+    from ambid.blackbox.frequency_subspace import frf_subspace
 
     if orders is not None:
         found = frf_ml(response, orders, domain=domain, delay=delay)
@@ -232,7 +231,7 @@ def _fitted(
 
 def _physical(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
     """Estimate the rig's parameters; a delay in s is so many samples."""
-    from ambid.blackbox.frequency.greybox import greybox_frf
+    from ambid.bearing.frequency import greybox_frf
 
     plant = model(rig.model)
     known: Delay = rig.channel(plant.inputs[0]).delay if delay is None else delay

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData
+from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.orders import Orders
-from ambid.blackbox.polynomial.orders import layout_of, read_orders, shown_orders
 from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.polynomial_predictor import compact_orders, layout_of, read_orders
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure as structure_named
 from ambid.errors import EstimationError
@@ -99,7 +98,7 @@ class RecursivePolynomial:
         open_loop: bool = False,
     ) -> None:
         found = structure_named(structure)
-        if not found.home.startswith("ambid.blackbox.polynomial:"):
+        if not found.prediction_error:
             raise EstimationError(f"{structure} is no polynomial structure. Use armax, oe or bj")
         n_u = int(found.inputs) if n_inputs is None else n_inputs
         u, y = np.zeros((1, n_u)), np.zeros((1, 1))
@@ -490,7 +489,7 @@ class _Window:
                 open_loop=True,  # whether it is, is no question of the coefficients
             )
             if near is None:
-                found = structure_named(who.structure).estimator(data, shown_orders(who.structure, who.layout))
+                found = structure_named(who.structure).estimator(data, compact_orders(who.structure, who.layout))
             else:
                 found = _fit_near(who, data, near)
         except EstimationError:
@@ -501,15 +500,14 @@ class _Window:
 
 
 def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
-    from ambid.blackbox.polynomial.predictor import predictor
-    from ambid.blackbox.polynomial.result import result
-    from ambid.blackbox.polynomial.scaled import scaled_data, unit
-    from ambid.blackbox.polynomial.search import searched
+    from ambid.blackbox.polynomial_predictor import coefficient_units, predictor, scale_data
+    from ambid.blackbox.polynomial_result import polynomial_fit
+    from ambid.blackbox.polynomial_search import search
 
-    scaled = scaled_data(who.structure, data)
-    worth = unit(who.layout, scaled, 0)
-    found = searched(predictor(who.layout), scaled.y[0], scaled.u, near / worth, most=_MOST)
-    return result(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
+    scaled = scale_data(who.structure, data)
+    worth = coefficient_units(who.layout, scaled, 0)
+    found = search(predictor(who.layout), scaled.y[0], scaled.u, near / worth, most=_MOST)
+    return polynomial_fit(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
 
 
 def _model_of(who: Identity, full: Array) -> PolynomialModel:
@@ -606,7 +604,7 @@ def _fit_of(
     covariance[np.ix_(free, free)] = spread
     return BlackBoxFit(
         structure=who.structure,
-        orders=shown_orders(who.structure, who.layout),
+        orders=compact_orders(who.structure, who.layout),
         model=model,
         covariance=covariance,
         n_estimated=free.size,

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.polynomial.orders import Layout
 from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.polynomial_predictor import Layout
 from ambid.blackbox.structures import any_structure
 from ambid.errors import EstimationError
 from ambid.recursive.square_root import factors_of, root_of, root_of_factors
@@ -310,7 +310,7 @@ def identity_of(fit: BlackBoxFit) -> Identity:
     `fit`: of a polynomial structure, one output.
     """
     model = fit.model
-    known = any_structure(fit.structure).home.startswith("ambid.blackbox.polynomial:")
+    known = any_structure(fit.structure).prediction_error
     if not known or not isinstance(model, PolynomialModel):
         raise EstimationError(
             f"{fit.structure} is no prediction error fit of a polynomial model; it cannot be followed. Fit armax, say"

@@ -34,8 +34,8 @@ from ambid.report.text import (
 )
 
 if TYPE_CHECKING:
+    from ambid.bearing.frequency import FrequencyEstimate
     from ambid.bearing.physical import PhysicalFit
-    from ambid.blackbox.frequency.physical_estimate import FrequencyEstimate
 
 AnyEstimate = Estimate | NonlinearBearingEstimate
 

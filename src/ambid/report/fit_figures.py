@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.measured import Measured, ModelResponse, model_responses
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.frequency.measured import Measured, ModelResponse, model_responses
+from ambid.blackbox.model import pole_covariance, zero_covariance
 from ambid.blackbox.response import one_step, simulation
-from ambid.blackbox.spread import pole_covariance, zero_covariance
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.report.drawing import (
     BAND,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.spread import pole_covariance
+from ambid.blackbox.model import pole_covariance
 from ambid.blackbox.structures import any_structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.nonlinear.structures import nonlinear_structure
@@ -41,7 +41,7 @@ from ambid.report.text import (
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
-    from ambid.blackbox.frequency.measured import Measured
+    from ambid.bearing.measured import Measured
     from ambid.blackbox.model import BlackBoxModel
     from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.blackbox.data import IOData
-from ambid.blackbox.orders import UsedOrders, shown
+from ambid.blackbox.data import IOData, UsedOrders, compact_order
 from ambid.blackbox.structures import Structure
 from ambid.validate.arx_orders import ArxCandidate, arx_candidates
 
@@ -18,7 +17,6 @@ _SIZES, _DELAYS, _TAPS = 10, 20, 60  # most states, delay in samples, coefficien
 _PATIENCE = 3  # sizes without an improvement after which a line ends
 _BUDGET = 40  # fits
 _SLOW = 6  # most states, and half the fits, for the instrumental structures, whose fits take longer
-_INSTRUMENTAL = "ambid.blackbox.instrumental"
 _FINALISTS = 12  # ARX candidates that are fitted
 
 
@@ -38,7 +36,7 @@ def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]
     """
     n_u = max(data.n_inputs, 1)
     room = max(data.n_samples // 10, 4)  # coefficients that a record of this length can tell
-    slow = of.home.startswith(_INSTRUMENTAL)
+    slow = of.instrumental
     most = max(1, min(_SLOW if slow else _SIZES, room // (n_u + 1)))
     taps = max(1, min(_TAPS, room) // n_u) if of.name == "fir" else most
     lag = max(1, min(_DELAYS, room // n_u))
@@ -70,7 +68,7 @@ def searched_orders(of: Structure, start: Start, n_inputs: int, score: Callable[
         return known[point]
 
     best = _line(keys, start, at)
-    budget = _BUDGET // 2 if of.home.startswith(_INSTRUMENTAL) else _BUDGET
+    budget = _BUDGET // 2 if of.instrumental else _BUDGET
     while len(known) < budget:
         around = [p for p in _moves(keys, best, start.bounds) if p not in known][: budget - len(known)]
         if not around:
@@ -88,7 +86,7 @@ def _finalists(of: Structure, start: Start) -> Iterator[UsedOrders]:
         ranked = sorted(start.arx, key=lambda c: c.n_rows * c.log_det + penalty * c.n_estimated)
         chosen += [c for c in ranked[: _FINALISTS // 2] if c not in chosen]
     for c in chosen:
-        full: UsedOrders = {"na": c.na, "nb": c.nb, "nk": shown(c.nk)}
+        full: UsedOrders = {"na": c.na, "nb": c.nb, "nk": compact_order(c.nk)}
         yield {k: full[k] for k in of.orders}
 
 
@@ -103,7 +101,7 @@ def _coordinates(of: Structure, n_inputs: int) -> tuple[Coordinate, ...]:
 def _orders(keys: tuple[Coordinate, ...], point: Point) -> UsedOrders:
     out = dict[str, int | tuple[int, ...]]()
     for key in dict.fromkeys(k for k, _ in keys):
-        out[key] = shown(tuple(v for (k, _), v in zip(keys, point, strict=True) if k == key))
+        out[key] = compact_order(tuple(v for (k, _), v in zip(keys, point, strict=True) if k == key))
     return out
 
 

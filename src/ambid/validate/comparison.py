@@ -9,9 +9,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ambid.blackbox.data import IOData
+from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.orders import Orders
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
 from ambid.validate.blackbox import judged

@@ -16,9 +16,8 @@ from typing import Literal, cast, get_args
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData
+from ambid.blackbox.data import IOData, UsedOrders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.orders import UsedOrders
 from ambid.blackbox.structures import Structure, structure
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.criteria import criteria, skipped

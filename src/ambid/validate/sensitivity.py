@@ -17,7 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.spread import pole_covariance
+from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import skipped
 from ambid.estimation.estimate import Estimate

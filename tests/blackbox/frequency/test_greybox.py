@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency.greybox import greybox_frf
-from ambid.blackbox.frequency.lines import Lines
-from ambid.blackbox.frequency.physical import Channels, response
+from ambid.bearing.frequency import Channels, greybox_frf, response
+from ambid.blackbox.frequency_lines import Lines
 from ambid.errors import EstimationError
 from ambid.physics.models import model
 from ambid.physics.presets import preset

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency.lines import lines
-from ambid.blackbox.frequency.rational import frf_ml
+from ambid.blackbox.frequency_lines import check_lines
+from ambid.blackbox.frequency_rational import frf_ml
 from ambid.errors import EstimationError
 from tests.blackbox.frequency.responses import noisy, plant
 
@@ -34,7 +34,7 @@ def test_moments_of_the_cost(n_y, n_u, freedom):
         covariance=covariance.reshape(count, n_y * n_u, n_y * n_u),
         degrees_of_freedom=2.0 * freedom,
     )
-    ln = lines(frf, 0)
+    ln = check_lines(frf, 0)
     per_line = np.sum(ln.whitened(G).reshape(2, count, -1) ** 2, axis=(0, 2)) / 2
     values = ln.verdict(float(per_line.sum()), 0).values
     # heavy tails: the sum within four of its own standard deviations, those within a fifth
@@ -44,7 +44,7 @@ def test_moments_of_the_cost(n_y, n_u, freedom):
 
 
 def test_whitened_errors_have_unit_variance():
-    ln = lines(noisy(F, plant("unstable-bearing", F), 0.02, 1), 0)
+    ln = check_lines(noisy(F, plant("unstable-bearing", F), 0.02, 1), 0)
     rows = [
         ln.whitened(noisy(F, plant("unstable-bearing", F), 0.02, seed).G - plant("unstable-bearing", F))
         for seed in range(50)
@@ -64,5 +64,5 @@ def test_lines_that_share_errors_widen_and_loosen():
 def test_scatter_over_realisations_needs_more_of_them():
     frf = replace(noisy(F, np.ones((100, 2, 2)), 0.1, 1, freedom=5.0), details={"realisations": 6})
     with pytest.raises(EstimationError, match="4 number"):
-        lines(frf, 2)
-    assert lines(replace(frf, details={}), 2).together == 2
+        check_lines(frf, 2)
+    assert check_lines(replace(frf, details={}), 2).together == 2

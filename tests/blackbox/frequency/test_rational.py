@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.blackbox import frequency_rational as rational
 from ambid.blackbox.fit_file import fit_from_json, fit_text
-from ambid.blackbox.frequency import rational
-from ambid.blackbox.frequency.basis import orthogonal_polynomials
-from ambid.blackbox.frequency.rational import frf_ml
-from ambid.blackbox.spread import pole_covariance, response_covariance
+from ambid.blackbox.frequency_rational import frf_ml, orthogonal_polynomials
+from ambid.blackbox.model import pole_covariance, response_covariance
 from ambid.errors import EstimationError
 from tests.blackbox.frequency.responses import RATE, closed_loop, extrapolated, noisy, plant, poles_of
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency import state_search
-from ambid.blackbox.frequency.lines import lines
-from ambid.blackbox.frequency.subspace import frf_subspace
-from ambid.blackbox.spread import pole_covariance
+from ambid.blackbox import frequency_subspace as state_search
+from ambid.blackbox.frequency_lines import check_lines
+from ambid.blackbox.frequency_subspace import frf_subspace
+from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
 from tests.blackbox.frequency.responses import RATE, closed_loop, continuous, noisy, plant, poles_of
 
@@ -153,7 +153,7 @@ def test_what_breaks_a_rule_is_refused(orders, options, message):
 
 def test_the_gauge_carries_no_information():
     frf = noisy(F, plant("unstable-bearing", F), 0.02, 5)
-    fit, ln = frf_subspace(frf, {"n": 3}, p=300.0), lines(frf, 9)
+    fit, ln = frf_subspace(frf, {"n": 3}, p=300.0), check_lines(frf, 9)
     T = np.random.default_rng(0).normal(size=(3, 3)) + 2 * np.eye(3)
     turned = state_search._turned(fit.model, T)
     other, _ = state_search.information(ln, turned, False)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency.vector_fitting import vector_fit
+from ambid.blackbox.frequency_rational import vector_fit
 from ambid.errors import EstimationError
 from tests.blackbox.frequency.responses import plant, poles_of
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import ss2tf
 
-from ambid.blackbox.instrumental import cliv, clsrivc, iv4, two_stage
-from ambid.blackbox.instrumental.clsrivc import sampled_coefficients
-from ambid.blackbox.spread import pole_covariance
+from ambid.blackbox.instrumental import cliv, iv4, two_stage
+from ambid.blackbox.instrumental_continuous import clsrivc, sampled_coefficients
+from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
 from ambid.signals import multisine
 from tests.bearing.benches import SETTINGS, run

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.blackbox.instrumental import iv4
-from ambid.blackbox.instrumental.arx_form import ArxOrders, Signals, least_squares
-from ambid.blackbox.spread import response_covariance
+from ambid.blackbox.instrumental import ArxOrders, Signals, iv4, least_squares
+from ambid.blackbox.model import response_covariance
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, second_order
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, lsim, max_len_seq
 
-from ambid.blackbox.instrumental import srivc
-from ambid.blackbox.instrumental.continuous import responses
+from ambid.blackbox.instrumental_continuous import responses, srivc
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, zoh
 

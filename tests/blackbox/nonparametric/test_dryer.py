@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.nonparametric import correlation_analysis, impulse_response, step_response
+from ambid.blackbox.impulse import correlation_analysis, impulse_response, step_response
 from tests.measured import ABSENT, BENCHMARKS
 
 DRYER = BENCHMARKS / "dryer.csv"

@@ -7,15 +7,16 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.nonparametric import (
+from ambid.blackbox.impulse import (
+    _Evidence,
     correlation_analysis,
     impulse_response,
-    measured_step,
+    kernel_matrix,
+    kernel_root,
     rfir,
     step_response,
+    triangle,
 )
-from ambid.blackbox.nonparametric.bayes import _Evidence, triangle
-from ambid.blackbox.nonparametric.kernels import kernel_matrix, kernel_root
 from ambid.errors import EstimationError
 
 NUM, DEN = [0.0, 0.0, 1.0, 0.5], [1.0, -1.5, 0.8]  # two samples of delay, poles 0.75 +- 0.49j
@@ -197,27 +198,6 @@ def test_the_step_response_is_the_running_sum_with_its_band():
         inside.append(np.abs(step.values[:, 0, 0] - np.cumsum(TRUTH)) < 1.96 * step.sd[:, 0, 0] + 1e-12)
     assert 0.8 < np.mean(np.array(inside)[:, 2:]) <= 1.0
     assert step.values[-1, 0, 0] == pytest.approx(1.5 / 0.3, rel=0.15)
-    exact = replace(step, values=np.cumsum(TRUTH)[:, None, None], sd=np.full((TAPS, 1, 1), 1e-9))
-    s = np.cumsum(TRUTH)
-    assert exact.overshoot() == pytest.approx(s.max() / s[-1] - 1)
-    k10, k90 = np.argmax(s >= 0.1 * s[-1]), np.argmax(s >= 0.9 * s[-1])
-    assert exact.rise_time_s() == pytest.approx(0.1 * (k90 - k10), abs=0.1)
-    assert replace(exact, sd=np.full((TAPS, 1, 1), 10.0)).rise_time_s() is None
-
-
-def test_a_recorded_step_is_read():
-    rng = np.random.default_rng(0)
-    u = np.r_[np.zeros(200), np.full(200, 2.0)] + 0.5
-    y = lfilter(NUM, DEN, u - 0.5) + 1.0 + 0.05 * rng.standard_normal(400)
-    data = IOData(u=u[:, None], y=y[:, None], dt=0.1, inputs=("u",), outputs=("y",), units={}, open_loop=True)
-    step = measured_step(data)
-    error = step.values[:80, 0, 0] - np.cumsum(TRUTH)
-    assert step.sd[0, 0, 0] == pytest.approx(0.025, rel=0.3)
-    assert np.mean(np.abs(error) < 1.96 * step.sd[:80, 0, 0]) > 0.85
-    assert not step.warnings
-    assert "open loop only" in measured_step(replace(data, open_loop=False)).warnings[0]
-    with pytest.raises(EstimationError, match="no single step"):
-        measured_step(record(400, 0))
 
 
 def test_correlation_stays_in_its_band_and_shows_feedback():

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
-from ambid.blackbox.roots import reflected, stable
+from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
 from tests.blackbox.polynomial.systems import SYSTEMS, A, B, System, record, unstable_loop
 
@@ -170,7 +170,7 @@ def test_stability_is_that_of_the_roots(roots: list[complex]) -> None:
     p = np.real(np.poly(roots))
     assert stable(p) == (np.max(np.abs(roots)) < 1.0)
     assert stable(np.append(p, 0.0)) == stable(p)
-    assert stable(reflected(p))
+    assert stable(reflect(p))
     assert not stable(np.array([1.0, np.nan]))
 
 

@@ -9,14 +9,11 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
+from ambid.blackbox import polynomial as engine
 from ambid.blackbox.data import IOData
-from ambid.blackbox.polynomial import polynomial as engine
-from ambid.blackbox.polynomial.orders import Layout
-from ambid.blackbox.polynomial.predictor import predictor
-from ambid.blackbox.polynomial.scaled import scaled_data
-from ambid.blackbox.polynomial.search import searched
-from ambid.blackbox.polynomial.separable import missed_minimum, separable_starts
-from ambid.blackbox.polynomial.starts import starts
+from ambid.blackbox.polynomial_predictor import Layout, predictor, scale_data
+from ambid.blackbox.polynomial_result import missed_minimum
+from ambid.blackbox.polynomial_search import search, separable_starts, starts
 from ambid.physics.models import model
 from tests.bearing.benches import BEARING, run
 from tests.blackbox.polynomial.systems import SYSTEMS, record
@@ -49,9 +46,9 @@ def test_a_levitated_bearing_sampled_fast(seed: int) -> None:
 
 def test_a_minimum_that_was_missed_is_told() -> None:
     data, of = bearing(0, 0), layout("armax", na=3, nb=3, nc=3)
-    scaled = scaled_data("armax", data)
+    scaled = scale_data("armax", data)
     p = predictor(of)
-    wrong = searched(p, scaled.y[0], scaled.u, next(starts(of, scaled.y[0], scaled.u)))
+    wrong = search(p, scaled.y[0], scaled.u, next(starts(of, scaled.y[0], scaled.u)))
     right = engine.fit_output("armax", of, scaled, 0, {}, None)
     assert wrong.cost > 1.05 * right.cost
     (said,) = missed_minimum([of], [wrong], scaled)
@@ -63,7 +60,7 @@ def test_no_false_alarm_where_the_search_was_long() -> None:
     found = []
     for seed in range(40):
         system = SYSTEMS["armax"]
-        scaled = scaled_data("armax", system.data(seed, 400))
+        scaled = scale_data("armax", system.data(seed, 400))
         of = layout("armax", na=2, nb=2, nc=2)
         fit = engine.fit_output("armax", of, scaled, 0, {}, None)
         found += missed_minimum([of], [replace(fit, iterations=99)], scaled)
@@ -74,7 +71,7 @@ def test_starts_from_a_grid_hold_slow_roots() -> None:
     rng = np.random.default_rng(2)
     C = np.poly([0.97, 0.96, 0.1])
     y = lfilter(C, np.poly([0.99, 0.5, -0.2]), rng.standard_normal(4000))
-    scaled = scaled_data("arma", record(np.empty((4000, 0)), y[:, None], open_loop=True))
+    scaled = scale_data("arma", record(np.empty((4000, 0)), y[:, None], open_loop=True))
     of = Layout(na=3, nb=(), nc=3, nd=0, nf=(), nk=())
     first = next(separable_starts(of, scaled.y[0], scaled.u))
     p = predictor(of)
@@ -99,13 +96,13 @@ def test_the_search_ends_as_low_as_from_the_truth(name: str) -> None:
         e = lfilter(C, np.convolve(A, D) if plant == "A" else D, rng.standard_normal(800))
         g = lfilter(B, A, u)
         y = g + e * np.std(g) / np.std(e) / 2
-        scaled = scaled_data(name, record(u[:, None], y[:, None], open_loop=True))
+        scaled = scale_data(name, record(u[:, None], y[:, None], open_loop=True))
         of = layout(name, **{f"n{plant.lower()}": n}, nb=n, nc=C.size - 1, nd=D.size - 1)
         truth = of.start()
         truth[of.places["C", None]], truth[of.places["D", None]] = C, D
         truth[of.places[plant, None if plant == "A" else 0]] = A
         truth[of.places["B", 0]] = B * scaled.u_scale[0] / scaled.y_scale[0]
-        there = searched(predictor(of), scaled.y[0], scaled.u, truth)
+        there = search(predictor(of), scaled.y[0], scaled.u, truth)
         fit = engine.fit_output(name, of, scaled, 0, {}, None)
         worse += fit.cost > there.cost * (1 + 1.0 / fit.n_rows)  # by more than one unit of the log likelihood, twice
     assert worse <= 1

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.blackbox.polynomial.orders import Layout
-from ambid.blackbox.polynomial.predictor import predictor
+from ambid.blackbox.polynomial_predictor import Layout, predictor
 
 NO = (0, 0)
 LAYOUTS = {

@@ -8,8 +8,7 @@ from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
 from ambid.blackbox.data import IOData
-from ambid.blackbox.polynomial.orders import Layout
-from ambid.blackbox.polynomial.predictor import predictor
+from ambid.blackbox.polynomial_predictor import Layout, predictor
 from ambid.errors import EstimationError
 from tests.blackbox.polynomial.systems import SYSTEMS, A, B, System, record, two_outputs
 

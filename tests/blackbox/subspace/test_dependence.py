@@ -7,8 +7,9 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.spread import pole_covariance
-from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, sspem, subspace_models
+from ambid.blackbox.model import pole_covariance
+from ambid.blackbox.state_space_search import sspem
+from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
 from ambid.errors import EstimationError
 
 METHODS = {f.__name__: f for f in (n4sid, moesp, cva, pbsid, sspem)}

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.gradient import Sensitivities
-from ambid.blackbox.response import one_step
-from ambid.blackbox.spread import pole_covariance, response_covariance
+from ambid.blackbox.model import pole_covariance, response_covariance
+from ambid.blackbox.response import Sensitivities, one_step
 from ambid.blackbox.state_space import StateSpaceModel
-from ambid.blackbox.subspace import pbsid, sspem
-from ambid.blackbox.subspace.local import balanced, linear, moved, tangent
+from ambid.blackbox.state_space_search import balance, linear, move, sspem, tangent
+from ambid.blackbox.subspace import pbsid
 from ambid.errors import EstimationError
 from tests.blackbox.subspace.systems import COLOURED, DT, SERIES, UNSTABLE, modal, record
 
@@ -85,13 +84,13 @@ def test_predictions_are_linear_where_they_are_said_to_be() -> None:
 
 def test_balancing_changes_nothing_but_states() -> None:
     m, x0 = some(5), np.array([1.0, -2.0, 0.5])
-    other, first = balanced(m, x0, np.diag([2.0, 0.1]))
+    other, first = balance(m, x0, np.diag([2.0, 0.1]))
     rng = np.random.default_rng(1)
     u, y = rng.standard_normal((50, 2)), rng.standard_normal((50, 2))
     np.testing.assert_allclose(
         predictions(other.theta, m, first, u, y), predictions(m.theta, m, x0, u, y), rtol=1e-8, atol=1e-8
     )
-    np.testing.assert_array_equal(moved(m, np.zeros(m.theta.size)).theta, m.theta)
+    np.testing.assert_array_equal(move(m, np.zeros(m.theta.size)).theta, m.theta)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_it_ends_where_no_direction_leads_further_down() -> None:
     for _ in range(20):
         step = 0.3 * factor @ rng.standard_normal(values.size)
         # part of a standard deviation along any direction costs something, and as much on either side
-        up, down = (log_det(moved(found.model, s * step), data, found.offsets) - least for s in (1, -1))
+        up, down = (log_det(move(found.model, s * step), data, found.offsets) - least for s in (1, -1))
         assert min(up, down) > 0
         assert up == pytest.approx(down, rel=0.6)
 

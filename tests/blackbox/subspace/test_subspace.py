@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.spread import pole_covariance, response_covariance
+from ambid.blackbox.model import pole_covariance, response_covariance
 from ambid.blackbox.structures import structure
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
 from ambid.errors import EstimationError

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.made import made
+from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
 
@@ -59,7 +58,7 @@ def arx(data: IOData, na: int, nb: int, nk: int = 1) -> BlackBoxFit:
     covariance = np.zeros((len(free),) * 2)
     covariance[np.ix_(free, free)] = inner[: na + nb * u.shape[1], : na + nb * u.shape[1]]
     gain = a.sum()
-    return made(
+    return build_fit(
         "arx",
         data,
         orders={"na": na, "nb": nb, "nk": nk},

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
 
-from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instrumental import two_stage
-from ambid.blackbox.made import made
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.state_space import StateSpaceModel
@@ -244,7 +243,7 @@ def test_the_tangent_of_a_state_space_holds_the_change_of_every_entry():
 
 
 def by_hand(model, data) -> BlackBoxFit:
-    return made(
+    return build_fit(
         "n4sid" if isinstance(model, StateSpaceModel) else "srivc",
         data,
         orders={"n": 2},

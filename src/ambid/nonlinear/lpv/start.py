@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.roots import reflected
+from ambid.blackbox.roots import reflect
 from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.lpv.schedule import basis_values
 from ambid.nonlinear.lpv.shape import LpvShape, Part, errors
@@ -93,7 +93,7 @@ def by_long_regression(shape: LpvShape, parts: Sequence[Part], first: int) -> Ar
         goal.append(t[shape.ma :])
     theta = _solved(again, goal)[0]
     if not shape.error_degree:
-        theta[-shape.ma :] = reflected(np.concatenate([[1.0], theta[-shape.ma :]]))[1:]
+        theta[-shape.ma :] = reflect(np.concatenate([[1.0], theta[-shape.ma :]]))[1:]
     return theta
 
 

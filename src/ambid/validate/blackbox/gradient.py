@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.gradient import Sensitivities
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import stable, states
+from ambid.blackbox.response import Sensitivities, run_states, stable
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox.predictor import Errors, held_transfer
 
@@ -135,7 +134,7 @@ def _state_space_tangent(fit: BlackBoxFit, found: Errors, u: Array, y: Array) ->
     delay out of the residuals.
     """
     m = found.model
-    x = states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
+    x = run_states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
     moves = {"A": True, "B": True, "C": False, "D": bool(np.any(m.D)), "K": bool(np.any(m.K))}
     free = np.concatenate([np.full(getattr(m, name).size, moves[name]) for name in "ABCDK"])
     if fit.covariance is not None and fit.covariance.shape[0] == free.size:

@@ -1,0 +1,503 @@
+"""Physical parameters of a linear model from a frequency response, by maximum likelihood.
+
+Minimises the sum of e^H C^-1 e between the measured response and that of the model, exactly sampled where the input is
+held, with exact derivatives; starts come from the response itself. Consistent under feedback as far as the response is:
+take it with the reference (`ambid.signals.frf`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.frequency_lines import Lines, check_lines
+from ambid.errors import EstimationError, nearest
+from ambid.estimation import start as weak_form
+from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, parameter_named
+from ambid.estimation.linear import directions
+from ambid.estimation.threads import one_thread
+from ambid.estimation.uncertainty import WEAK
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import LinearModel
+from ambid.physics.parameters import Parameter
+from ambid.signals.response import FrequencyResponse
+
+Complex = NDArray[np.complex128]
+
+_COPIES = 2000  # rows for the bands of the weak form, which count in parts of a long spectrum
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Channels:
+    """Which inputs and outputs of the model were measured."""
+
+    outputs: tuple[int, ...]  # rows of the model's C, in the order of the response's outputs
+    inputs: tuple[int, ...]  # columns of its B
+
+
+def response(
+    model: LinearModel,
+    theta: Mapping[str, float],
+    names: Sequence[str],
+    ln: Lines,
+    channels: Channels,
+    delay: float,
+    *,
+    slope: bool = True,
+    moving: bool = True,
+) -> tuple[Complex, Complex]:
+    """Return the model's response and its derivative by parameters and delay.
+
+    `theta`: SI; `names`: parameters to differentiate by; `slope`: whether derivatives are wanted; `moving`: whether the
+    derivative by the delay is one of them. Returns `G`: (n_frequencies, n_outputs, n_inputs), complex; `derivative`:
+    the last by the delay in samples; empty where not wanted.
+    """
+    space = model.matrices(theta)
+    along = [model.derivative(theta, name) for name in names] if slope else []
+    n, columns, rows = space.A.shape[0], list(channels.inputs), list(channels.outputs)
+    if ln.held:
+        whole = int(np.floor(delay))
+        points = np.exp(1j * ln.omega * ln.dt)
+        late = np.exp(-1j * ln.omega * ln.dt)[:, None, None]
+        shift = late**whole
+        fraction = delay - whole
+        at, directions = discretise(space, ln.dt, fraction=fraction if fraction or moving else None, derivatives=along)
+        A, C = at.A, at.C[rows]
+        B = at.B[:, columns] + at.B_late[:, columns] * late
+        changes = [(d.A, d.B[:, columns] + d.B_late[:, columns] * late, d.C[rows]) for d in directions if slope]
+    else:
+        points = 1j * ln.omega
+        shift = np.exp(-1j * ln.omega * ln.dt * delay)[:, None, None]
+        A, C = space.A, space.C[rows]
+        B = np.broadcast_to(space.B[:, columns], (points.size, n, len(columns)))
+        changes = [(d.A, d.B[:, columns][None], d.C[rows]) for d in along]
+    pencil = points[:, None, None] * np.eye(n) - A
+    right = np.linalg.solve(pencil, B.astype(np.complex128)) * shift
+    G = C @ right
+    if not slope:
+        return G, np.empty((*G.shape, 0), dtype=np.complex128)
+    wide = np.broadcast_to(C.T.astype(np.complex128), (points.size, n, len(rows)))
+    left = np.swapaxes(np.linalg.solve(np.swapaxes(pencil, 1, 2), wide), 1, 2)
+    out = np.empty((*G.shape, len(names) + int(moving)), dtype=np.complex128)
+    for j, (dA, dB, dC) in enumerate(changes[: out.shape[-1]]):
+        out[..., j] = left @ (dA @ right + dB * shift) + dC @ right
+    if moving and not ln.held:
+        out[..., -1] = -1j * (ln.omega * ln.dt)[:, None, None] * G
+    return G, out
+
+
+def start_values(
+    model: LinearModel, ln: Lines, channels: Channels, delay: float, known: Mapping[str, float]
+) -> Iterator[dict[str, float]]:
+    """Yield start values: the equations of motion, linear in the parameters, by regression over bands of lines.
+
+    As `ambid.estimation.start`, with the response in place of the spectra: the input is 1 (times its hold), each output
+    its G. Nothing where the model's equations want an output that was not measured.
+
+    `known`: fixed values, SI. Returns all parameters, SI, as they come out (not always a plant).
+    """
+    copies = max(1, _COPIES // ln.n_lines)
+    omega = np.repeat(ln.omega, copies)
+    angle = omega * ln.dt
+    hold = np.sinc(angle / (2 * np.pi)) * np.exp(-0.5j * angle) if ln.held else np.ones(omega.size, dtype=np.complex128)
+    signals = {model.inputs[channels.inputs[0]]: (hold, 1j * omega * hold, -(omega**2) * hold)}
+    noise = {}
+    for j, k in enumerate(channels.outputs):
+        g = np.repeat(ln.G[:, j, 0], copies)
+        signals[model.outputs[k]] = (g, 1j * omega * g, -(omega**2) * g)
+        noise[model.outputs[k]] = float(np.sqrt(np.mean(ln.sd[:, j, 0] ** 2)))
+    if set(model.outputs) - set(signals):
+        return
+    moments = weak_form.Moments(omega=omega, signals=signals)
+    yield from weak_form.candidates(model.name, moments, noise, delay, 1.0 / ln.dt, known)
+
+
+_FAR = 1e100  # standard deviations: worse than anything
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhysicalProblem:
+    """What is estimated, and how a vector of order one means it: logarithms of what is positive, the rest over
+    sizes.
+    """
+
+    model: LinearModel
+    lines: Lines
+    channels: Channels
+    estimated: tuple[Parameter, ...]
+    known: Mapping[str, float]  # the others, SI
+    # (n_estimated,), SI
+    size: Array  # SI
+    positive: NDArray[np.bool_]  # (n_estimated,), bool, what is searched as a logarithm
+    # the lower whole one where `fractional` and the input is held
+    delay: float  # samples, or the lower whole one of a fraction that is estimated
+    fractional: bool = False  # whether the delay is estimated as a real number, last in the vector
+
+    def theta(self, v: Array) -> dict[str, float]:
+        """Return all physical parameters in SI.
+
+        `v`: (n_vector,).
+        """
+        x = v[: self.size.size]
+        values = self.size * np.where(self.positive, np.exp(np.clip(np.where(self.positive, x, 0.0), -50.0, 50.0)), x)
+        return {**self.known, **{p.name: float(x) for p, x in zip(self.estimated, values, strict=True)}}
+
+    def delay_at(self, v: Array) -> float:
+        """Return the delay in samples.
+
+        `v`: (n_vector,).
+        """
+        if not self.fractional:
+            return self.delay
+        return self.delay + (float(1 / (1 + np.exp(-v[-1]))) if self.lines.held else float(v[-1]))
+
+    def vector(self, values: Mapping[str, float]) -> Array:
+        """Return the vector for given parameters, without a delay.
+
+        `values`: SI. Returns (n_estimated,).
+        """
+        x = np.array([values[p.name] for p in self.estimated]) / self.size
+        return np.where(self.positive, np.log(np.maximum(x, 1e-300)), x)
+
+    def residual(self, v: Array) -> Array:
+        """Return whitened model - measured, then the priors'.
+
+        `v`: (n_vector,). Returns (n_rows,).
+        """
+        n_rows = 2 * self.lines.n_lines * self.lines.entries
+        try:
+            with np.errstate(all="ignore"):  # a step too far overflows: the search turns back from what is not finite
+                G, _ = response(self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v), slope=False)
+                rows = self.lines.whitened(G - self.lines.G)
+        except (np.linalg.LinAlgError, ValueError):
+            rows = np.full(n_rows, _FAR)
+        return np.concatenate([np.where(np.isfinite(rows), rows, _FAR), self._prior(v)])
+
+    def slope(self, v: Array, *, by_parameters: bool = False) -> Array:
+        """Return the derivative of `residual`.
+
+        `v`: (n_vector,); `by_parameters`: by parameters in SI and the delay in samples instead of the vector. Returns
+        (n_rows, n_vector).
+        """
+        theta, names = self.theta(v), [p.name for p in self.estimated]
+        _, d = response(self.model, theta, names, self.lines, self.channels, self.delay_at(v), moving=self.fractional)
+        J = self.lines.whitened(d)
+        rows = np.zeros((sum(p.role == "prior" for p in self.estimated), J.shape[1]))
+        for row, (j, p) in zip(rows, ((j, p) for j, p in enumerate(self.estimated) if p.role == "prior"), strict=True):
+            row[j] = 1.0 / float(p.sd or np.inf)
+        J = np.vstack([J, rows])
+        if not by_parameters:
+            n = self.size.size
+            J[:, :n] *= np.where(self.positive, [theta[k] for k in names], self.size)
+            if self.fractional and self.lines.held:
+                part = self.delay_at(v) - self.delay
+                J[:, n] *= part * (1 - part)
+        return J
+
+    def _prior(self, v: Array) -> Array:
+        theta = self.theta(v)
+        return np.array([(theta[p.name] - float(p.value or 0.0)) / float(p.sd or np.inf)
+                         for p in self.estimated if p.role == "prior"])  # fmt: skip
+
+
+_NORMAL_95 = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrequencyEstimate:
+    """Physical parameters from a frequency response."""
+
+    status: Literal["converged", "stalled"]
+    model: str
+    parameters: tuple[EstimatedParameter, ...]  # in the model's order
+    covariance_names: tuple[str, ...]  # estimated parameters, order of `covariance`
+    covariance: Array  # (n, n), SI
+    # robust (scatter of the scores over the lines, never smaller) where the check ``cost`` fails
+    covariance_method: Literal["information", "robust"]
+    delay: Delay  # of the inputs, in samples
+    continuous: Continuous
+    checks: Mapping[str, Check]  # ``cost`` and ``identifiable``
+    warnings: tuple[str, ...] = ()
+    # singular values of the scaled information matrix and the weakest direction
+    information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameter values, SI."""
+        return {p.name: p.value for p in self.parameters}
+
+    @property
+    def passed(self) -> bool:
+        """Whether the search converged and every check passed."""
+        return self.status == "converged" and all(c.passed for c in self.checks.values())
+
+    def parameter(self, name: str) -> EstimatedParameter:
+        """Return one parameter by name."""
+        return parameter_named(self.parameters, name)
+
+
+def frequency_estimate(
+    frf: FrequencyResponse,
+    problem: PhysicalProblem,
+    parameters: tuple[Parameter, ...],
+    cost: float,
+    v: Array,
+    converged: bool,
+    how: Literal["estimated", "given"],
+) -> FrequencyEstimate:
+    """Put an estimate together.
+
+    `parameters`: what was known before, in the model's order; `cost`: at `v`, priors included; `v`: (n_vector,); `how`:
+    the delay.
+    """
+    ln, n = problem.lines, problem.size.size
+    r, J = problem.residual(v), problem.slope(v, by_parameters=True)
+    n_priors = J.shape[0] - 2 * ln.n_lines * ln.entries
+    data = J[: J.shape[0] - n_priors] / np.sqrt(ln.widening)
+    whole = directions(np.vstack([data, J[J.shape[0] - n_priors :]])).inverse()
+    check = ln.verdict(cost, v.size, n_priors)
+    theta = problem.theta(v)
+    covariance = whole[:n, :n]
+    if not check.passed:
+        covariance = _robust(ln, whole, J, r)[:n, :n]
+    names = tuple(p.name for p in problem.estimated)
+    reference = problem.model.references(theta)
+    scale = np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
+    sizes, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    weakest = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
+    sd = np.sqrt(np.diag(covariance))
+    seen = {k: converged and bool(s < WEAK) for k, s in zip(names, sd / scale, strict=True)}
+    alone = np.sqrt(np.diag(directions(data).inverse())[:n])
+    spread, own = (dict(zip(names, x.tolist(), strict=True)) for x in (sd, alone))
+    unseen = [k for k in names if not seen[k]]
+    checks = {
+        "cost": check,
+        "identifiable": Check(
+            passed=not unseen,
+            detail=f"not shown by these lines: {', '.join(unseen)}. Excite another band, or give a prior"
+            if unseen
+            else "every estimated parameter has a relative standard deviation under 25 %",
+        ),
+    }
+    warnings = [*frf.warnings, *(f"{k}: {c.detail}" for k, c in checks.items() if not c.passed)]
+    if not converged:
+        warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+    total = problem.delay_at(v)
+    space = problem.model.matrices(theta)
+    return FrequencyEstimate(
+        status="converged" if converged else "stalled",
+        model=problem.model.name,
+        parameters=tuple(_parameter(p, theta[p.name], spread, seen, own) for p in parameters),
+        covariance_names=names,
+        covariance=covariance,
+        covariance_method="information" if check.passed else "robust",
+        delay=Delay(
+            samples=int(np.floor(total)),
+            fraction=total - float(np.floor(total)),
+            sd=float(np.sqrt(whole[-1, -1])) if problem.fractional else None,
+            how=how,
+        ),
+        continuous=Continuous(
+            states=problem.model.states,
+            A=space.A,
+            B=space.B,
+            C=space.C,
+            poles=np.linalg.eigvals(space.A).astype(np.complex128),
+        ),
+        checks=checks,
+        warnings=tuple(warnings),
+        information={
+            "singular_values": (1 / np.sqrt(np.maximum(sizes, 1e-300))).tolist(),
+            "weakest_direction": dict(zip(names, weakest.tolist(), strict=True)),
+        },
+        record={"lines": ln.n_lines, "rate_hz": frf.rate_hz, "method": frf.method, "hold": frf.hold},
+    )
+
+
+def _robust(ln: Lines, whole: Array, J: Array, r: Array) -> Array:
+    """Covariance from the scatter of the scores over the lines, with standard deviations never below those of noise."""
+    rows = 2 * ln.n_lines * ln.entries
+    scores = (J[:rows] * r[:rows, None]).reshape(2, ln.n_lines, ln.entries, -1).sum(axis=(0, 2))
+    half = scores @ (whole / ln.widening)
+    own = half.T @ half * ln.alike
+    larger = np.maximum(1.0, np.sqrt(np.diag(whole) / np.maximum(np.diag(own), 1e-300)))
+    return np.asarray(own * np.outer(larger, larger))
+
+
+def _parameter(
+    p: Parameter, value: float, sd: Mapping[str, float], seen: Mapping[str, bool], alone: Mapping[str, float]
+) -> EstimatedParameter:
+    spread = sd.get(p.name, 0.0)
+    share = float(1 / (1 + (alone[p.name] / p.sd) ** 2)) if p.role == "prior" and p.sd else None
+    return EstimatedParameter(
+        name=p.name,
+        unit=p.unit,
+        value=value,
+        sd=spread,
+        ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
+        role=p.role,
+        identifiable=seen.get(p.name, True),
+        data_share=share,
+    )
+
+
+MAX_DELAY = 6  # samples, searched when the delay is "auto"
+_KEPT = 6  # starts that are searched a little way
+_SHORT = 12  # evaluations of that
+_WORTH = 10.0  # fall of twice the cost that a delay in fractions has to be worth
+
+
+def greybox_frf(
+    frf: FrequencyResponse,
+    model: LinearModel,
+    parameters: Sequence[Parameter],
+    *,
+    delay: float | Literal["auto"] = "auto",
+    roles: Mapping[str, str] | None = None,
+) -> FrequencyEstimate:
+    """Estimate the physical parameters of a model from a frequency response."""
+    channels = _channels(frf, model, roles or {})
+    ordered = _order_parameters(model, parameters)
+    if delay != "auto" and not (np.isfinite(delay) and delay >= 0):
+        raise EstimationError(f"a delay of {delay} samples; it must be zero or positive, or 'auto'. Correct it")
+    free = tuple(p for p in ordered if p.role != "fixed")
+    if not free:
+        raise EstimationError("no parameter is free; nothing is left to estimate. Give one the role 'free' or 'prior'")
+    ln = check_lines(frf, len(free) + 1)
+    with one_thread():
+        problem, v = _race(model, ln, channels, ordered, delay)
+        cost, v, converged = _search(problem, v)
+        if delay == "auto":
+            problem, cost, v, converged = _free_fraction(problem, cost, v, converged)
+    return frequency_estimate(frf, problem, ordered, cost, v, converged, "estimated" if delay == "auto" else "given")
+
+
+def _channels(frf: FrequencyResponse, model: LinearModel, roles: Mapping[str, str]) -> Channels:
+    found: dict[str, list[int]] = {"input": [], "output": []}
+    for what, names, known in (("input", frf.inputs, model.inputs), ("output", frf.outputs, model.outputs)):
+        for name in names:
+            role = roles.get(name, name)
+            if role not in known:
+                raise EstimationError(
+                    f"{what} {name!r} of the response is no {what} of model {model.name!r}, which has "
+                    f"{', '.join(known)}.{nearest(role, list(known))} Give roles={{{name!r}: ...}}"
+                )
+            found[what].append(known.index(role))
+    return Channels(outputs=tuple(found["output"]), inputs=tuple(found["input"]))
+
+
+def _order_parameters(model: LinearModel, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    given = {p.name: p for p in parameters}
+    wanted = [p.name for p in model.parameters]
+    if sorted(given) != sorted(wanted) or len(parameters) != len(wanted):
+        raise EstimationError(
+            f"parameters {', '.join(sorted(p.name for p in parameters))} for model {model.name!r}, which has "
+            f"{', '.join(wanted)}. Give each once"
+        )
+    return tuple(given[k] for k in wanted)
+
+
+def _race(
+    model: LinearModel,
+    ln: Lines,
+    channels: Channels,
+    parameters: tuple[Parameter, ...],
+    delay: float | Literal["auto"],
+) -> tuple[PhysicalProblem, Array]:
+    """All starts of all delays by their cost, the best searched a little way, the best of those."""
+    fixed = {p.name: p.value for p in parameters if p.role == "fixed" and p.value is not None}
+    given = {p.name: p.value for p in parameters if p.value is not None}
+    positive = {s.name for s in model.parameters if s.positive}
+    scored: list[tuple[float, int, PhysicalProblem, Array]] = []
+    for lag in [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]:
+        from_data = list(start_values(model, ln, channels, lag, fixed))
+        for found in [*from_data, *({**x, **given} for x in [*from_data[:3], {}] if given != fixed or not x)]:
+            # noise may turn the sign of what hardly shows (a resistance at a sharp resonance): its size is a start
+            values = {k: abs(x) if k in positive else x for k, x in found.items()}
+            problem = _problem(model, ln, channels, parameters, fixed, values, lag)
+            if problem is not None:
+                v = problem.vector(values)
+                cost = _cost(problem, v)
+                if cost < 1e100:
+                    scored.append((cost, len(scored), problem, v))
+    if not scored:
+        raise EstimationError(
+            "no start values make a plant (positive m and L) with this response: an output is missing, or signs, units "
+            "or channels are not what the model says. Check them, or give every parameter a start value"
+        )
+    scored.sort()
+    race = []
+    for _, k, problem, v in scored[:_KEPT]:
+        cost, end, _ = _search(problem, v, evaluations=_SHORT)
+        race.append((cost, k, problem, end))
+    best = min(race)
+    return best[2], best[3]
+
+
+def _problem(
+    model: LinearModel,
+    ln: Lines,
+    channels: Channels,
+    parameters: tuple[Parameter, ...],
+    fixed: Mapping[str, float],
+    values: Mapping[str, float],
+    delay: float,
+) -> PhysicalProblem | None:
+    """Set up from start values; None where they are no plant."""
+    positive = {s.name: s.positive for s in model.parameters}
+    if set(positive) - set(values) or not all(np.isfinite(x) for x in values.values()):
+        return None
+    if any(values[k] <= 0 for k, must in positive.items() if must):
+        return None
+    free, reference = tuple(p for p in parameters if p.role != "fixed"), model.references(values)
+    size = [max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0)) or 1.0 for p in free]
+    return PhysicalProblem(
+        model=model,
+        lines=ln,
+        channels=channels,
+        estimated=free,
+        known=dict(fixed),
+        size=np.array(size),
+        positive=np.array([positive[p.name] for p in free]),
+        delay=delay,
+    )
+
+
+def _cost(problem: PhysicalProblem, v: Array) -> float:
+    return float(np.sum(problem.residual(v) ** 2)) / 2
+
+
+def _search(problem: PhysicalProblem, v: Array, *, evaluations: int = 200) -> tuple[float, Array, bool]:
+    """Levenberg-Marquardt; cost (priors included), vector, whether it converged."""
+    from scipy.optimize import least_squares
+
+    found = least_squares(
+        problem.residual, v, jac=problem.slope, method="lm", x_scale="jac", xtol=1e-11, ftol=1e-12, gtol=1e-11,
+        max_nfev=evaluations,
+    )  # fmt: skip
+    return float(found.cost), np.asarray(found.x, dtype=np.float64), bool(found.status > 0)
+
+
+def _free_fraction(
+    problem: PhysicalProblem, cost: float, v: Array, converged: bool
+) -> tuple[PhysicalProblem, float, Array, bool]:
+    """Free the delay on both sides of the whole sample, and keep it where that is worth it."""
+    best = (problem, cost, v, converged)
+    sides = [problem.delay - 1, problem.delay] if problem.lines.held else [problem.delay]
+    for lower in sides:
+        if lower < 0:
+            continue
+        at = replace(problem, delay=lower, fractional=True)
+        begin = (1.0 if lower < problem.delay else -1.0) if problem.lines.held else 0.0
+        found = _search(at, np.append(v, begin))
+        good = at.delay_at(found[1]) >= 0 and np.isfinite(found[0])
+        if good and 2 * (best[1] - found[0]) > (_WORTH if best[0] is problem else 0.0):
+            best = (at, *found)
+    return best

@@ -1,0 +1,220 @@
+"""A measured frequency response with what was fitted to it, what those models say, and its file ``ambid.frf/1``.
+
+A model is compared with a held input's response as that was measured: sampled under the hold, delay included.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.bearing.frequency import Channels, FrequencyEstimate, response
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.fit_file import fit_to_json
+from ambid.blackbox.frequency_lines import check_lines
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.estimation.documents import covariance_together, fields_json, plain_json
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import StateSpace
+from ambid.physics.models import model as physical_model
+from ambid.signals.response import FrequencyResponse
+
+Complex = NDArray[np.complex128]
+
+_STEP = 1e-3  # standard deviations of a coefficient over which a difference is taken
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measured:
+    """A frequency response of one record and the models that were fitted to it, file schema ``ambid.frf/1``.
+
+    Attributes
+    ----------
+    response : FrequencyResponse
+    references : tuple of str
+        Channels of the loop's outer excitation that were used.
+    open_loop : bool
+        Whether the user says that no feedback was at work.
+    fit : BlackBoxFit or None
+        Structure ``frf-ml`` or ``frf-subspace``.
+    estimate : FrequencyEstimate or None
+        Physical parameters.
+    record : Mapping[str, object]
+        ``samples``, ``rate_hz``, ``sha256``, ``file``, ``history``.
+    timing_s : Mapping[str, float]
+        Wall time by stage.
+    """
+
+    response: FrequencyResponse
+    references: tuple[str, ...] = ()
+    open_loop: bool = False
+    fit: BlackBoxFit | None = None
+    estimate: FrequencyEstimate | None = None
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every fit converged and passed its checks; a response alone has none to fail."""
+        return all(x is None or x.passed for x in (self.fit, self.estimate))
+
+    @property
+    def distortion_sd(self) -> Array | None:
+        """Standard deviation due to distortion, shape (n_f, n_y, n_u); None where noise is all that was measured."""
+        frf = self.response
+        if frf.noise_covariance is None or np.array_equal(frf.noise_covariance, frf.covariance):
+            return None
+        return frf.distortion_sd
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModelResponse:
+    """What a model says of a response, with what its coefficients leave open."""
+
+    source: str  # what the model is
+    frequency_hz: Array  # (n_frequencies,), Hz
+    G: Complex  # (n_frequencies, n_outputs, n_inputs), complex
+    log_sd: Array  # (n_frequencies, n_outputs, n_inputs), standard deviation of the natural logarithm of the magnitude
+    phase_sd: Array  # (n_frequencies, n_outputs, n_inputs), rad
+
+
+def model_responses(measured: Measured, frequency_hz: Array) -> tuple[ModelResponse, ...]:
+    """Compute what the models fitted to a response say, in the same form as the response was measured.
+
+    `frequency_hz`: (n_frequencies,), Hz. Returns of the black-box fit and of the physical parameters, as far as there
+    are such.
+    """
+    found = []
+    if measured.fit is not None:
+        found.append(_of_fit(measured.fit, measured.response, frequency_hz))
+    if measured.estimate is not None:
+        found.append(_of_estimate(measured.estimate, measured.response, frequency_hz))
+    return tuple(found)
+
+
+def _of_fit(fit: BlackBoxFit, frf: FrequencyResponse, frequency_hz: Array) -> ModelResponse:
+    omega, model, held = 2 * np.pi * frequency_hz, fit.model, frf.hold == "zoh"
+    if isinstance(model, StateSpaceModel):
+        # the method takes the known delay out of the lines beforehand
+        late = np.exp(-1j * omega * float(str(fit.details.get("delay_s", 0.0))))[:, None, None]
+        if model.dt is None and held:
+            G = _sampled(model, omega, fit.dt) * late
+            return _with_spread(fit.structure, frequency_hz, G, _differences(model, omega, fit) * late[..., None])
+        G, slope = model.frequency_response(omega) * late, model.frequency_response_derivative(omega) * late[..., None]
+    else:
+        G, slope = model.frequency_response(omega), model.frequency_response_derivative(omega)
+        if model.dt is None and held:  # the hold's own response, which the fit takes out
+            hold = (np.sinc(frequency_hz * fit.dt) * np.exp(-0.5j * omega * fit.dt))[:, None, None]
+            G, slope = G * hold, slope * hold[..., None]
+    return _with_spread(fit.structure, frequency_hz, G, slope @ _root(fit.covariance, model.theta.size))
+
+
+def _of_estimate(estimate: FrequencyEstimate, frf: FrequencyResponse, frequency_hz: Array) -> ModelResponse:
+    plant, names = physical_model(estimate.model), estimate.covariance_names
+    at = replace(check_lines(frf, 1), omega=2 * np.pi * frequency_hz)
+    channels = Channels(
+        outputs=tuple(plant.outputs.index(x) for x in frf.outputs),
+        inputs=tuple(plant.inputs.index(x) for x in frf.inputs),
+    )
+    delay = estimate.delay.samples + estimate.delay.fraction
+    G, slope = response(plant, estimate.values, names, at, channels, delay, moving=False)
+    return _with_spread(
+        f"physical parameters of {estimate.model}", frequency_hz, G, slope @ _root(estimate.covariance, len(names))
+    )
+
+
+def _with_spread(source: str, frequency_hz: Array, G: Complex, spread: Complex) -> ModelResponse:
+    """Standard deviations from independent directions, last axis of `spread`, each of one standard deviation."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.nan_to_num(spread / G[..., None])
+    return ModelResponse(
+        source=source,
+        frequency_hz=frequency_hz,
+        G=G,
+        log_sd=np.linalg.norm(relative.real, axis=-1),
+        phase_sd=np.linalg.norm(relative.imag, axis=-1),
+    )
+
+
+def _root(covariance: Array | None, n: int) -> Array:
+    """A square root of a covariance, column by column a direction; scaled first, as coefficients differ by decades."""
+    if covariance is None:
+        return np.zeros((n, 0))
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    unit = np.where(sd > 0, sd, 1.0)
+    size, directions = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return np.asarray(unit[:, None] * directions * np.sqrt(np.maximum(size, 0.0)))
+
+
+def _sampled(model: StateSpaceModel, omega: Array, dt: float) -> Complex:
+    """Response of a continuous plant with a held input at the sampling instants."""
+    n = model.order
+    space = StateSpace(A=model.A, B=model.B, C=model.C, E=np.zeros((n, 0)))
+    d, _ = discretise(space, dt)
+    wide = np.broadcast_to(d.B.astype(np.complex128), (omega.size, *d.B.shape))
+    states = np.linalg.solve(np.exp(1j * omega * dt)[:, None, None] * np.eye(n) - d.A, wide)
+    return np.asarray(d.C @ states + model.D)
+
+
+def _differences(model: StateSpaceModel, omega: Array, fit: BlackBoxFit) -> Complex:
+    """Changes of the sampled response along the directions of the covariance, by central differences."""
+    root = _root(fit.covariance, model.theta.size)
+    root = root[:, np.linalg.norm(root, axis=0) > 0]
+    moved = [
+        sum(sign * _sampled(model.with_theta(model.theta + sign * _STEP * way), omega, fit.dt) for sign in (1, -1))
+        / (2 * _STEP)
+        for way in root.T
+    ]
+    return np.stack(moved, axis=-1) if moved else np.zeros((omega.size, *model.D.shape, 0), dtype=np.complex128)
+
+
+SCHEMA = "ambid.frf/1"
+
+
+def measured_text(measured: Measured) -> str:
+    """Return the JSON text of a measured response, one field a line."""
+    fields = measured_to_json(measured).items()
+    body = ",\n ".join(f"{json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in fields)
+    return f"{{{body}}}\n"
+
+
+def measured_to_json(measured: Measured) -> dict[str, Any]:
+    """Return a measured response in the form of schema ``ambid.frf/1``; numbers that are not finite are null."""
+    frf, estimate = measured.response, measured.estimate
+    more = {
+        "G": _by_pair(frf, frf.G),
+        "sd": _by_pair(frf, frf.sd),
+        "noise_sd": _by_pair(frf, frf.noise_sd),
+        "distortion_sd": _by_pair(frf, measured.distortion_sd),
+        "coherence": None if frf.coherence is None else {o: frf.coherence[:, k] for k, o in enumerate(frf.outputs)},
+        "covariance": _covariance_json(frf),
+        "fit": None if measured.fit is None else fit_to_json(measured.fit),
+        "estimate": None if estimate is None else covariance_together(fields_json(estimate, without=("record",))),
+    }
+    return {
+        "schema": SCHEMA,
+        **fields_json(measured, without=("response", "fit", "estimate")),
+        **fields_json(frf, without=("G", "covariance", "noise_covariance", "coherence")),
+        **plain_json(more),
+    }
+
+
+def _by_pair(frf: FrequencyResponse, values: Any) -> dict[str, dict[str, Any]] | None:
+    """``{output: {input: [...]}}``."""
+    if values is None:
+        return None
+    return {o: {i: values[:, j, k] for k, i in enumerate(frf.inputs)} for j, o in enumerate(frf.outputs)}
+
+
+def _covariance_json(frf: FrequencyResponse) -> dict[str, Any] | None:
+    """With one entry `sd` says it all."""
+    if frf.n_inputs * frf.n_outputs == 1:
+        return None
+    return {"entries": [[o, i] for o in frf.outputs for i in frf.inputs], "matrix": frf.covariance}

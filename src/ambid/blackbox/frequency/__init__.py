@@ -1,1 +1,0 @@
-"""Parametric models from frequency responses: rational, state space, and the physical parameters themselves."""

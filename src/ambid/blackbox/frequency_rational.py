@@ -1,0 +1,611 @@
+"""Transfer functions from a frequency response by maximum likelihood, in s or in z.
+
+Minimises the sum of e^H C^-1 e with e = G - N/D exp(-j omega tau) by Levenberg-Marquardt with the exact Jacobian, from
+vector fitting and from iterated linear fits (Pintelon and Schoukens 2012, ch. 9; Sanathanan and Koerner 1963). N and D
+are searched in polynomials that are orthogonal on the lines (Forsythe 1957; Rolain et al. 1995; Brubeck, Nakatsukasa
+and Trefethen 2021), with one common factor left free, so that the search is well-conditioned at any order.
+
+Vector fitting relocates poles: G sigma = p with sigma = d + sum c_k/(s - a_k) and p alike is linear in c, d and the
+residues of p; the zeros of sigma are the next poles. Relaxed: sigma's real part sums to the number of lines instead of
+d = 1 (Gustavsen and Semlyen 1999; Gustavsen 2006; one QR for each entry: Deschrijver et al. 2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.data import Orders, check_order_names, compact_order, left_open, order_per_input, single_order
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.transfer_model import TransferModel
+from ambid.errors import EstimationError
+from ambid.estimation.threads import one_thread
+from ambid.signals.response import FrequencyResponse
+
+Complex = NDArray[np.complex128]
+
+
+def orthogonal_polynomials(points: Complex, weight: Array, degree: int) -> tuple[Complex, Array]:
+    """Return orthogonal polynomials on points and their coefficients.
+
+    Orthonormal for Re sum_f weight_f^2 conj(a_f) b_f, which is the sum over the lines and their conjugates.
+
+    `points`: (n_frequencies,), complex, of order one (s over a frequency of the band, or z); `weight`:
+    (n_frequencies,), positive. Returns `values`: (n_frequencies, degree + 1), complex; `powers`: (degree + 1, degree +
+    1), column k holds the coefficients of polynomial k, lowest power first.
+    """
+    n = points.size
+    q = np.empty((n, degree + 1), dtype=np.complex128)
+    powers = np.zeros((degree + 1, degree + 1))
+    first = float(np.linalg.norm(weight))
+    q[:, 0], powers[0, 0] = weight / first, 1.0 / first
+    for k in range(degree):
+        v, c = points * q[:, k], np.concatenate([[0.0], powers[:-1, k]])
+        for _ in range(2):  # once more, against round-off
+            h = np.real(q[:, : k + 1].conj().T @ v)
+            v, c = v - q[:, : k + 1] @ h, c - powers[:, : k + 1] @ h
+        size = max(float(np.linalg.norm(v)), 1e-300)
+        q[:, k + 1], powers[:, k + 1] = v / size, c / size
+    return q / weight[:, None], powers
+
+
+_STILL = 1e-10  # relative movement of the poles at which they stand
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoleResidueModel:
+    """G = D + sum_k residues[k] / (s - poles[k]), in s (rad/s) or z."""
+
+    poles: Complex  # (n,), complex, complex ones in neighbouring conjugate pairs
+    residues: Complex  # (n, n_outputs, n_inputs), complex
+    D: Array  # (n_outputs, n_inputs)
+    dt: float | None  # sampling interval in s; None for continuous time
+    iterations: int  # relocations that were made
+    converged: bool  # whether the poles stood still at the end
+    error: float  # root mean square of the weighted error
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G.
+
+        `omega`: (n_frequencies,), rad/s. Returns (n_frequencies, n_outputs, n_inputs), complex.
+        """
+        s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
+        return np.asarray(self.D + np.einsum("fk,kyu->fyu", 1.0 / (s[:, None] - self.poles), self.residues))
+
+    def transfer_model(self) -> TransferModel:
+        """Return transfer functions with the common denominator."""
+        den, (_, n_y, n_u) = np.real(np.poly(self.poles)), self.residues.shape
+        rest = [np.poly(np.delete(self.poles, k)) for k in range(self.poles.size)]
+        num = [[self.D[o, i] * den for i in range(n_u)] for o in range(n_y)]
+        for o, i in np.ndindex(n_y, n_u):
+            for k, others in enumerate(rest):
+                num[o][i] = num[o][i] + np.concatenate([[0.0], np.real(self.residues[k, o, i] * others)])
+        return TransferModel(
+            num=tuple(tuple(row) for row in num), den=tuple(tuple(den for _ in row) for row in num), dt=self.dt
+        )
+
+    def state_space(self) -> StateSpaceModel:
+        """Return a real block-diagonal form: each pole as often as the rank of its residue matrix wants.
+
+        Returns with K = 0.
+        """
+        from scipy.linalg import block_diag
+
+        _, n_y, n_u = self.residues.shape
+        blocks: list[tuple[Array, Array, Array]] = []
+        for k, a in enumerate(self.poles):
+            if a.imag < 0:
+                continue
+            left, size, right = np.linalg.svd(self.residues[k])
+            for j in np.nonzero(size > 1e-9 * max(float(size[0]), 1e-300))[0]:
+                c, b = left[:, j] * np.sqrt(size[j]), right[j] * np.sqrt(size[j])
+                if a.imag == 0:
+                    # a real residue has real singular vectors, up to a phase that both share
+                    turn = np.exp(-1j * np.angle(b[np.argmax(np.abs(b))]))
+                    blocks.append((np.array([[a.real]]), np.real(b * turn)[None], np.real(c / turn)[:, None]))
+                else:
+                    block = np.array([[a.real, a.imag], [-a.imag, a.real]])
+                    blocks.append((block, 2 * np.stack([b.real, -b.imag]), np.stack([c.real, c.imag], axis=1)))
+        A = block_diag(*[b[0] for b in blocks]) if blocks else np.zeros((0, 0))
+        B = np.vstack([np.zeros((0, n_u)), *[b[1] for b in blocks]])
+        C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
+        return StateSpaceModel(A=A, B=B, C=C, D=self.D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
+
+
+def vector_fit(
+    omega: Array,
+    G: Complex,
+    n_poles: int,
+    *,
+    dt: float | None = None,
+    weight: Array | None = None,
+    feedthrough: bool = True,
+    start: Complex | None = None,
+    iterations: int = 40,
+) -> PoleResidueModel:
+    """Fit poles that all entries share, and their residues.
+
+    `omega`: (n_frequencies,), rad/s; `G`: (n_frequencies, n_outputs, n_inputs), complex; `dt`: sampling interval in s
+    for a model in z; None for one in s; `weight`: (n_frequencies, n_outputs, n_inputs), one over the standard deviation
+    of each entry; default 1; `feedthrough`: whether D is estimated; else 0; `start`: (n_poles,), complex, first poles,
+    conjugates side by side; default spread over the band, lightly damped; `iterations`: relocations at most. Returns
+    the best of all relocations.
+    """
+    n, m = omega.size, int(np.prod(G.shape[1:]))
+    if n_poles < 1 or 2 * n * m < n_poles * (m + 1) + m or n < 2:
+        raise EstimationError(f"{n_poles} poles from {n} lines: give at least 1 pole, and fewer than the lines show")
+    if not (np.all(np.isfinite(omega)) and np.all(np.isfinite(G))):
+        raise EstimationError("vector fitting got numbers that are not finite; leave those lines out")
+    size = float(np.median(omega)) if dt is None else 1.0  # poles of order one
+    points = np.asarray(1j * omega / size if dt is None else np.exp(1j * omega * dt), dtype=np.complex128)
+    flat = G.reshape(n, m)
+    w = np.ones((n, m)) if weight is None else np.asarray(weight, dtype=np.float64).reshape(n, m)
+    w = w / np.sqrt(np.mean(w**2 * np.abs(flat) ** 2) + 1e-300)
+    poles = _spread_poles(omega, n_poles, size, dt) if start is None else np.asarray(start, dtype=np.complex128) / size
+    best: tuple[float, Complex, Complex, Array] | None = None
+    done, still = 0, False
+    for done in range(1, iterations + 1):  # noqa: B007  (its last value is reported)
+        moved = _relocate(points, flat, w, poles, feedthrough)
+        change = np.max(
+            np.abs(np.sort_complex(moved) - np.sort_complex(poles)) / np.maximum(np.abs(moved).max(), 1e-300)
+        )
+        poles, still = moved, bool(change < _STILL)
+        error, residues, D = _fit_residues(points, flat, w, poles, feedthrough)
+        if best is None or error < best[0]:
+            best = (error, poles, residues, D)
+        if still:
+            break
+    if best is None or not np.isfinite(best[0]):
+        raise EstimationError("vector fitting found no finite poles; lower the number of poles, or check the lines")
+    return PoleResidueModel(
+        poles=best[1] * size,
+        residues=(best[2] * size).reshape(n_poles, *G.shape[1:]),
+        D=best[3].reshape(G.shape[1:]),
+        dt=dt,
+        iterations=done,
+        converged=still,
+        error=best[0],
+    )
+
+
+def _spread_poles(omega: Array, n_poles: int, size: float, dt: float | None) -> Complex:
+    """Lightly damped pairs over the band, and one real pole where their number is odd."""
+    used = omega[omega > 0]
+    centres = np.geomspace(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
+    centres = np.asarray(centres)[: n_poles // 2]
+    pairs = np.stack([centres * (-0.01 + 1j), centres * (-0.01 - 1j)], axis=1).ravel()
+    s = np.concatenate([pairs, [-np.sqrt(used[0] * used[-1])] * (n_poles % 2)]).astype(np.complex128)
+    return np.asarray(s / size if dt is None else np.exp(s * dt))
+
+
+def _basis(points: Complex, poles: Complex) -> tuple[Complex, NDArray[np.int_]]:
+    """Partial fractions with real coefficients, (n_frequencies, n_poles), and their kinds: 0 real, 1 and 2 a pair."""
+    phi = np.empty((points.size, poles.size), dtype=np.complex128)
+    kind = np.zeros(poles.size, dtype=np.int_)
+    k = 0
+    while k < poles.size:
+        a = poles[k]
+        if a.imag == 0:
+            phi[:, k] = 1.0 / (points - a)
+            k += 1
+        else:
+            up, down = 1.0 / (points - a), 1.0 / (points - np.conj(a))
+            phi[:, k], phi[:, k + 1] = up + down, 1j * (up - down)
+            kind[k : k + 2] = 1, 2
+            k += 2
+    return phi, kind
+
+
+def _relocate(points: Complex, flat: Complex, w: Array, poles: Complex, feedthrough: bool) -> Complex:
+    """One relocation: the zeros of sigma."""
+    phi, kind = _basis(points, poles)
+    n, m, order = points.size, flat.shape[1], poles.size
+    own = np.column_stack([phi, np.ones(n)]) if feedthrough else phi
+    sigma = np.column_stack([phi, np.ones(n)])
+    rows = []
+    for e in range(m):
+        block = np.column_stack([own * w[:, [e]], -sigma * (w[:, e] * flat[:, e])[:, None]])
+        r = np.asarray(np.linalg.qr(np.concatenate([block.real, block.imag]), mode="r"))
+        rows.append(r[own.shape[1] :, own.shape[1] :])
+    relax = np.real(np.sum(sigma, axis=0)) * (np.sqrt(np.mean([np.sum(np.abs(r) ** 2) for r in rows])) / n)
+    system = np.vstack([*rows, relax])
+    right = np.zeros(system.shape[0])
+    right[-1] = relax[-1]
+    norm = np.maximum(np.linalg.norm(system, axis=0), 1e-300)
+    x = np.linalg.lstsq(system / norm, right, rcond=None)[0] / norm
+    c, d = x[:order], x[order]
+    if abs(d) < 1e-8:
+        d = 1e-8 if d >= 0 else -1e-8
+    A, b = np.zeros((order, order)), np.ones(order)
+    for k in range(order):
+        if kind[k] == 0:
+            A[k, k] = poles[k].real
+        elif kind[k] == 1:
+            A[k : k + 2, k : k + 2] = [[poles[k].real, poles[k].imag], [-poles[k].imag, poles[k].real]]
+            b[k], b[k + 1] = 2.0, 0.0
+    found = np.linalg.eigvals(A - np.outer(b, c) / d).astype(np.complex128)
+    real = np.sort(found[np.abs(found.imag) <= 1e-12 * np.abs(found)].real)
+    upper = found[found.imag > 1e-12 * np.abs(found)]
+    upper = upper[np.argsort(upper.imag)]
+    return np.concatenate([np.stack([upper, upper.conj()], axis=1).ravel(), real.astype(np.complex128)])
+
+
+def _fit_residues(
+    points: Complex, flat: Complex, w: Array, poles: Complex, feedthrough: bool
+) -> tuple[float, Complex, Array]:
+    """Weighted error, residues (n_poles, m) and D (m,) for given poles."""
+    phi, kind = _basis(points, poles)
+    own = np.column_stack([phi, np.ones(points.size)]) if feedthrough else phi
+    m, squares = flat.shape[1], 0.0
+    x = np.empty((own.shape[1], m))
+    for e in range(m):
+        block = own * w[:, [e]]
+        a = np.concatenate([block.real, block.imag])
+        right = np.concatenate([(w[:, e] * flat[:, e]).real, (w[:, e] * flat[:, e]).imag])
+        norm = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+        x[:, e] = np.linalg.lstsq(a / norm, right, rcond=None)[0] / norm
+        squares += float(np.sum((a @ x[:, e] - right) ** 2))
+    residues = np.zeros((poles.size, m), dtype=np.complex128)
+    for k in range(poles.size):
+        if kind[k] == 0:
+            residues[k] = x[k]
+        elif kind[k] == 1:
+            residues[k] = x[k] + 1j * x[k + 1]
+            residues[k + 1] = np.conj(residues[k])
+    D = x[-1] if feedthrough else np.zeros(m)
+    return float(np.sqrt(squares / flat.size)), residues, np.asarray(D)
+
+
+MAX_DELAY = 6  # samples, searched when the delay is "auto"
+_STARTING = 12  # iterated linear fits from each start
+_RACE = 3  # starts from which the likelihood is searched
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Form:
+    """Degrees, and who shares a denominator: what a vector of coefficients means."""
+
+    lines: Lines
+    variable: Complex  # the points, scaled
+    size: float  # rad/s that the points are scaled by; 1 for z
+    dt: float | None
+    extra: Complex  # known factor of the response (hold)
+    nb: tuple[int, ...]  # numerator coefficients of each entry
+    nf: tuple[int, ...]  # degree of each denominator
+    group: tuple[int, ...]  # denominator of each entry
+    delay_free: bool
+    values: tuple[Complex, ...] = ()  # polynomials of each denominator's group on the lines
+    powers: tuple[Array, ...] = ()
+
+    @property
+    def places(self) -> tuple[list[slice], list[slice], int]:
+        edge, num, den = 0, [], []
+        for n in self.nb:
+            num.append(slice(edge, edge + n))
+            edge += n
+        for n in self.nf:
+            den.append(slice(edge, edge + n + 1))
+            edge += n + 1
+        return num, den, edge
+
+    @property
+    def n_vector(self) -> int:
+        return self.places[2] + int(self.delay_free)
+
+    @property
+    def n_estimated(self) -> int:
+        """One factor in each group is no number of the model."""
+        return self.n_vector - len(self.nf)
+
+
+def frf_ml(
+    frf: FrequencyResponse,
+    orders: Orders,
+    *,
+    domain: Literal["s", "z"] | None = None,
+    delay: float | Literal["auto"] = 0.0,
+    common: bool = True,
+) -> BlackBoxFit:
+    """Fit transfer functions to a frequency response by maximum likelihood.
+
+    Parameters
+    ----------
+    frf : FrequencyResponse
+    orders : Mapping[str, int or tuple of int]
+        ``nf``, degree of the denominator (a tuple, row by row, where entries have their own), and ``nb``, number of
+        numerator coefficients (a tuple, row by row, where entries differ): at most nf + 1.
+    domain : {"s", "z"}, optional
+        Default z where the input is held over a sample, where such a model is exact, else s. With s and a held input
+        the hold's own response is taken out; what it folds down from above half the rate stays, and the check sees it.
+    delay : float or "auto", s
+        Of all inputs; "auto" estimates it (in whole samples for z).
+    common : bool
+        Whether all entries share one denominator.
+
+    Returns
+    -------
+    BlackBoxFit
+        Structure ``frf-ml``, a TransferModel with covariance (that of an estimated delay included), the check ``cost``
+        (see `Lines.verdict`), and in `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s``
+        and ``condition`` (of the scaled Jacobian).
+
+    Raises
+    ------
+    EstimationError
+        If orders or lines break a rule.
+    """
+    domain = domain or ("z" if frf.hold == "zoh" else "s")
+    if domain not in ("s", "z"):
+        raise EstimationError(f"domain {domain!r}; it must be 's' or 'z'. Give one of them")
+    if domain == "z" and frf.hold != "zoh":
+        raise EstimationError("a model in z wants an input that is held over a sample; this one is not. Use domain 's'")
+    if delay != "auto" and not (np.isfinite(delay) and delay >= 0):
+        raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct it")
+    form = _form(frf, orders, domain, common)
+    period = form.lines.dt
+    if domain == "z" and delay != "auto" and abs(delay / period - round(delay / period)) > 1e-9:
+        raise EstimationError(f"a delay of {delay} s is no whole number of samples of {period} s. Use domain 's'")
+    with one_thread():
+        best = _best_fit(form, delay, domain)
+    return _result(frf, best, domain)
+
+
+def _best_fit(
+    form: _Form, delay: float | Literal["auto"], domain: Literal["s", "z"]
+) -> tuple[float, _Form, Array, float, bool]:
+    """Cost, form, vector, delay and whether it converged: the best of the searches from the best starts."""
+    period = form.lines.dt
+    lags = period * np.arange(MAX_DELAY + 1.0) if delay == "auto" else np.array([delay])
+    found = sorted((start for lag in lags for start in _starts(form, float(lag))), key=lambda c: c[0])
+    if not found:
+        raise EstimationError("no start fits these lines; lower the orders, or check G and its covariance")
+    best: tuple[float, _Form, Array, float, bool] | None = None
+    for _, at, vector, lag in found[:_RACE]:
+        free = replace(at, delay_free=delay == "auto" and domain == "s")
+        begin = np.append(vector, lag / period) if free.delay_free else vector
+        cost, end, converged = _search(free, begin, lag)
+        if best is None or cost < best[0]:
+            best = (cost, free, end, lag, converged)
+    assert best is not None
+    return best
+
+
+def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"], common: bool) -> _Form:
+    """Check the orders and lay the coefficients out."""
+    m = int(np.prod(np.shape(frf.G)[1:]))
+    who, pair = "frf-ml", "input-output pair"
+    check_order_names(who, orders, ("nb", "nf"), ("nf",))
+    shared = common and not (isinstance(orders["nf"], tuple) and len(orders["nf"]) > 1)
+    group = (0,) * m if shared else tuple(range(m))
+    nf = (single_order(who, orders, "nf", 0),) if shared else order_per_input(who, orders, "nf", 0, m, of=pair)
+    usual = tuple(max(nf[g], 1) for g in group)
+    nb = usual if left_open(orders, "nb") else order_per_input(who, orders, "nb", 1, m, of=pair)
+    if any(n > nf[g] + 1 for n, g in zip(nb, group, strict=True)):
+        raise EstimationError(
+            f"{who}: order nb = {nb} with nf = {nf}; a numerator has at most nf + 1 coefficients. Lower nb"
+        )
+    checked = check_lines(frf, sum(nb) + sum(nf))
+    size = float(np.median(checked.omega)) if domain == "s" else 1.0
+    dt = None if domain == "s" else checked.dt
+    s = 1j * checked.omega
+    hold = np.sinc(checked.omega * checked.dt / (2 * np.pi)) * np.exp(-s * checked.dt / 2)
+    return _Form(
+        lines=checked,
+        variable=np.asarray(s / size if dt is None else np.exp(s * dt), dtype=np.complex128),
+        size=size,
+        dt=dt,
+        extra=hold if checked.held and dt is None else np.ones(s.size, dtype=np.complex128),
+        nb=nb,
+        nf=nf,
+        group=group,
+        delay_free=False,
+    )
+
+
+def _starts(form: _Form, lag: float) -> list[tuple[float, _Form, Array, float]]:
+    """Cost, form with its polynomials, vector and delay of each start for one delay."""
+    out = []
+    weight = 1.0 / form.lines.sd.reshape(form.lines.n_lines, -1)
+    factor = form.extra * np.exp(-1j * form.lines.omega * lag)
+    G = form.lines.G.reshape(form.lines.n_lines, -1) / factor[:, None]
+    w = weight * np.abs(factor)[:, None]
+    for fitted in (True, False):
+        dens = [np.ones(form.lines.n_lines, dtype=np.complex128) for _ in form.nf]
+        for g, n in enumerate(form.nf):
+            entries = [e for e, of in enumerate(form.group) if of == g]
+            if fitted and n:
+                try:
+                    vf = vector_fit(
+                        form.lines.omega, G[:, entries, None], n, dt=form.dt, weight=w[:, entries, None],
+                        feedthrough=any(form.nb[e] > n for e in entries), iterations=20,
+                    )  # fmt: skip
+                except (EstimationError, np.linalg.LinAlgError):
+                    continue
+                dens[g] = np.prod(form.variable[:, None] - vf.poles / form.size, axis=1)
+        scored = _iterate(form, G, w, dens, lag)
+        if scored is not None:
+            out.append(scored)
+    return out
+
+
+def _iterate(
+    form: _Form, G: Complex, w: Array, dens: list[Complex], lag: float
+) -> tuple[float, _Form, Array, float] | None:
+    """Iterated linear fits from given denominators; the best of them, in polynomials made for it."""
+    best: tuple[float, _Form, Array, float] | None = None
+    for _ in range(_STARTING):
+        at = _with_basis(form, w, dens)
+        vector = np.zeros(at.n_vector)
+        num, den, _ = at.places
+        for g, n in enumerate(at.nf):
+            entries = [e for e, of in enumerate(at.group) if of == g]
+            c, tops = _linear(at, G, w / np.abs(dens[g])[:, None], g, n, entries)
+            vector[den[g]] = c
+            for e, top in zip(entries, tops, strict=True):
+                vector[num[e]] = top
+        cost = float(np.sum(_residual(at, vector, lag)[0] ** 2)) / 2
+        if np.isfinite(cost) and (best is None or cost < best[0]):
+            better = best is None or cost < best[0] * (1 - 1e-6)
+            best = (cost, at, vector, lag)
+            if not better:
+                break
+        elif best is not None and cost > 10 * best[0]:
+            break
+        dens = [at.values[g] @ vector[den[g]] for g in range(len(at.nf))]
+    return best
+
+
+def _with_basis(form: _Form, w: Array, dens: list[Complex]) -> _Form:
+    values, powers = [], []
+    for g, n in enumerate(form.nf):
+        entries = [e for e, of in enumerate(form.group) if of == g]
+        weight = np.sqrt(np.mean(w[:, entries] ** 2, axis=1)) / np.maximum(np.abs(dens[g]), 1e-300)
+        v, p = orthogonal_polynomials(form.variable, weight / np.max(weight), n)
+        values.append(v)
+        powers.append(p)
+    return replace(form, values=tuple(values), powers=tuple(powers))
+
+
+def _linear(at: _Form, G: Complex, w: Array, g: int, n: int, entries: list[int]) -> tuple[Array, list[Array]]:
+    """Denominator of unit norm and numerators that make w (N - D G) smallest."""
+    rows, kept = [], []
+    for e in entries:
+        top, bottom = at.values[g][:, : at.nb[e]] * w[:, [e]], at.values[g] * (w[:, e] * G[:, e])[:, None]
+        both = np.column_stack([top, -bottom])
+        r = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag]), mode="r"))
+        rows.append(r[at.nb[e] :, at.nb[e] :])
+        kept.append(r)
+    c = np.linalg.svd(np.vstack(rows))[2][n]
+    tops = [
+        np.linalg.lstsq(r[: at.nb[e], : at.nb[e]], -r[: at.nb[e], at.nb[e] :] @ c, rcond=None)[0]
+        for e, r in zip(entries, kept, strict=True)
+    ]
+    return c, tops
+
+
+def _residual(at: _Form, vector: Array, lag: float, *, slope: bool = False) -> tuple[Array, Array]:
+    """Whitened model - measured, and its derivative by the vector."""
+    num, den, _ = at.places
+    n, ln = at.lines.n_lines, at.lines
+    delay = vector[-1] * ln.dt if at.delay_free else lag
+    factor = at.extra * np.exp(-1j * ln.omega * delay)
+    model = np.empty((n, ln.entries), dtype=np.complex128)
+    J = np.zeros((n, ln.entries, vector.size if slope else 0), dtype=np.complex128)
+    for e, g in enumerate(at.group):
+        D = at.values[g] @ vector[den[g]]
+        own = at.values[g][:, : at.nb[e]]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            model[:, e] = own @ vector[num[e]] / D * factor
+            if slope:
+                J[:, e, num[e]] = own * (factor / D)[:, None]
+                J[:, e, den[g]] = -at.values[g] * (model[:, e] / D)[:, None]
+                if at.delay_free:
+                    J[:, e, -1] = -1j * ln.omega * ln.dt * model[:, e]
+    shape = ln.G.shape
+    return ln.whitened(model.reshape(shape) - ln.G), ln.whitened(J.reshape(*shape, -1)) if slope else np.empty((0, 0))
+
+
+def _search(at: _Form, vector: Array, lag: float) -> tuple[float, Array, bool]:
+    """Levenberg-Marquardt; cost, vector, whether it converged."""
+    from scipy.optimize import least_squares
+
+    found = least_squares(
+        lambda v: _residual(at, v, lag)[0],
+        vector,
+        jac=lambda v: _residual(at, v, lag, slope=True)[1],
+        method="lm",
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-13,
+        gtol=1e-13,
+        max_nfev=200,
+    )
+    return float(found.cost), np.asarray(found.x), bool(found.status > 0)
+
+
+def _result(
+    frf: FrequencyResponse,
+    best: tuple[float, _Form, Array, float, bool],
+    domain: Literal["s", "z"],
+) -> BlackBoxFit:
+    """Coefficients of powers, their covariance and what goes with them."""
+    cost, at, vector, lag, converged = best
+    J = _residual(at, vector, lag, slope=True)[1]
+    norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+    used = at.n_estimated  # the common factors carry no information
+    half = (vt[:used].T / np.maximum(s[:used], 1e-15 * s[0])) / norm[:, None]
+    covariance = half @ half.T * at.lines.widening
+    model, M = _powers(at, vector, lag)
+    n_y, n_u = at.lines.G.shape[1:]
+    delay = model.delay[0]
+    spread = float(np.sqrt(covariance[-1, -1])) * at.lines.dt if at.delay_free else None
+    return build_response_fit(
+        "frf-ml",
+        frf,
+        at.lines,
+        orders={"nb": compact_order(at.nb), "nf": compact_order(at.nf)},
+        model=model,
+        covariance=M @ covariance @ M.T,
+        cost=cost,
+        n_estimated=at.n_estimated,
+        offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
+        converged=converged,
+        details={"domain": domain, "delay_s": delay, "delay_sd_s": spread, "condition": float(s[0] / s[used - 1])},
+        warnings=_hold_warning(at),
+    )
+
+
+def _hold_warning(at: _Form) -> list[str]:
+    if at.dt is not None or not at.lines.held:
+        return []
+    return [
+        "the input is held over a sample: a model in s leaves out what the hold folds down; a model in z, or the "
+        "grey box, is exact"
+    ]
+
+
+def _powers(at: _Form, vector: Array, lag: float) -> tuple[TransferModel, Array]:
+    """The model in powers of s or z, denominators monic, and the derivative of its coefficients by the vector."""
+    num, den, _ = at.places
+    n_y, n_u = at.lines.G.shape[1:]
+    rows, tops, bottoms = list[Array](), list[Array](), list[Array]()
+    for e, g in enumerate(at.group):
+        n, k = at.nf[g], at.nb[e]
+        scale_den, scale_num = at.size ** -np.arange(n + 1.0), at.size ** -np.arange(float(k))
+        d, a = scale_den * (at.powers[g] @ vector[den[g]]), scale_num * (at.powers[g][:k, :k] @ vector[num[e]])
+        for values, place, own in (
+            (a, num[e], scale_num[:, None] * at.powers[g][:k, :k]),
+            (d, den[g], scale_den[:, None] * at.powers[g]),
+        ):
+            block = np.zeros((values.size, vector.size))
+            block[:, place] = own / d[n]
+            block[:, den[g]] -= np.outer(values / d[n] ** 2, scale_den[n] * at.powers[g][n])
+            rows.append(block[::-1])
+        rows[-1][0] = 0.0  # the leading one
+        tops.append(a[::-1] / d[n])
+        monic = d[::-1] / d[n]
+        monic[0] = 1.0
+        bottoms.append(monic)
+    if not all(np.all(np.isfinite(p)) for p in (*tops, *bottoms)):
+        raise EstimationError("frf-ml: no finite coefficients fit these lines. Lower the orders")
+    delay = float(vector[-1]) * at.lines.dt if at.delay_free else lag
+    if at.delay_free:
+        moved = np.zeros((n_u, vector.size))
+        moved[:, -1] = at.lines.dt
+        rows.append(moved)
+    model = TransferModel(
+        num=tuple(tuple(tops[o * n_u : (o + 1) * n_u]) for o in range(n_y)),
+        den=tuple(tuple(bottoms[o * n_u : (o + 1) * n_u]) for o in range(n_y)),
+        dt=at.dt,
+        delay=(delay,) * n_u,
+        delay_estimated=at.delay_free,
+    )
+    return model, np.vstack(rows)

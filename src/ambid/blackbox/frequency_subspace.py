@@ -1,0 +1,542 @@
+"""State space from a frequency response by subspace, with the Laguerre operator w = (s - p)/(s + p) (thesis 1.7-1.8).
+
+On s = j omega, |w| = 1: its powers are as good as those of a discrete-time system's z, where powers of j omega grow
+with omega^k and are nearly parallel. Inputs are projected out of the block rows w^k G, rows are weighted by the noise
+they carry, the column space gives A and C, a linear fit B and D (McKelvey, Akcay and Ljung 1996; Van Overschee and De
+Moor 1996). A held input is exact too: sampled lines are lines of a rational function of (2/T)(z - 1)/(z + 1).
+
+At the end the likelihood is searched from there. All matrices are free, also the choice of the state; the directions in
+which only the state changes carry no information and are left out by their known number (McKelvey, Helmersson and
+Ribarits 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.data import Orders, check_order_names, left_open, single_order
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.errors import EstimationError
+from ambid.estimation.threads import one_thread
+from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import StateSpace
+from ambid.signals.response import FrequencyResponse
+
+Complex = NDArray[np.complex128]
+
+
+def laguerre_operator(omega: Array, p: float) -> Complex:
+    """Return w = (j omega - p)/(j omega + p).
+
+    `omega`: (n_frequencies,), rad/s; `p`: positive. Returns (n_frequencies,), complex, on the unit circle: -1 at 0, j
+    at p, towards 1 far above it.
+    """
+    if not (np.isfinite(p) and p > 0):
+        raise EstimationError(f"the Laguerre operator's p is {p} rad/s; it must be positive. Give one inside the band")
+    return np.asarray((1j * omega - p) / (1j * omega + p))
+
+
+def block_rows_condition(omega: Array, order: int, p: float | None = None) -> float:
+    """Return the condition number of the rows 1, v, v^2 ... v^order that a subspace method works on.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n_frequencies,), rad/s
+    order : int
+        Highest power.
+    p : float, optional, rad/s
+        v is the Laguerre operator with this p; without, v = j omega over the median of omega, so that it is not the
+        unit of time that makes the number large.
+
+    Returns
+    -------
+    float
+        Of the real matrix of real and imaginary parts, shape (order + 1, 2 n_frequencies).
+
+    Raises
+    ------
+    EstimationError
+        If there are fewer lines than rows need.
+    """
+    if not 1 <= order < 2 * omega.size:
+        raise EstimationError(f"powers up to {order} on {omega.size} lines; give an order from 1 to twice the lines")
+    v = 1j * omega / np.median(omega) if p is None else laguerre_operator(omega, p)
+    rows = v[None, :] ** np.arange(order + 1)[:, None]
+    s = np.linalg.svd(np.concatenate([rows.real, rows.imag], axis=1), compute_uv=False)
+    return float(s[0] / max(s[-1], 1e-300))
+
+
+def best_conditioned(omega: Array, order: int) -> float:
+    """Return the p for which the powers of the operator are best conditioned, in rad/s.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (n_frequencies,), rad/s
+    order : int
+
+    Returns
+    -------
+    float
+        Within 1 % of the best between the slowest and ten times the fastest line.
+    """
+    from scipy.optimize import minimize_scalar
+
+    low, high = np.log(np.min(omega[omega > 0])), np.log(np.max(omega)) + np.log(10.0)
+    grid = np.linspace(low, high, 25)
+    size = [np.log(block_rows_condition(omega, order, float(np.exp(x)))) for x in grid]
+    k, step = int(np.argmin(size)), grid[1] - grid[0]
+    found = minimize_scalar(
+        lambda x: np.log(block_rows_condition(omega, order, float(np.exp(x)))),
+        bounds=(grid[k] - step, grid[k] + step),
+        method="bounded",
+        options={"xatol": 0.01},
+    )
+    return float(np.exp(found.x if found.fun < size[k] else grid[k]))
+
+
+def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[float, StateSpaceModel, bool]:
+    """Search the likelihood from a model by Levenberg-Marquardt.
+
+    `feedthrough`: whether D is free.
+    """
+    from scipy.optimize import least_squares
+
+    here = _balance(model)
+    free = _free(here, feedthrough)
+
+    def at(v: Array) -> StateSpaceModel:
+        theta = here.theta.copy()
+        theta[free] = v
+        return here.with_theta(theta)
+
+    def residual(v: Array) -> Array:
+        return ln.whitened(at(v).frequency_response(ln.omega) - ln.G)
+
+    def slope(v: Array) -> Array:
+        return ln.whitened(at(v).frequency_response_derivative(ln.omega)[..., free])
+
+    found = least_squares(
+        residual, here.theta[free], jac=slope, method="lm", x_scale="jac", xtol=1e-11, ftol=1e-12, gtol=1e-11,
+        max_nfev=200,
+    )  # fmt: skip
+    return float(found.cost), at(found.x), bool(found.status > 0)
+
+
+def information(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[Array, float]:
+    """Return the covariance of all matrices from the information matrix, and the condition of the scaled Jacobian.
+
+    Returns `covariance`: (n_theta, n_theta), minimal in the directions of the state's choice: zero there.
+    """
+    free = _free(model, feedthrough)
+    J = ln.whitened(model.frequency_response_derivative(ln.omega)[..., free])
+    norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+    used = int(np.count_nonzero(free)) - model.order**2
+    half = (vt[:used].T / np.maximum(s[:used], 1e-15 * s[0])) / norm[:, None]
+    full = np.zeros((model.theta.size, model.theta.size))
+    full[np.ix_(free, free)] = half @ half.T * ln.widening
+    return full, float(s[0] / s[used - 1])
+
+
+def resample(ln: Lines, model: StateSpaceModel, again: Callable[[Complex], StateSpaceModel], count: int) -> Array:
+    """Return the scatter of an estimator's matrices over draws from the covariance of the response.
+
+    Draws are about the model's own response, with a fixed seed; each result is turned into the state of `model`.
+
+    `again`: estimates from a response, shape (n_frequencies, n_outputs, n_inputs). Returns (n_theta, n_theta).
+    """
+    rng = np.random.default_rng(1)
+    centre, factor = model.frequency_response(ln.omega), np.linalg.inv(ln.root)
+    draws = []
+    for _ in range(count):
+        z = rng.standard_normal((ln.n_lines, ln.entries, 2)) @ np.array([1.0, 1j]) / np.sqrt(2)
+        drawn = again(centre + (factor @ z[..., None])[..., 0].reshape(centre.shape))
+        draws.append(_align(drawn, model).theta)
+    scatter = np.stack(draws) - model.theta
+    return np.asarray(scatter.T @ scatter / count)
+
+
+def to_continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpaceModel, Array] | None:
+    """Return the continuous model that gives the discrete one under a hold, and its covariance.
+
+    `model`: discrete; `covariance`: (n_theta, n_theta). Returns none where no real continuous model exists.
+    """
+    from scipy.linalg import logm
+
+    assert model.dt is not None
+    n, n_u = model.B.shape
+    values = np.linalg.eigvals(model.A)
+    if np.any((np.abs(values.imag) < 1e-9 * np.abs(values)) & (values.real <= 0)) or np.any(np.abs(values) < 1e-12):
+        return None
+    whole = np.zeros((n + n_u, n + n_u))
+    whole[:n, :n], whole[:n, n:], whole[n:, n:] = model.A, model.B, np.eye(n_u)
+    log = np.real(logm(whole)) / model.dt
+    found = StateSpaceModel(A=log[:n, :n], B=log[:n, n:], C=model.C, D=model.D, K=model.K / model.dt, dt=None)
+    used, none = n * (n + n_u), np.zeros((n, 0))
+    one_each = [(x[: n * n].reshape(n, n), x[n * n :].reshape(n, n_u)) for x in np.eye(used)]
+    directions = [StateSpace(A=dA, B=dB, E=none, C=model.C) for dA, dB in one_each]
+    _, slopes = discretise(StateSpace(A=found.A, B=found.B, E=none, C=model.C), model.dt, derivatives=directions)
+    forward = np.stack([np.concatenate([d.A.ravel(), d.B.ravel()]) for d in slopes], axis=1)
+    M = np.eye(model.theta.size)
+    M[:used, :used] = np.linalg.inv(forward)
+    return found, M @ covariance @ M.T
+
+
+def _free(model: StateSpaceModel, feedthrough: bool) -> NDArray[np.bool_]:
+    """Which of theta is estimated: A, B, C, and D where it is wanted."""
+    n, n_y, n_u = model.order, model.n_outputs, model.n_inputs
+    free = np.zeros(model.theta.size, dtype=np.bool_)
+    free[: n * (n + n_u + n_y) + (n_y * n_u if feedthrough else 0)] = True
+    return free
+
+
+def _change_states(model: StateSpaceModel, T: Array) -> StateSpaceModel:
+    """The same model in the state T^-1 x."""
+    back = np.linalg.inv(T)
+    return StateSpaceModel(
+        A=back @ model.A @ T, B=back @ model.B, C=model.C @ T, D=model.D, K=back @ model.K, dt=model.dt
+    )
+
+
+def _balance(model: StateSpaceModel) -> StateSpaceModel:
+    """States of which inputs and outputs speak alike: rows of B and columns of C of equal size, A balanced."""
+    from scipy.linalg import matrix_balance
+
+    _, T = matrix_balance(model.A)
+    model = _change_states(model, np.asarray(T))
+    b, c = np.linalg.norm(model.B), np.linalg.norm(model.C)
+    return _change_states(model, np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
+
+
+def _align(model: StateSpaceModel, like: StateSpaceModel) -> StateSpaceModel:
+    """A model in the state in which its observability matrix is nearest to another's."""
+    scale = max(float(np.max(np.abs(np.linalg.eigvals(like.A)))), 1e-300)
+
+    def observability(of: StateSpaceModel) -> Array:
+        rows = [of.C / np.maximum(np.linalg.norm(like.C, axis=1, keepdims=True), 1e-300)]
+        for _ in range(of.order):
+            rows.append(rows[-1] @ of.A / scale)
+        return np.vstack(rows)
+
+    T = np.linalg.lstsq(observability(model), observability(like), rcond=None)[0]
+    return _change_states(model, np.asarray(T, dtype=np.float64))
+
+
+_GRID = 9  # values of p that are tried
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Trial:
+    model: StateSpaceModel
+    cost: float
+    p: float
+    singular_values: Array
+
+
+def frf_subspace(
+    frf: FrequencyResponse,
+    orders: Orders | Literal["auto"],
+    *,
+    p: float | None = None,
+    block_rows: int | None = None,
+    delay: float = 0.0,
+    feedthrough: bool = False,
+    domain: Literal["s", "z"] = "s",
+    refine: bool = True,
+    max_order: int = 8,
+    resamples: int = 100,
+) -> BlackBoxFit:
+    """Identify a state space from a frequency response.
+
+    Parameters
+    ----------
+    frf : FrequencyResponse
+    orders : Mapping[str, int or "auto"], or "auto"
+        ``n``. "auto", or left out: the lowest order whose refined cost noise explains; the one of least BIC where
+        none does.
+    p : float, optional, rad/s
+        Of the Laguerre operator; default the one of least mean square error on a grid over the band.
+    block_rows : int, optional
+        Default 2 n + 2, as far as lines allow.
+    delay : float, s
+        Of all inputs, known; it is taken out, and stands in the details.
+    feedthrough : bool
+        Whether D is estimated; else 0. In z it is the direct path within a sample.
+    domain : {"s", "z"}
+        Of the result. z is for held inputs only.
+    refine : bool
+        Whether the likelihood is searched from the subspace estimate; standard deviations are then those of maximum
+        likelihood. If not, they are found by resampling.
+    max_order : int
+        Highest order tried by "auto".
+    resamples : int
+        Draws from the covariance of the response, with a fixed seed, where `refine` is false.
+
+    Returns
+    -------
+    BlackBoxFit
+        Structure ``frf-subspace``, a StateSpaceModel with K = 0; ``singular_values`` (noise alone: about 1), ``p``,
+        ``condition`` (of the operator's rows) and ``condition_without`` (of powers of s) in the details.
+
+    Raises
+    ------
+    EstimationError
+        If orders, options or lines break a rule.
+    """
+    n = _order(frf, orders, delay, domain, max_order)
+    with one_thread():
+        if n is None:
+            return _choose_order(frf, p, block_rows, delay, feedthrough, domain, refine, max_order, resamples)
+        return _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
+
+
+def _of_order(
+    frf: FrequencyResponse,
+    n: int,
+    p: float | None,
+    block_rows: int | None,
+    delay: float,
+    feedthrough: bool,
+    domain: Literal["s", "z"],
+    refine: bool,
+    resamples: int,
+) -> BlackBoxFit:
+    """One order: subspace, refinement or resampling, continuous form."""
+    n_y, n_u = frf.n_outputs, frf.n_inputs
+    n_estimated = n * (n_y + n_u) + (n_y * n_u if feedthrough else 0)
+    ln = _remove_delay(check_lines(frf, n_estimated), delay)
+    rows = _block_rows(ln, n, block_rows)
+    best = _best_operator(ln, n, rows, feedthrough, p)
+    cost, model, converged = best.cost, best.model, True
+    if refine:
+        cost, model, converged = refine_matrices(ln, model, feedthrough)
+        covariance, condition = information(ln, model, feedthrough)
+    else:
+
+        def again(response: Complex) -> StateSpaceModel:
+            return _trial(ln, response, n, rows, feedthrough, best.p).model
+
+        covariance, condition = resample(ln, model, again, resamples) * ln.alike, None
+    warnings = []
+    if model.dt is not None and domain == "s":
+        found = to_continuous(model, covariance)
+        if found is None:
+            warnings.append(
+                "given in z: a pole on the negative real axis of z or at 0 belongs to no continuous model under a hold"
+            )
+        else:
+            model, covariance = found
+    points = _points(ln).imag
+    return build_response_fit(
+        "frf-subspace",
+        frf,
+        ln,
+        orders={"n": n},
+        model=model,
+        covariance=covariance,
+        cost=cost,
+        n_estimated=n_estimated,
+        offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
+        converged=converged,
+        best=refine,
+        warnings=warnings,
+        details={
+            "p": best.p,
+            "block_rows": rows,
+            "singular_values": best.singular_values.tolist(),
+            "condition": block_rows_condition(points, rows - 1, best.p),
+            "condition_without": block_rows_condition(points, rows - 1),
+            "condition_jacobian": condition,
+            "delay_s": delay,
+            "refined": refine,
+            "subspace_cost": best.cost,
+        },
+    )
+
+
+def _order(
+    frf: FrequencyResponse,
+    orders: Orders | Literal["auto"],
+    delay: float,
+    domain: str,
+    max_order: int,
+) -> int | None:
+    """Return the order, None where it is to be chosen; refuse what breaks a rule."""
+    if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
+        raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
+    if not (np.isfinite(delay) and delay >= 0):
+        raise EstimationError(f"a delay of {delay} s; it must be zero or positive. Correct it")
+    samples = delay * frf.rate_hz
+    if frf.hold == "zoh" and abs(samples - round(samples)) > 1e-9 * max(samples, 1.0):
+        raise EstimationError(
+            f"a delay of {delay} s is {samples:.4g} samples; under a hold a part of a sample is no common phase of the "
+            "lines. Give whole samples, or estimate it with greybox_frf or frf_ml in domain 's'"
+        )
+    asked = {} if isinstance(orders, str) and orders == "auto" else orders
+    check_order_names("frf-subspace", asked, ("n",))
+    if not left_open(asked, "n"):
+        return single_order("frf-subspace", asked, "n", 1)
+    if max_order < 1:
+        raise EstimationError(f"max_order is {max_order}; it must be at least 1. Raise it")
+    return None
+
+
+def _choose_order(
+    frf: FrequencyResponse,
+    p: float | None,
+    block_rows: int | None,
+    delay: float,
+    feedthrough: bool,
+    domain: Literal["s", "z"],
+    refine: bool,
+    max_order: int,
+    resamples: int,
+) -> BlackBoxFit:
+    """The lowest order that noise explains, else the one of least BIC."""
+    m, tried, bic = 2 * frf.G.size, list[tuple[float, int]](), dict[str, float]()
+    for n in range(1, max_order + 1):
+        try:
+            ln = _remove_delay(check_lines(frf, n * (frf.n_outputs + frf.n_inputs)), delay)
+            trial = _best_operator(ln, n, _block_rows(ln, n, block_rows), feedthrough, p)
+        except EstimationError:
+            if not tried:
+                raise
+            break
+        cost = refine_matrices(ln, trial.model, feedthrough)[0]
+        count = n * (frf.n_outputs + frf.n_inputs) + (frf.n_outputs * frf.n_inputs if feedthrough else 0)
+        verdict = ln.verdict(cost, count)
+        tried.append((2 * cost + count * float(np.log(m)), n))
+        bic[str(n)] = tried[-1][0]
+        if verdict.p is not None and verdict.p > 0.01:
+            tried = [tried[-1]]
+            break
+    n = min(tried)[1]
+    fit = _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
+    return replace(fit, details={**fit.details, "bic_by_order": bic})
+
+
+def _remove_delay(ln: Lines, delay: float) -> Lines:
+    """Turn the known delay out of G; a common phase leaves its covariance as it is."""
+    return replace(ln, G=ln.G * np.exp(1j * ln.omega * delay)[:, None, None]) if delay else ln
+
+
+def _block_rows(ln: Lines, n: int, given: int | None) -> int:
+    """Rows enough for the order, and not more than the lines can tell apart."""
+    n_y, n_u = ln.G.shape[1:]
+    least = n // n_y + 2
+    most = (2 * ln.n_lines * n_u) // (n_y + n_u)
+    rows = max(least, min(2 * n + 2, most // 2)) if given is None else given
+    if rows < least or rows > most:
+        raise EstimationError(
+            f"{rows} block rows for order {n} on {ln.n_lines} lines; it must be {least} to {most}. Give another "
+            "number, lower the order, or measure more lines"
+        )
+    return rows
+
+
+def _points(ln: Lines) -> Complex:
+    """Points on the imaginary axis where G is rational: s, or (2/T)(z - 1)/(z + 1) for a held input."""
+    return np.asarray(1j * (2 / ln.dt * np.tan(ln.omega * ln.dt / 2) if ln.held else ln.omega), dtype=np.complex128)
+
+
+def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool, p: float | None) -> _Trial:
+    """The p of least mean square error."""
+    if p is not None:
+        return _trial(ln, ln.G, n, rows, feedthrough, p)
+    omega = _points(ln).imag
+    used = omega[omega > 0]
+    grid = [best_conditioned(used, rows - 1), *np.geomspace(used[0], used[-1], _GRID + 2)[1:-1]]
+    found = []
+    for value in grid:
+        try:
+            found.append(_trial(ln, ln.G, n, rows, feedthrough, float(value)))
+        except np.linalg.LinAlgError:
+            continue
+    found = [t for t in found if np.isfinite(t.cost)]
+    if not found:
+        raise EstimationError(f"no state space of order {n} fits these lines; lower the order, or check the response")
+    return min(found, key=lambda t: t.cost)
+
+
+def _trial(ln: Lines, G: Complex, n: int, rows: int, feedthrough: bool, p: float) -> _Trial:
+    """One subspace estimate: A and C from the column space, B and D from a linear fit."""
+    points = _points(ln)
+    space, s = _column_space(ln, G, laguerre_operator(points.imag, p), n, rows)
+    n_y = G.shape[1]
+    up, low = space[:-n_y], space[n_y:]
+    A = np.asarray(p * np.linalg.lstsq(up - low, up + low, rcond=None)[0], dtype=np.float64)
+    C = _output_matrix(A, space, p, n_y)
+    dt = None
+    if ln.held:  # s = (2/T)(z - 1)/(z + 1)
+        dt, half = ln.dt, np.eye(n) - ln.dt / 2 * A
+        A = np.asarray(np.linalg.solve(half, np.eye(n) + ln.dt / 2 * A), dtype=np.float64)
+        C = np.asarray(np.linalg.solve(half.T, C.T).T, dtype=np.float64)
+    B, D, cost = _input_matrices(ln, G, A, C, feedthrough, dt)
+    model = StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((n, n_y)), dt=dt)
+    return _Trial(model=model, cost=cost, p=p, singular_values=s)
+
+
+def _column_space(ln: Lines, G: Complex, w: Complex, n: int, rows: int) -> tuple[Array, Array]:
+    """Extended observability matrix (rows * n_outputs, n), and all singular values."""
+    n_f, n_y, n_u = G.shape
+    output = np.sqrt(np.mean(ln.sd**2, axis=(0, 2)))  # outputs in units of their noise
+    level = np.sqrt(np.mean((ln.sd / output[:, None]) ** 2, axis=(1, 2)))  # lines likewise
+    powers = w[:, None] ** np.arange(rows)
+    scaled = G / output[:, None] / level[:, None, None]
+    Y = np.einsum("fk,fyu->kyfu", powers, scaled).reshape(rows * n_y, n_f * n_u)
+    U = np.einsum("fk,vu,f->kvfu", powers, np.eye(n_u), 1.0 / level).reshape(rows * n_u, n_f * n_u)
+    both = np.vstack([U, Y])
+    r = np.asarray(np.linalg.qr(np.concatenate([both.real, both.imag], axis=1).T, mode="r"))
+    tall = r[rows * n_u :, rows * n_u :].T
+    inverse = np.linalg.inv(ln.root)
+    covariance = (inverse @ np.swapaxes(inverse.conj(), 1, 2)).reshape(n_f, n_y, n_u, n_y, n_u)
+    noise = np.einsum("fyuzu->fyz", covariance) / np.outer(output, output) / level[:, None, None] ** 2
+    rowwise = np.einsum("fk,fl,fyz->kylz", powers, powers.conj(), noise).reshape(rows * n_y, rows * n_y).real
+    factor = np.linalg.cholesky(rowwise + 1e-14 * np.trace(rowwise) * np.eye(rows * n_y))
+    left, s, _ = np.linalg.svd(np.linalg.solve(factor, tall))
+    space = (factor @ left[:, :n]).reshape(rows, n_y, n) * output[:, None]
+    return space.reshape(rows * n_y, n), s
+
+
+def _output_matrix(A: Array, space: Array, p: float, n_y: int) -> Array:
+    """C from all block rows: row k is C (A - p)^k (A + p)^(rows - 1 - k), each mode scaled alike."""
+    n, rows = A.shape[0], space.shape[0] // n_y
+    values, vectors = np.linalg.eig(A)
+    size = np.sqrt(np.abs(values) ** 2 + p**2)
+    # this function of A is real: conjugate modes have equal sizes
+    unit = np.real(vectors @ np.diag(1 / size) @ np.linalg.inv(vectors))
+    less, more = (A - p * np.eye(n)) @ unit, (A + p * np.eye(n)) @ unit
+    blocks = [np.linalg.matrix_power(less, k) @ np.linalg.matrix_power(more, rows - 1 - k) for k in range(rows)]
+    wide, right = np.hstack(blocks), np.hstack(list(space.reshape(rows, n_y, n)))
+    return np.asarray(np.linalg.lstsq(wide.T, right.T, rcond=None)[0].T, dtype=np.float64)
+
+
+def _input_matrices(
+    ln: Lines, G: Complex, A: Array, C: Array, feedthrough: bool, dt: float | None
+) -> tuple[Array, Array, float]:
+    """B and D by weighted linear least squares, and the cost."""
+    n, (n_f, n_y, n_u) = A.shape[0], G.shape
+    points = 1j * ln.omega if dt is None else np.exp(1j * ln.omega * dt)
+    left = np.linalg.solve(
+        np.swapaxes(points[:, None, None] * np.eye(n) - A, 1, 2),
+        np.broadcast_to(C.T.astype(np.complex128), (n_f, n, n_y)),
+    )
+    columns = np.einsum("fjy,uv->fyujv", left, np.eye(n_u)).reshape(n_f, n_y, n_u, n * n_u)
+    if feedthrough:
+        direct = np.einsum("yz,uv->yuzv", np.eye(n_y), np.eye(n_u)).reshape(n_y, n_u, n_y * n_u)
+        columns = np.concatenate([columns, np.broadcast_to(direct, (n_f, *direct.shape))], axis=3)
+    a, b = ln.whitened(columns), ln.whitened(G)
+    norm = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+    x = np.linalg.lstsq(a / norm, b, rcond=None)[0] / norm
+    cost = float(np.sum((a @ x - b) ** 2)) / 2
+    D = x[n * n_u :].reshape(n_y, n_u) if feedthrough else np.zeros((n_y, n_u))
+    return x[: n * n_u].reshape(n, n_u), D, cost

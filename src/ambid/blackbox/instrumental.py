@@ -1,0 +1,667 @@
+"""Instrumental variables in discrete time: iv4 without feedback; cliv and two-stage with the reference of a loop.
+
+A y = B u + noise of any colour: least squares is biased where the equation's noise is not white. Instruments that the
+noise did not make (what the inputs, or in a loop the reference, explain) take the bias off, and filtering with a model
+of the noise makes the estimate as sharp as a method without a noise model of G can be (Ljung 1999, sec. 15.3; Gilson
+and Van den Hof 2005). Noise model and estimate are repeated in turn until they settle. two-stage estimates B/F of a
+stable plant from the part of the input that the reference makes (Van den Hof and Schrama 1993).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.signal import lfilter
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, order_per_input, single_order
+from ambid.blackbox.fit import BlackBoxFit, build_fit
+from ambid.blackbox.instruments import (
+    Autoregression,
+    Solution,
+    autoregression,
+    noise_covariance,
+    project_out,
+    reference_part,
+    require_reference,
+    solve,
+    span,
+    weak_instruments,
+)
+from ambid.blackbox.model import pole_covariance
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.roots import reflect, stable
+from ambid.errors import EstimationError
+from ambid.estimation.threads import one_thread
+
+_NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
+_NO_AVERAGE = np.ones(1)
+_SETTLED = 1e-4  # change of the filtered output by a round, relative to the innovations
+_INSIDE = 0.9999  # radius to which poles on the unit circle are drawn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArxOrders:
+    """Orders of one output."""
+
+    na: int
+    nb: tuple[int, ...]  # for each input
+    nk: tuple[int, ...]
+
+    @property
+    def first(self) -> int:
+        """First sample whose lags are all in the record."""
+        return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.na + sum(self.nb)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Signals:
+    """One output and the inputs, offsets roughly off."""
+
+    y: Array  # (n_samples,)
+    u: Array  # (n_samples, n_inputs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ArxEstimate:
+    """Outcome of one output."""
+
+    A: Array  # (na + 1,)
+    B: tuple[Array, ...]  # for each input
+    constant: float  # of the equation, for the signals as given
+    noise: Autoregression  # of the equation error: A y = B u + constant + C w/D
+    C: Array  # (n + 1,), 1, or A with the poles outside the unit circle mirrored: noise that enters at the output
+    solution: Solution  # last step; its unknowns are a_1 ..., b of every input, and the constant
+    innovations: Array  # (n_rows,), ending with the last sample
+
+
+def regressors(signals: Signals, orders: ArxOrders, first: int) -> Array:
+    """Return -y(t-1) ... -y(t-na), u_i(t-nk) ..., 1 for t >= first, shape (n_samples - first, size + 1).
+
+    Returns (n_rows, n_coefficients + 1).
+    """
+    n = signals.y.size
+    columns = [-signals.y[first - k : n - k] for k in range(1, orders.na + 1)]
+    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+        columns += [signals.u[first - k : n - k, i] for k in range(nk, nk + nb)]
+    return np.stack([*columns, np.ones(n - first)], axis=1)
+
+
+def instrumental_step(
+    who: str,
+    data: Signals,
+    instruments: Signals,
+    orders: ArxOrders,
+    noise: Autoregression = _NO_NOISE_MODEL,
+    C: Array = _NO_AVERAGE,
+) -> Solution:
+    """Make one instrumental variable step; all columns are filtered by D/C.
+
+    `who`: method, for errors; `C`: (n + 1,).
+    """
+    first, p = orders.first, noise.order
+    rows, Z, target = regressors(data, orders, first), regressors(instruments, orders, first), data.y[first:]
+    if p or C.size > 1:
+        from scipy.signal import lfilter
+
+        rows, Z, target = (lfilter(noise.D, C, x, axis=0)[p:] for x in (rows, Z, target))
+    if C.size > 1:  # what the filter does not know of the time before the record fades with the plant's own poles
+        free = _free(C, rows.shape[0])
+        rows, Z, target = project_out(free, rows), project_out(free, Z), project_out(free, target[:, None])[:, 0]
+    return solve(Z, rows, target, who=who)
+
+
+def least_squares(who: str, data: Signals, orders: ArxOrders) -> Array:
+    """Return the least-squares coefficients: instruments equal to regressors; biased by coloured noise.
+
+    Returns (n_coefficients + 1,).
+    """
+    return instrumental_step(who, data, data, orders).theta
+
+
+def equation_error(data: Signals, theta: Array, orders: ArxOrders) -> Array:
+    """Return A y - B u - constant from the first sample with all lags on.
+
+    `theta`: (n_coefficients + 1,). Returns (n_rows,).
+    """
+    first = orders.first
+    return np.asarray(data.y[first:] - regressors(data, orders, first) @ theta)
+
+
+def optimal_step(
+    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int
+) -> ArxEstimate:
+    """Model the noise of the equation at `theta` and make the filtered, optimal step (Ljung 1999, eq. 15.25-15.29).
+
+    The noise is modelled twice, as 1/D and as C/D with C the stable counterpart of A, and the sharper model is taken.
+    The second is that of noise on the output: sampled fast, it has zeros next to the unit circle, which no
+    autoregression of moderate order holds. For an unstable plant C mirrors its poles: noise spectra do not tell them.
+
+    `theta`: (n_coefficients + 1,), consistent estimate from a step before; `highest`: highest order of the noise model.
+    """
+    from scipy.signal import lfilter
+
+    error = equation_error(data, theta, orders)
+    noise, C = autoregression(error, highest), _NO_AVERAGE
+    mirrored = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE)
+    outer = np.asarray(lfilter([1.0], mirrored, error))
+    at_output = autoregression(project_out(_free(mirrored, outer.size), outer[:, None])[:, 0], highest)
+    if _cost(at_output, error.size) < _cost(noise, error.size):
+        noise, C = at_output, mirrored
+    solution = instrumental_step(who, data, instruments, orders, noise, C)
+    found = solution.theta
+    A = np.concatenate([[1.0], found[: orders.na]])
+    B, first = list[Array](), orders.na
+    for nb, nk in zip(orders.nb, orders.nk, strict=True):
+        B.append(np.concatenate([np.zeros(nk), found[first : first + nb]]))
+        first += nb
+    return ArxEstimate(
+        A=A,
+        B=tuple(B),
+        constant=float(found[-1]),
+        noise=noise,
+        C=C,
+        solution=solution,
+        innovations=solution.residual,
+    )
+
+
+def iterate_optimal(
+    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int, rounds: int
+) -> ArxEstimate:
+    """Repeat `optimal` until noise model and estimate agree.
+
+    `theta`: (n_coefficients + 1,); `rounds`: at most.
+    """
+    for _ in range(rounds):
+        found = optimal_step(who, data, instruments, orders, theta, highest)
+        before, theta = theta, found.solution.theta
+        moved = np.linalg.pinv(found.solution.inverse) @ (theta - before)
+        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
+            break
+    return found
+
+
+def _free(C: Array, n: int) -> Array:
+    """Free responses of 1/C, shape (n, order of C)."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], C, np.eye(n, C.size - 1), axis=0))
+
+
+def _cost(noise: Autoregression, n: int) -> float:
+    return float(n * np.log(noise.variance + 1e-300) + 2 * noise.order)
+
+
+def polynomials(found: ArxEstimate) -> Polynomials:
+    """Return A, B and, as the noise model, C/D."""
+    return Polynomials(A=found.A, B=found.B, C=found.C, D=found.noise.D, F=tuple(np.ones(1) for _ in found.B))
+
+
+def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
+    """Return the covariance of all coefficients of `polynomials`, leading ones and zeros included.
+
+    C follows from A and has zeros. The noise of the filtered equation is modelled once more, so that a noise model of
+    too low an order costs efficiency but does not make the standard deviations too small.
+
+    Returns (n_theta, n_theta).
+    """
+    rows = found.innovations.size
+    left = autoregression(found.innovations, 10)
+    spare = rows / max(rows - orders.size - 1, 1)
+    inner = found.solution.covariance(left)[:-1, :-1] * spare
+    sizes = [found.A.size, *(b.size for b in found.B), found.C.size, found.noise.D.size, *(1 for _ in found.B)]
+    free = [slice(1, found.A.size)]
+    start = found.A.size
+    for b, nk in zip(found.B, orders.nk, strict=True):
+        free.append(slice(start + nk, start + b.size))
+        start += b.size
+    places = np.concatenate([np.arange(s.start, s.stop) for s in free])
+    out = np.zeros((sum(sizes), sum(sizes)))
+    out[np.ix_(places, places)] = inner
+    d = slice(start + found.C.size, start + found.C.size + found.noise.D.size)
+    out[d, d] = noise_covariance(found.noise, rows)
+    return out
+
+
+def operating_point(found: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
+    """Share the constants of the equations out over input and output offsets, each moved as little as possible.
+
+    A(1) y0 - B(1) u0 = constant; where A(1) is near zero (an integrating plant) the input takes it.
+
+    `found`: one for each output, for signals with the means taken off; `u_mean`, `u_sd`: (n_inputs,), SI; `y_mean`,
+    `y_sd`: (n_outputs,), SI.
+    """
+    n_y = y_mean.size
+    rows = np.zeros((n_y, n_y + u_mean.size))
+    for o, f in enumerate(found):
+        rows[o, o] = f.A.sum() * y_sd[o]
+        rows[o, n_y:] = -np.array([b.sum() for b in f.B]) * u_sd
+    move = np.linalg.lstsq(rows, np.array([f.constant for f in found]), rcond=None)[0]
+    return Offsets(u=u_mean + move[n_y:] * u_sd, y=y_mean + move[:n_y] * y_sd)
+
+
+NOISE_ORDER = 20  # added to na + nb; Akaike's criterion chooses below it
+_CORNERS = (np.inf, 0.5, 0.1, 0.02)  # of the filters of the first step, in radians a sample
+_ROUGH = 3
+_ROUNDING = 1e-11
+_NOISE_ROUNDS = 30  # noise model and estimate in turn, at most
+
+
+def estimate_output(who: str, signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
+    """Estimate one output with given instruments.
+
+    `who`: method, for the error; `signals`, `clean`: as measured, and without what the noise does.
+    """
+    highest = orders.size + NOISE_ORDER
+    best: ArxEstimate | None = None
+    for corner in _CORNERS if orders.na else _CORNERS[:1]:
+        C = np.asarray(np.poly(np.full(orders.na, np.exp(-corner)))) if np.isfinite(corner) else np.ones(1)
+        try:
+            theta = instrumental_step(who, signals, clean, orders, C=C).theta
+            found = iterate_optimal(who, signals, clean, orders, theta, highest, _ROUGH)
+        except EstimationError:
+            continue
+        if best is None or found.noise.variance < best.noise.variance:
+            best = found
+    if best is None:
+        raise EstimationError(
+            f"{who}: the input or reference does not move every term of this model, so that its coefficients have no "
+            "single solution. Lower the orders, excite more frequencies, or give more independent references"
+        )
+    if is_exact(best, signals):
+        return best
+    return iterate_optimal(who, signals, clean, orders, best.solution.theta, highest, _NOISE_ROUNDS)
+
+
+def is_exact(found: ArxEstimate, signals: Signals) -> bool:
+    """Return whether nothing but rounding is left, of which no noise model can be made."""
+    return bool(np.linalg.norm(found.innovations) <= _ROUNDING * np.linalg.norm(signals.y))
+
+
+_ROUNDS = 10  # of instruments from the model itself, at most
+_SETTLED_IV4 = 1e-4  # change of the filtered output by a round, relative to the innovations
+_INSIDE_IV4 = 0.999  # radius to which the poles of an unstable instrument are drawn
+
+
+def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate G = B/A by the four-step instrumental variable method; every output by itself.
+
+    Parameters
+    ----------
+    data : IOData
+        Without feedback: past inputs are instruments, so the noise must not reach the input.
+    orders : Mapping[str, int or tuple of int]
+        ``na``; ``nb`` and ``nk`` (default 1), one or one for each input.
+
+    Returns
+    -------
+    BlackBoxFit
+        PolynomialModel with A, B and the noise model C/D; C is 1, or the stable counterpart of A.
+
+    Raises
+    ------
+    EstimationError
+        If an order breaks a rule, or the record is too short or does not excite the plant.
+    """
+    used = arx_orders("iv4", data, orders)
+    deviations, means, sds = centre(data)
+    explained = _explained(deviations)
+    found = [
+        _one_output(Signals(y=y, u=deviations.u), used, None if explained is None else explained[:, o])
+        for o, y in enumerate(deviations.y.T)
+    ]
+    return arx_fit("iv4", data, used, found, means, sds)
+
+
+def arx_orders(who: str, data: IOData, orders: Orders) -> ArxOrders:
+    """Check na, nb and nk, and that the record is long enough for them."""
+    check_order_names(who, orders, ("na", "nb", "nk"), ("na", "nb"))
+    n_u = data.n_inputs
+    used = ArxOrders(
+        na=single_order(who, orders, "na", 0),
+        nb=order_per_input(who, orders, "nb", 1, n_u),
+        nk=order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u),
+    )
+    check_length(who, data, data.n_samples - (used.first if n_u else 0), used.size + 1)
+    return used
+
+
+def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Array]]:
+    """Return the data with means off (for the numbers' sake; constants are estimated), the means and the spreads.
+
+    Returns means; standard deviations.
+    """
+    from dataclasses import replace
+
+    means = (data.u.mean(axis=0), data.y.mean(axis=0))
+    sds = (data.u.std(axis=0), data.y.std(axis=0))
+    reference = data.reference - data.reference.mean(axis=0)
+    return replace(data, u=data.u - means[0], y=data.y - means[1], reference=reference), means, sds
+
+
+def arx_fit(
+    who: str,
+    data: IOData,
+    orders: ArxOrders,
+    found: list[ArxEstimate],
+    means: tuple[Array, Array],
+    sds: tuple[Array, Array],
+    warnings: tuple[str, ...] = (),
+) -> BlackBoxFit:
+    """Put the estimates of all outputs together.
+
+    `found`: for each output, of the data with the means off.
+    """
+    from scipy.linalg import block_diag
+
+    rows = min(f.innovations.size for f in found)
+    e = np.stack([f.innovations[-rows:] for f in found], axis=1)
+    return build_fit(
+        who,
+        data,
+        orders={"na": orders.na, "nb": orders.nb, "nk": orders.nk},
+        model=PolynomialModel(outputs=tuple(polynomials(f) for f in found), dt=data.dt),
+        covariance=block_diag(*[covariance(f, orders) for f in found]),
+        n_estimated=sum(orders.size + f.noise.order for f in found),
+        offsets=operating_point(found, *means, *sds),
+        noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
+        warnings=(*warnings, *weak_instruments([f.solution for f in found], data.outputs)),
+        details={
+            "noise_order": [f.noise.order for f in found],
+            "condition": [f.solution.condition for f in found],
+            "instrument_strength": [f.solution.strength() for f in found],
+        },
+    )
+
+
+def _one_output(signals: Signals, orders: ArxOrders, explained: Array | None) -> ArxEstimate:
+    """Instruments from what the inputs explain of the output, then from the model itself, until it stands still."""
+    if explained is None:
+        start = least_squares("iv4", signals, orders)
+        clean = _simulate(signals, start, orders)
+    else:
+        clean = Signals(y=explained, u=signals.u)
+    found, highest = estimate_output("iv4", signals, clean, orders), orders.size + NOISE_ORDER
+    for _ in range(0 if is_exact(found, signals) else _ROUNDS):
+        before = found.solution.theta
+        found = optimal_step("iv4", signals, _simulate(signals, before, orders), orders, before, highest)
+        moved = np.linalg.pinv(found.solution.inverse) @ (found.solution.theta - before)
+        if np.linalg.norm(moved) <= _SETTLED_IV4 * np.linalg.norm(found.innovations):
+            break
+    return found
+
+
+def _explained(deviations: IOData) -> Array | None:
+    """What the inputs alone make of the outputs, by an autoregression of many lags; None where none is stable."""
+    from dataclasses import replace
+
+    u, names = deviations.u, deviations.inputs
+    alone = replace(deviations, u=np.empty((u.shape[0], 0)), inputs=(), reference=u, references=names)
+    try:
+        return reference_part("iv4", alone).y
+    except EstimationError:
+        return None
+
+
+def _simulate(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
+    """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
+    from scipy.signal import lfilter
+
+    A = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE_IV4)
+    y, first = np.zeros(signals.y.size), orders.na
+    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+        y += lfilter(np.concatenate([np.zeros(nk), theta[first : first + nb]]), A, signals.u[:, i])
+        first += nb
+    return Signals(y=y, u=signals.u)
+
+
+def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate G = B/A of a plant in a loop, with instruments from the reference; every output by itself.
+
+    Parameters
+    ----------
+    data : IOData
+        With a reference that the noise does not reach.
+    orders : Mapping[str, int or tuple of int]
+        ``na``; ``nb`` and ``nk`` (default 1), one or one for each input.
+
+    Returns
+    -------
+    BlackBoxFit
+        PolynomialModel with A, B and the noise model C/D; C is 1, or the stable counterpart of A.
+
+    Raises
+    ------
+    EstimationError
+        If there is no reference, an order breaks a rule, or the record is too short or does not excite the plant.
+    """
+    require_reference("cliv", data)
+    used = arx_orders("cliv", data, orders)
+    deviations, means, sds = centre(data)
+    clean = reference_part("cliv", deviations)
+    found = [
+        in_loop(Signals(y=deviations.y[:, o], u=deviations.u), Signals(y=clean.y[:, o], u=clean.u), used)
+        for o in range(data.n_outputs)
+    ]
+    fit = arx_fit("cliv", data, used, found, means, sds)
+    return fit
+
+
+def in_loop(signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
+    """Estimate one output with the parts of the signals that the reference makes as instruments."""
+    return estimate_output("cliv", signals, clean, orders)
+
+
+_COLUMNS = 400  # of the finite impulse response, all references together
+_CERTAIN = 2.0  # standard deviations by which a pole is outside before the plant is called unstable
+_NOISE_ORDER_2 = 20
+_STAGE_ROUNDS = 30
+_STAGE_SETTLED = 1e-6  # change of the output by a step, relative to the noise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Refined:
+    """One output after the refined steps."""
+
+    polynomials: Polynomials
+    noise: Array  # (n_samples,), y - G u, free responses and constant taken off
+    constant: float
+    step: Solution  # the last one
+    settled: bool
+
+
+def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate G = B/F of a stable plant in a loop from its reference; every output by itself.
+
+    Errors of the first stage reach the second and make it several times less sharp than it has to be. So its G is only
+    the start of refined instrumental variable steps (Gilson and Van den Hof 2005): Z' (y - G u) = 0 with the measured
+    input, Z from the clean one. They leave the noise of the plant alone, and their covariance is known.
+
+    Parameters
+    ----------
+    data : IOData
+        With a reference that the noise does not reach.
+    orders : Mapping[str, int or tuple of int]
+        ``nb``, ``nf`` and ``nk`` (default 1), one or one for each input.
+
+    Returns
+    -------
+    BlackBoxFit
+        PolynomialModel with B and F.
+
+    Raises
+    ------
+    EstimationError
+        If there is no reference, the plant is unstable, an order breaks a rule, or the record is too short.
+    """
+    from ambid.blackbox.polynomial import oe
+
+    who = "two-stage"
+    require_reference(who, data)
+    check_order_names(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
+    n_u = data.n_inputs
+    nb, nf = order_per_input(who, orders, "nb", 1, n_u), order_per_input(who, orders, "nf", 0, n_u)
+    nk = order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u)
+    unknowns = sum(nb) + sum(nf)
+    check_length(who, data, data.n_samples - max(nf), unknowns + 1)
+    with one_thread():
+        _refuse_unstable(data, nb, nf, nk)
+        clean, lags, warnings = _first_stage(who, data)
+        rest = data.part(lags, data.n_samples)
+        second = oe(replace(rest, u=clean), {"nb": nb, "nf": nf, "nk": nk})
+        assert isinstance(second.model, PolynomialModel)
+        if not all(stable(f) for p in second.model.outputs for f in p.F):
+            raise EstimationError(_UNSTABLE.format(poles="the second stage found poles outside the unit circle"))
+        mean = rest.u.mean(axis=0)
+        found = [
+            _refine(p, clean - mean, rest.u - mean, rest.y[:, o] - second.offsets.y[o], nk)
+            for o, p in enumerate(second.model.outputs)
+        ]
+        blocks = [_stage_covariance(f, nk) for f in found]
+    noise = np.stack([f.noise for f in found], axis=1)
+    return build_fit(
+        who,
+        data,
+        orders={"nb": nb, "nf": nf, "nk": nk},
+        model=PolynomialModel(outputs=tuple(f.polynomials for f in found), dt=data.dt),
+        covariance=block_diag(*blocks),
+        n_estimated=data.n_outputs * unknowns,
+        offsets=Offsets(u=mean, y=second.offsets.y + np.array([f.constant for f in found])),
+        noise_covariance=noise.T @ noise / max(noise.shape[0] - unknowns - 1, 1),
+        status="converged" if all(f.settled for f in found) else "stalled",
+        warnings=(*warnings, *weak_instruments([f.step for f in found], data.outputs)),
+        details={
+            "first_stage_lags": lags,
+            "condition": [f.step.condition for f in found],
+            "instrument_strength": [f.step.strength() for f in found],
+        },
+    )
+
+
+_UNSTABLE = (
+    "two-stage: {poles}; the second stage simulates the plant from its input, which is bounded only for a stable one. "
+    "Use cliv or clsrivc, which need no simulation, or bj and armax on the loop's own signals"
+)
+
+
+def _refuse_unstable(data: IOData, nb: tuple[int, ...], nf: tuple[int, ...], nk: tuple[int, ...]) -> None:
+    """Ask cliv, which stands unstable plants, where the poles are."""
+    if not max(nf):
+        return
+    try:
+        plain = cliv(data, {"na": max(nf), "nb": nb, "nk": nk})
+    except EstimationError:
+        return
+    poles = plain.model.poles()
+    size = np.abs(poles)
+    if plain.covariance is None or not size.size:
+        return
+    direction = np.stack([poles.real, poles.imag], axis=1) / np.maximum(size, 1e-12)[:, None]
+    spread = np.einsum("pi,pij,pj->p", direction, pole_covariance(plain.model, plain.covariance), direction)
+    outside = size - _CERTAIN * np.sqrt(np.maximum(spread, 0)) > 1
+    if np.any(outside):
+        worst = float(size[outside].max())
+        raise EstimationError(_UNSTABLE.format(poles=f"the plant is unstable (a pole at |z| = {worst:.6g})"))
+
+
+def _first_stage(who: str, data: IOData) -> tuple[Array, int, tuple[str, ...]]:
+    """Part of the input that the reference makes, from sample `lags` on; `lags`; warnings."""
+    memory = reference_part(who, centre(data)[0]).memory
+    n, n_r = data.reference.shape
+    lags = int(min(memory, _COLUMNS // n_r, n // (6 * n_r)))
+    r = data.reference - data.reference.mean(axis=0)
+    rows = np.hstack([np.ones((n - lags, 1)), *[r[lags - k : n - k] for k in range(lags + 1)]])
+    mean = data.u.mean(axis=0)
+    basis = span(rows)
+    u = data.u[lags:] - mean
+    warnings = (
+        ()
+        if lags >= memory
+        else (
+            f"the loop remembers its reference for {memory} samples, and the record allows a first stage of {lags}: "
+            "what is left out counts as noise. Take a longer record, or cliv",
+        )
+    )
+    return basis @ (basis.T @ u) + mean, lags, warnings
+
+
+def _refine(p: Polynomials, clean: Array, u: Array, y: Array, nk: tuple[int, ...]) -> _Refined:
+    """Solve Z' (y - G u) = 0 with the measured input, Z the gradient by the clean one, from G of the second stage."""
+    settled = False
+    for _ in range(_STAGE_ROUNDS):
+        pulses = _pulses(p, y.size)
+        basis = span(pulses)
+        raw = y - sum(lfilter(b, f, u[:, i]) for i, (b, f) in enumerate(zip(p.B, p.F, strict=True)))
+        noise = raw - basis @ (basis.T @ raw)
+        instruments, rows = _gradient(p, clean, 0.0, nk), _gradient(p, u, noise, nk)
+        instruments -= basis @ (basis.T @ instruments)
+        rows -= basis @ (basis.T @ rows)
+        step = solve(instruments, rows, noise, who="two-stage")
+        size = np.linalg.norm(pulses, axis=0)
+        constant = float(np.linalg.lstsq(pulses / size, raw, rcond=1e-8)[0][0] / size[0])
+        here = _Refined(polynomials=p, noise=noise, constant=constant, step=step, settled=settled)
+        if settled:
+            return here
+        moved = _move(p, step.theta, nk)
+        if not all(stable(f) for f in moved.F):
+            return here
+        settled = bool(np.linalg.norm(instruments @ step.theta) <= _STAGE_SETTLED * np.linalg.norm(noise))
+        p = moved
+    return here
+
+
+def _gradient(p: Polynomials, u: Array, error: Array | float, nk: tuple[int, ...]) -> Array:
+    """Derivatives of B/F u by the free b of each input, then the free f of each; `error` is added to B/F u."""
+    by_b, by_f = [], []
+    for i, (b, f) in enumerate(zip(p.B, p.F, strict=True)):
+        smooth = lfilter([1.0], f, u[:, i])
+        out = -lfilter([1.0], f, lfilter(b, f, u[:, i]) + error)
+        by_b += [_delay(smooth, k) for k in range(nk[i], b.size)]
+        by_f += [_delay(out, k) for k in range(1, f.size)]
+    return np.stack(by_b + by_f, axis=1)
+
+
+def _pulses(p: Polynomials, n: int) -> Array:
+    """A constant, and what initial states make of the output."""
+    pulse = np.zeros(n)
+    pulse[0] = 1.0
+    return np.stack(
+        [np.ones(n), *(_delay(lfilter([1.0], f, pulse), k) for f in p.F for k in range(f.size - 1))], axis=1
+    )
+
+
+def _move(p: Polynomials, change: Array, nk: tuple[int, ...]) -> Polynomials:
+    B, F, first = list[Array](), list[Array](), 0
+    for b, k in zip(p.B, nk, strict=True):
+        B.append(np.concatenate([b[:k], b[k:] + change[first : first + b.size - k]]))
+        first += b.size - k
+    for f in p.F:
+        F.append(np.concatenate([f[:1], f[1:] + change[first : first + f.size - 1]]))
+        first += f.size - 1
+    return replace(p, B=tuple(B), F=tuple(F))
+
+
+def _stage_covariance(found: _Refined, nk: tuple[int, ...]) -> Array:
+    """Covariance of all coefficients of one output, for noise of any colour."""
+    p, n = found.polynomials, found.noise.size
+    starts = np.cumsum([p.A.size, *(b.size for b in p.B), p.C.size, p.D.size, *(f.size for f in p.F)])
+    b_starts, f_starts = starts[: len(p.B)], starts[len(p.B) + 2 : -1]
+    places = [int(s) + k for s, b, d in zip(b_starts, p.B, nk, strict=True) for k in range(d, b.size)]
+    places += [int(s) + k for s, f in zip(f_starts, p.F, strict=True) for k in range(1, f.size)]
+    out = np.zeros((int(starts[-1]),) * 2)
+    inner = found.step.covariance(autoregression(found.noise, _NOISE_ORDER_2))
+    out[np.ix_(places, places)] = inner * (n / max(n - len(places) - 1, 1))
+    return out
+
+
+def _delay(x: Array, k: int) -> Array:
+    return np.concatenate([np.zeros(k), x[: x.size - k]]) if k else x

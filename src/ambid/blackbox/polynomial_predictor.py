@@ -1,0 +1,494 @@
+"""Orders, data and predictor of A y = (B/F) u + (C/D) e for one output, with its exact gradients (thesis eq. 3.12).
+
+Residual: e = (D/C) (A y - sum_i (B_i/F_i) u_i - kappa), kappa the constant that offsets leave.
+Gradients: all lags of one polynomial are one filtered signal, shifted: de/da_k = (D/C) y(t-k),
+de/db_k = -D/(C F) u(t-k), de/dc_k = -(1/C) e(t-k), de/dd_k = (1/C) v(t-k) with v = A y - (B/F) u - kappa,
+de/df_k = (D B)/(C F^2) u(t-k). Filters start at rest at sample 0; residuals count from `first_row` on, and what came
+before is replaced by impulses at that row whose sizes are estimated (as many as there are initial states). From rest
+nothing came before: all residuals count, and there are neither impulses nor a constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.data import (
+    IOData,
+    Orders,
+    UsedOrders,
+    check_order_names,
+    compact_order,
+    left_open,
+    order_per_input,
+    single_order,
+)
+from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.structures import structure
+from ambid.errors import EstimationError, nearest
+
+Key = tuple[str, int | None]
+
+_PER_INPUT = ("nb", "nk", "nf")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """Orders of one output, and which of its coefficients are free."""
+
+    na: int
+    nb: tuple[int, ...]  # one for each input
+    nc: int
+    nd: int
+    nf: tuple[int, ...]
+    nk: tuple[int, ...]
+    fixed: tuple[int, ...] = ()  # places of coefficients that the user fixed
+    # everything was zero before the first sample: no initial states, no constant, and all samples count
+    at_rest: bool = False
+    # where each polynomial stands among all coefficients, in the order of `PolynomialModel.theta`
+    places: Mapping[Key, slice] = field(init=False, repr=False, compare=False)
+    # (n_free,), places of the estimated coefficients
+    free: NDArray[np.int64] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "places", _places(self))
+        object.__setattr__(self, "free", _free(self))
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.nb)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of all coefficients, leading ones and zeros included."""
+        return self.na + sum(self.nb) + sum(self.nk) + self.nc + self.nd + sum(self.nf) + 3 + self.n_inputs
+
+    @property
+    def first_row(self) -> int:
+        """First sample whose regressors lie in the record, or are known to be zero."""
+        if self.at_rest:
+            return 0
+        return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
+
+    def free_lags(self, key: Key) -> tuple[int, ...]:
+        """Return the lags of the coefficients of polynomial `key` that are estimated.
+
+        `key`: letter and input.
+        """
+        place = self.places[key]
+        first = self.nk[key[1]] if key[0] == "B" and key[1] is not None else 1
+        return tuple(k for k in range(first, place.stop - place.start) if place.start + k not in self.fixed)
+
+    def start(self) -> Array:
+        """Return coefficients of a model that is zero: leading ones alone, shape (n_theta,)."""
+        theta = np.zeros(self.n_theta)
+        for (letter, _), place in self.places.items():
+            theta[place.start] = float(letter != "B")
+        return theta
+
+    def polynomials(self, theta: Array) -> Polynomials:
+        """Return the polynomials that `theta` holds.
+
+        `theta`: (n_theta,).
+        """
+        p = self.places
+        per_input = range(self.n_inputs)
+        return Polynomials(
+            A=theta[p["A", None]],
+            B=tuple(theta[p["B", i]] for i in per_input),
+            C=theta[p["C", None]],
+            D=theta[p["D", None]],
+            F=tuple(theta[p["F", i]] for i in per_input),
+        )
+
+
+def _places(layout: Layout) -> dict[Key, slice]:
+    sizes: list[tuple[Key, int]] = [(("A", None), layout.na + 1)]
+    sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(layout.nb, layout.nk, strict=True))]
+    sizes += [(("C", None), layout.nc + 1), (("D", None), layout.nd + 1)]
+    sizes += [(("F", i), f + 1) for i, f in enumerate(layout.nf)]
+    first, out = 0, {}
+    for key, size in sizes:
+        out[key] = slice(first, first + size)
+        first += size
+    return out
+
+
+def _free(layout: Layout) -> NDArray[np.int64]:
+    lags = [p.start + k for key, p in layout.places.items() for k in layout.free_lags(key)]
+    out = np.array(lags, dtype=np.int64)
+    out.flags.writeable = False
+    return out
+
+
+def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tuple[int, ...] | None]:
+    """Check orders against structure and data; nk is None where it is to be estimated.
+
+    `name`: structure.
+    """
+    known = structure(name).orders
+    _check_inputs(name, data)
+    check_order_names(name, orders, known, [key for key in known if key != "nk"])
+    found: dict[str, int | tuple[int, ...] | None] = {}
+    for key in known:
+        if key == "nk" and left_open(orders, key):
+            found[key] = None
+        elif key in _PER_INPUT:
+            found[key] = order_per_input(name, orders, key, 1 if key == "nb" else 0, data.n_inputs)
+        else:
+            found[key] = single_order(name, orders, key, 0)
+    if not any(found[key] for key in known if key != "nk"):
+        raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
+    return found
+
+
+def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int, *, at_rest: bool = False) -> Layout:
+    """Return the layout of checked orders.
+
+    `orders`: of `read_orders`, nk a number for each input by now.
+    """
+
+    def one(key: str) -> int:
+        value = orders.get(key, 0)
+        return value if isinstance(value, int) else 0
+
+    def each(key: str) -> tuple[int, ...]:
+        value = orders.get(key)
+        return value if isinstance(value, tuple) else (0,) * n_inputs
+
+    return _layout(one("na"), each("nb"), one("nc"), one("nd"), each("nf"), each("nk"), at_rest)
+
+
+@lru_cache(maxsize=256)
+def _layout(
+    na: int, nb: tuple[int, ...], nc: int, nd: int, nf: tuple[int, ...], nk: tuple[int, ...], at_rest: bool
+) -> Layout:
+    return Layout(na=na, nb=nb, nc=nc, nd=nd, nf=nf, nk=nk, at_rest=at_rest)  # fixed: see `fixed_places`
+
+
+def compact_orders(name: str, layout: Layout) -> UsedOrders:
+    """Return the orders as a result prints them: a number where all inputs agree."""
+    out: dict[str, int | tuple[int, ...]] = {}
+    for key in structure(name).orders:
+        value = getattr(layout, key)
+        out[key] = compact_order(value) if isinstance(value, tuple) else value
+    return out
+
+
+def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, float]) -> list[dict[int, float]]:
+    """Find where the coefficients that the user fixed stand.
+
+    `name`: structure; `layouts`: one for each output; `fixed`: by the names of `PolynomialModel.names`. Returns place
+    and value, for each output.
+    """
+    if not fixed:
+        return [{} for _ in layouts]
+    outputs = tuple(layout.polynomials(layout.start()) for layout in layouts)
+    names = PolynomialModel(outputs=outputs, dt=1.0).names
+    free = {}
+    first = 0
+    for o, layout in enumerate(layouts):
+        free.update({names[first + p]: (o, int(p)) for p in layout.free})
+        first += layout.n_theta
+    found: list[dict[int, float]] = [{} for _ in layouts]
+    for key, value in fixed.items():
+        if key not in free:
+            raise EstimationError(
+                f"{name}: no coefficient {key!r} can be fixed; there are {', '.join(free)}.{nearest(key, list(free))}"
+            )
+        if not np.isfinite(value):
+            raise EstimationError(f"{name}: coefficient {key} is fixed at {value}; it must be a finite number")
+        o, place = free[key]
+        found[o][place] = float(value)
+    return found
+
+
+def _check_inputs(name: str, data: IOData) -> None:
+    wants = structure(name).inputs
+    if wants and not data.n_inputs:
+        raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
+    if not wants and data.n_inputs:
+        raise EstimationError(
+            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Leave them out, or "
+            "use armax"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaledData:
+    """Data without means, in units of their standard deviations."""
+
+    u: Array  # (n_inputs, n_samples), (n_outputs, n_samples)
+    y: Array
+    u_mean: Array  # (n_inputs,)
+    u_scale: Array
+    y_mean: Array  # (n_outputs,)
+    y_scale: Array
+    at_rest: bool = False  # whether the user says that everything was zero before the first sample
+
+
+def scale_data(name: str, data: IOData, *, at_rest: bool = False) -> ScaledData:
+    """Take off means and divide by standard deviations."""
+    out = []
+    for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
+        mean = np.zeros(len(names)) if at_rest else np.mean(values, axis=0)
+        centred = np.subtract(values.T, mean[:, None], order="C")
+        scale = np.sqrt(np.array([x @ x for x in centred]) / max(values.shape[0], 1))
+        for k, channel in enumerate(names):
+            if not scale[k] > 1e-13 * abs(mean[k]):
+                raise EstimationError(
+                    f"{name}: {channel!r} does not move (constant at {values[0, k]:g}); nothing can be learnt from it. "
+                    "Excite it, or leave it out"
+                )
+        centred /= scale[:, None]
+        out.append((centred, mean, scale))
+    (u, u_mean, u_scale), (y, y_mean, y_scale) = out
+    return ScaledData(u=u, y=y, u_mean=u_mean, u_scale=u_scale, y_mean=y_mean, y_scale=y_scale, at_rest=at_rest)
+
+
+def coefficient_units(layout: Layout, scaled: ScaledData, o: int) -> Array:
+    """Return what one scaled coefficient is worth in SI, shape (n_theta,).
+
+    `o`: output. Returns (n_theta,).
+    """
+    out = np.ones(layout.n_theta)
+    for i in range(layout.n_inputs):
+        out[layout.places["B", i]] = scaled.y_scale[o] / scaled.u_scale[i]
+    return out
+
+
+def liveliest_part(u: Array, size: int = 8192) -> slice:
+    """Return the piece of a long record in which the inputs move most, for a start or a first choice.
+
+    `u`: (n_inputs, n_samples); `size`: of the piece; records up to twice as long are taken whole.
+    """
+    n = u.shape[1]
+    if n <= 2 * size:
+        return slice(0, n)
+    energy = np.add.reduceat(np.sum(u * u, axis=0), np.arange(0, n - size + 1, size))
+    first = int(np.argmax(energy[:-1])) * size
+    return slice(first, first + size)
+
+
+Table = NDArray[np.int64]
+
+_BLOCK = 512  # samples: signals and rows of a small model stay in the fast cache
+_ONE, _MINUS, _CONSTANT, _THETA = 0, 1, 2, 3  # places in the vector of all coefficients
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Predictor:
+    """What is filtered by what, for one structure."""
+
+    layout: Layout
+    filters: Table  # (n_filters, 6), (n_terms, 4), see `_kernels`
+    terms: Table
+    columns: Table  # (n_columns, 3), signal, lag and sign of every gradient and, last, of the residual
+    n_signals: int
+    pad: int
+    first_row: int
+    impulse_row: int
+    n_initial: int  # initial states, the first columns; the constant, if any, follows, then the free coefficients
+    n_nuisance: int  # initial states and constant
+
+    def coefficients(self, theta: Array, nuisance: Array) -> Array:
+        """Return what the filters take.
+
+        `theta`: (n_theta,), all coefficients of the output; `nuisance`: (n_nuisance,), initial states, then the
+        constant. Returns (3 + n_theta + n_initial,).
+        """
+        constant = nuisance[self.n_initial :] if self.n_nuisance > self.n_initial else np.zeros(1)
+        return np.concatenate([[1.0, -1.0], -constant, theta, nuisance[: self.n_initial]])
+
+    def triangle(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
+        """Return R of the QR decomposition of [initial states, constant, free coefficients, residual].
+
+        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
+        (n_columns, n_columns).
+        """
+        from ambid.blackbox.polynomial_kernels import predictor_triangle
+
+        R: Array = predictor_triangle(
+            y,
+            u,
+            self.filters,
+            self.terms,
+            self.columns,
+            self.coefficients(theta, nuisance),
+            self.n_signals,
+            self.pad,
+            self.first_row,
+            self.impulse_row,
+            self.n_initial,
+            max(_BLOCK, self.pad + 1),
+        )
+        return R
+
+    def blocks(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Iterator[tuple[int, Array]]:
+        """Yield the rows [gradients, residual] block by block.
+
+        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
+        (n_columns, n_rows), first sample, and rows, which are good until the next block is asked for.
+        """
+        from ambid.blackbox.polynomial_kernels import block_rows
+
+        coef, m = self.coefficients(theta, nuisance), max(_BLOCK, self.pad + 1)
+        s, w = np.zeros((self.n_signals, self.pad + m)), np.empty((self.columns.shape[0], m))
+        ringing = 1
+        for first in range(0, y.size, m):
+            n, ringing = block_rows(
+                y,
+                u,
+                self.filters,
+                self.terms,
+                self.columns,
+                coef,
+                s,
+                w,
+                self.pad,
+                self.first_row,
+                self.impulse_row,
+                first,
+                ringing,
+            )
+            yield max(first, self.first_row), w[:, :n]
+
+    def rows(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
+        """Return the gradients and, last, the residual; complex where the coefficients are.
+
+        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
+        (n_columns, n_samples - first_row).
+        """
+        return self._rows(y, u, theta, nuisance, self.columns)
+
+    def residual(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
+        """Return the residual; complex where the coefficients are.
+
+        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
+        (n_samples - first_row,).
+        """
+        return np.asarray(self._rows(y, u, theta, nuisance, self.columns[-1:])[0])
+
+    def _rows(self, y: Array, u: Array, theta: Array, nuisance: Array, columns: Table) -> Array:
+        from ambid.blackbox.polynomial_kernels import predictor_rows
+
+        coef = self.coefficients(theta, nuisance)
+        s = np.zeros((self.n_signals, self.pad + y.size), dtype=coef.dtype)
+        out: Array = predictor_rows(
+            y, u, self.filters, self.terms, columns, coef, s, self.pad, self.first_row, self.impulse_row
+        )
+        return out
+
+
+@dataclass(slots=True)
+class _Plan:
+    """Filters, terms and columns while they are being written down."""
+
+    n_signals: int
+    filters: list[tuple[int, ...]] = field(default_factory=list)
+    terms: list[tuple[int, int, int, int]] = field(default_factory=list)
+    columns: list[tuple[int, int, int]] = field(default_factory=list)
+    known: dict[tuple[object, int, int], int] = field(default_factory=dict)
+
+    def filtered(self, terms: list[tuple[int, int, int, int]], over: slice, *, impulse: bool = False) -> int:
+        """Add the signal sum(terms) / polynomial `over`, and return its row; terms: (row, place, size, lag)."""
+        n_over = over.stop - over.start - 1
+        if not n_over and len(terms) == 1 and terms[0][1:] == (_ONE, 1, 0):
+            return terms[0][0]
+        key = (tuple(terms), over.start, over.stop)
+        if key in self.known:
+            return self.known[key]
+        first = len(self.terms)
+        self.terms += terms
+        row = self.known[key] = self.n_signals
+        self.filters.append((row, over.start + 1, n_over, first, len(self.terms), int(impulse)))
+        self.n_signals += 1
+        return row
+
+
+@lru_cache(maxsize=256)
+def predictor(layout: Layout) -> Predictor:
+    """Write down the predictor of one output.
+
+    `layout`: at rest: without initial states and without the constant that offsets leave.
+    """
+    n_u, free = layout.n_inputs, not layout.at_rest
+    place = {key: slice(p.start + _THETA, p.stop + _THETA) for key, p in layout.places.items()}
+    A, C, D = (place[x, None] for x in "ACD")
+    one, impulse = 1 + n_u, 2 + n_u
+    plan = _Plan(n_signals=3 + n_u)
+    nothing = slice(0, 1)
+    n_noise = max(layout.nc, layout.nd)
+    states = layout.n_theta + _THETA  # initial states: of every F, then of C and D
+    initial: list[tuple[int, int, int]] = []
+
+    def through_noise(row: int, *, rings: bool = False) -> int:  # (D/C) x
+        whole = D.stop - D.start == 1
+        term = (row, _ONE, 1, 0) if whole else (row, D.start, D.stop - D.start, 0)
+        return plan.filtered([term], C, impulse=rings)
+
+    v_terms = [(0, A.start, A.stop - A.start, 0)]
+    w, F = [], []
+    for i in range(n_u):
+        b, f = place["B", i], place["F", i]
+        terms = [(1 + i, b.start + layout.nk[i], layout.nb[i], layout.nk[i])]
+        if layout.nf[i] and free:
+            terms.append((impulse, states, layout.nf[i], 0))
+            states += layout.nf[i]
+        w.append(plan.filtered(terms, f))
+        F.append(f)
+        v_terms.append((w[i], _MINUS, 1, 0))
+    if free:
+        v_terms.append((one, _CONSTANT, 1, 0))
+    v = plan.filtered(v_terms, nothing)
+    e_terms = [(v, _ONE, 1, 0) if not layout.nd else (v, D.start, layout.nd + 1, 0)]
+    if n_noise and free:
+        e_terms.append((impulse, states, n_noise, 0))
+    e = plan.filtered(e_terms, C)
+    for i in range(n_u):
+        if layout.nf[i] and free:
+            row = plan.filtered([(through_noise(impulse, rings=True), _ONE, 1, 0)], F[i], impulse=True)
+            initial += [(row, j, -1) for j in range(layout.nf[i])]
+    if n_noise and free:
+        row = plan.filtered([(impulse, _ONE, 1, 0)], C, impulse=True)
+        initial += [(row, j, 1) for j in range(n_noise)]
+    plan.columns += initial
+    if free:
+        plan.columns.append((through_noise(one), 0, -1))
+    n_nuisance = len(plan.columns)
+
+    def gradient(key: tuple[str, int | None], row: int, sign: int) -> None:
+        plan.columns += [(row, k, sign) for k in layout.free_lags(key)]
+
+    if layout.free_lags(("A", None)):
+        gradient(("A", None), through_noise(0), 1)
+    for i in range(n_u):
+        if layout.free_lags(("B", i)):
+            gradient(("B", i), plan.filtered([(through_noise(1 + i), _ONE, 1, 0)], F[i]), -1)
+    if layout.free_lags(("C", None)):
+        gradient(("C", None), plan.filtered([(e, _ONE, 1, 0)], C), -1)
+    if layout.free_lags(("D", None)):
+        gradient(("D", None), plan.filtered([(v, _ONE, 1, 0)], C), 1)
+    for i in range(n_u):
+        if layout.free_lags(("F", i)):
+            gradient(("F", i), plan.filtered([(through_noise(w[i]), _ONE, 1, 0)], F[i]), 1)
+    plan.columns.append((e, 0, 1))
+    return Predictor(
+        layout=layout,
+        filters=np.array(plan.filters, dtype=np.int64).reshape(-1, 6),
+        terms=np.array(plan.terms, dtype=np.int64).reshape(-1, 4),
+        columns=np.array(plan.columns, dtype=np.int64),
+        n_signals=plan.n_signals,
+        pad=2
+        + max(max(t[2] + t[3] for t in plan.terms), max(c[1] for c in plan.columns), *(f[2] for f in plan.filters)),
+        first_row=layout.first_row,
+        impulse_row=impulse,
+        n_initial=len(initial),
+        n_nuisance=n_nuisance,
+    )

@@ -1,0 +1,477 @@
+"""State-space models by prediction error: the maximum of the likelihood, started from a subspace estimate.
+
+Solves: min log det (1/N) sum e e' with x+ = A x + B u + K e, y = C x + D u + e over A, B, C, [D,] K, first states and a
+constant for every output, for stable and unstable plants, with and without feedback. Levenberg-Marquardt on QR-reduced
+rows whitened by the errors' covariance (Ljung 1999, sec. 7.4 and 10.2), in local coordinates theta = theta_0 + P beta:
+the columns of P are orthonormal, and orthogonal to all that a change of states does, (T A - A T, T B, -C T, 0, T K) for
+every T (McKelvey, Helmersson and Ribarits 2004, Automatica 40, 1629). Efficient where the innovations are white (Ljung
+1999, sec. 9.3): its covariance is the inverse of the information matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtpqrt
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData, Orders
+from ambid.blackbox.fit import BlackBoxFit, build_fit
+from ambid.blackbox.response import Sensitivities
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.subspace import FirstModel, Method, embed_delays, first_model, operating_point, to_units
+from ambid.blackbox.subspace_projection import Realisation, kalman_gain, radius
+from ambid.errors import EstimationError
+from ambid.estimation.kernels import state_scan
+from ambid.estimation.linear import directions
+from ambid.estimation.threads import one_thread
+
+_DOUBLINGS = 24  # samples as a power of two
+_FAINT = 1e-10  # Hankel singular value beside the largest below which a state is not scaled further
+
+
+def tangent(model: StateSpaceModel, *, feedthrough: bool) -> Array:
+    """Return directions along which the model moves, those of a mere change of states left out.
+
+    `feedthrough`: whether D moves. Returns orthonormal columns.
+    """
+    m, n, n_u, n_y = model, model.order, model.n_inputs, model.n_outputs
+    eye = np.eye(n)
+    exchange = np.vstack(
+        [
+            np.kron(eye, m.A.T) - np.kron(m.A, eye),
+            np.kron(eye, m.B.T),
+            -np.kron(m.C, eye),
+            np.kron(eye, m.K.T),
+        ]
+    )
+    basis = np.linalg.qr(exchange, mode="complete")[0][:, n * n :]
+    before, size = n * n + n * n_u + n_y * n, n_y * n_u
+    out = np.zeros((m.theta.size, basis.shape[1] + (size if feedthrough else 0)))
+    out[:before, : basis.shape[1]] = basis[:before]
+    out[before + size :, : basis.shape[1]] = basis[before:]
+    if feedthrough:
+        out[before : before + size, basis.shape[1] :] = np.eye(size)
+    return out
+
+
+def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
+    """Return directions along which the predictions are linear: inputs and outputs enter a predictor that stays.
+
+    With F = A - K C and C held, they are linear in K and in B - K D; in D beside K up to the product of their changes.
+
+    `feedthrough`: whether D moves.
+    """
+    m, n, n_u, n_y = model, model.order, model.n_inputs, model.n_outputs
+    ends = np.cumsum([0, n * n, n * n_u, n_y * n, n_y * n_u, n * n_y])
+    by_b, by_k = n * n_u, n * n_y
+    out = np.zeros((m.theta.size, by_b + by_k + (n_y * n_u if feedthrough else 0)))
+    out[ends[1] : ends[2], :by_b] = np.eye(by_b)
+    out[ends[4] : ends[5], by_b : by_b + by_k] = np.eye(by_k)
+    out[: ends[1], by_b : by_b + by_k] = np.kron(np.eye(n), m.C.T)  # dA = dK C
+    out[ends[1] : ends[2], by_b : by_b + by_k] = np.kron(np.eye(n), m.D.T)  # dB = dK D
+    if feedthrough:
+        out[ends[3] : ends[4], by_b + by_k :] = np.eye(n_y * n_u)
+        out[ends[1] : ends[2], by_b + by_k :] = np.kron(m.K, np.eye(n_u))  # dB = K dD
+    return out
+
+
+def move(model: StateSpaceModel, change: Array) -> StateSpaceModel:
+    """Return the model with its coefficients changed.
+
+    `change`: (n_theta,).
+    """
+    theta, parts, at = model.theta + change, {}, 0
+    for name in "ABCDK":
+        shape = getattr(model, name).shape
+        parts[name] = theta[at : at + shape[0] * shape[1]].reshape(shape)
+        at += shape[0] * shape[1]
+    return StateSpaceModel(**parts, dt=model.dt)
+
+
+def balance(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpaceModel, Array]:
+    """Return the model in states that white inputs and outputs drive, and the predictions show, by equal amounts.
+
+    `model`: with a stable predictor; `x0`: (n,), first states; `noise`: (n_outputs, n_outputs), of the innovations:
+    errors are counted in it. Returns `model`: as it was where its predictor is too near the edge of stability to be
+    balanced; `x0`: (n,).
+    """
+    m = model
+    F, G = m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K])
+    seen = np.linalg.solve(np.linalg.cholesky(noise), m.C)
+    try:
+        left, right = _factor(_gramian(F, G)), _factor(_gramian(F.T, seen.T))
+        U, s, _ = np.linalg.svd(right.T @ left)
+        s = np.sqrt(np.maximum(s, _FAINT * s[0]))
+        T = (U / s).T @ right.T  # new states = T old states
+        back = np.linalg.inv(T)
+    except (np.linalg.LinAlgError, ValueError):
+        return model, x0
+    if not (np.all(np.isfinite(T)) and np.linalg.cond(T) < 1e12):
+        return model, x0
+    return StateSpaceModel(A=T @ m.A @ back, B=T @ m.B, C=m.C @ back, D=m.D, K=T @ m.K, dt=m.dt), T @ x0
+
+
+def _gramian(F: Array, G: Array) -> Array:
+    """Sum of F^k G G' F'^k, its length doubled until nothing is added: no equation to be ill-conditioned."""
+    total, power = G @ G.T, F
+    for _ in range(_DOUBLINGS):
+        total = total + power @ total @ power.T
+        power = power @ power
+        if not np.any(np.abs(power) > 1e-18):
+            break
+    if not np.all(np.isfinite(total)):
+        raise np.linalg.LinAlgError("the predictor forgets nothing")
+    return np.asarray(total)
+
+
+def _factor(gramian: Array) -> Array:
+    """Return L with L L' = gramian, rounding below zero taken as rounding."""
+    values, ways = np.linalg.eigh(0.5 * (gramian + gramian.T))
+    if not values[-1] > 0:
+        raise np.linalg.LinAlgError("nothing drives the states")
+    return np.asarray(ways * np.sqrt(np.maximum(values, 1e-14 * values[-1])))
+
+
+Tick = Callable[[], None] | None
+
+_BLOCK = 2048  # samples at once
+_PANEL = 32
+_STEPS = 100
+_NEAR = 1e-7  # fall of N log det that one more step promises, below which the search is done
+_ROUNDING = 1e-3  # the same, below which a step that does not succeed is rounding
+_EXACT = 1e-12  # errors beside outputs of unit deviation from which they are rounding
+_SHORTEST = 2.0**-30  # part of a step below which no stable predictor lies that way
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Point:
+    """A model with what belongs to this record; scaled channels."""
+
+    model: StateSpaceModel
+    x0: Array  # (n,), states at the first sample
+    constant: Array  # (n_outputs,), mean of the errors of the predictor that knows of no constant
+    noise: Array  # (n_outputs, n_outputs), covariance of the errors, no degrees of freedom taken off
+    cost: float  # N log det of it
+
+    @property
+    def exact(self) -> bool:
+        """Whether the errors are rounding, with no noise to be seen."""
+        return bool(np.trace(self.noise) < 1.5 * _EXACT**2 * self.noise.shape[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Found:
+    """Where the search ended."""
+
+    point: Point
+    tangent: Array  # (n_theta, n_directions)
+    # (n_directions, n_directions), triangular root of the information along the tangent, first states and constants
+    # projected out
+    information: Array
+    n_numbers: int  # directions, first states and constants
+    iterations: int
+    converged: bool
+    promise: float  # fall of N log det that one more step promises
+
+
+def start_point(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Point | None:
+    """Give a model the first states and constants that suit it best.
+
+    `model`: scaled; `noise`: (n_outputs, n_outputs), of the innovations, roughly; `u`: (n_samples, n_inputs); `y`:
+    (n_samples, n_outputs). Returns none where the predictor is not stable, or leaves no errors.
+    """
+    if radius(model.A - model.K @ model.C) >= 1.0:
+        return None
+    n, n_y = model.order, model.n_outputs
+    rough = Point(model=model, x0=np.zeros(n), constant=np.zeros(n_y), noise=noise, cost=np.inf)
+    return _settle(rough, np.zeros((model.theta.size, 0)), u, y)
+
+
+def search(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick = None) -> Found:
+    """Search from a start.
+
+    `u`: (n_samples, n_inputs), scaled; `y`: (n_samples, n_outputs); `feedthrough`: whether D is estimated; `tick`:
+    called before each step.
+    """
+    point, damping, iterations = start, 1e-3, 0
+    k = start.model.order + start.model.n_outputs
+    while True:
+        if tick is not None:
+            tick()
+        model, x0 = balance(point.model, point.x0, point.noise)
+        point = replace(point, model=model, x0=x0)
+        ways = tangent(model, feedthrough=feedthrough)
+        factor = _triangle(point, ways, u, y)
+        promise = float(np.sum(factor[:-1, -1] ** 2))
+        better = None
+        if promise > _NEAR and not point.exact and iterations < _STEPS:
+            better, damping = _step(point, ways, factor, damping, u, y, feedthrough=feedthrough)
+        if better is None:
+            break
+        point, iterations = better, iterations + 1
+    return Found(
+        point=point,
+        tangent=ways,
+        information=factor[k:-1, k:-1],
+        n_numbers=factor.shape[1] - 1,
+        iterations=iterations,
+        converged=promise < _ROUNDING or point.exact,
+        promise=promise,
+    )
+
+
+def _step(
+    point: Point, ways: Array, factor: Array, damping: float, u: Array, y: Array, *, feedthrough: bool
+) -> tuple[Point | None, float]:
+    """Find a better point: more damping after failure, a shorter step where the predictor gets unstable."""
+    n, k = point.model.order, point.model.order + point.model.n_outputs
+    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
+    rows, right = factor[:-1, :-1] / size, factor[:-1, -1]
+    U, s, Vt = np.linalg.svd(rows)
+    s = np.maximum(s, 1e-300)
+    along = U.T @ right
+    while damping < 1e10:
+        scaled = Vt.T @ (along * s / (s**2 + damping))
+        change, part = scaled / size, 1.0
+        model = move(point.model, ways @ change[k:])
+        while radius(model.A - model.K @ model.C) >= 1.0 and part > _SHORTEST:
+            part *= 0.5
+            model = move(point.model, ways @ (part * change[k:]))
+        trial = None
+        if part > _SHORTEST:
+            near = replace(
+                point, model=model, x0=point.x0 + part * change[:n], constant=point.constant + part * change[n:k]
+            )
+            trial = _settle(near, linear(model, feedthrough=feedthrough), u, y)
+        left = right - part * rows @ scaled
+        promised = float(right @ right - left @ left)
+        if trial is not None and point.cost - trial.cost > 1e-3 * promised > 0:
+            good = point.cost - trial.cost > 0.5 * promised and part == 1.0
+            return trial, max(damping / 20, 1e-14) if good else damping
+        damping = max(damping, 1e-10) * 8
+    return None, damping
+
+
+def _settle(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
+    """Solve for all that the predictions are linear in: the valley of poles that zeros nearly cancel gets straight."""
+    n, k = rough.model.order, rough.model.order + rough.model.n_outputs
+    factor = _triangle(rough, ways, u, y)
+    if not np.all(np.isfinite(factor)):
+        return None
+    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
+    solved = np.linalg.lstsq(factor[:-1, :-1] / size, factor[:-1, -1], rcond=1e-10)[0]
+    change = np.asarray(solved / size, dtype=np.float64)
+    model = move(rough.model, ways @ change[k:])
+    return _evaluate(model, rough.x0 + change[:n], rough.constant + change[n:k], u, y)
+
+
+def _evaluate(model: StateSpaceModel, x0: Array, constant: Array, u: Array, y: Array) -> Point | None:
+    """Run the record through; None where the errors are not finite, or some outputs' alone are rounding."""
+    triangle = np.zeros((y.shape[1], y.shape[1]))
+    for _, e in _blocks(model, x0, u, y):
+        if not np.all(np.isfinite(e)):
+            return None
+        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, e - constant]), mode="r"))
+    size, least = np.abs(np.diag(triangle)), _EXACT * np.sqrt(y.shape[0])
+    if np.all(size <= least):  # no noise: errors are rounding, and count as this much
+        size, triangle = np.full(size.size, least), least * np.eye(size.size)
+    if not np.all(size >= least):
+        return None
+    noise = triangle.T @ triangle / y.shape[0]
+    cost = float(y.shape[0] * (2 * np.sum(np.log(size)) - size.size * np.log(y.shape[0])))
+    return Point(model=model, x0=x0, constant=constant, noise=noise, cost=cost)
+
+
+def _blocks(model: StateSpaceModel, x0: Array, u: Array, y: Array) -> Iterator[tuple[Array, Array]]:
+    """States and inputs, and errors without a constant taken off, block by block."""
+    n, n_u = model.order, model.n_inputs
+    step = np.ascontiguousarray(np.hstack([model.A - model.K @ model.C, model.B - model.K @ model.D, model.K]))
+    out, x = np.hstack([model.C, model.D]).T, np.array(x0)
+    for first in range(0, y.shape[0], _BLOCK):
+        part = slice(first, first + _BLOCK)
+        work = np.hstack([np.zeros((y[part].shape[0], n)), u[part], y[part]])
+        state_scan(step, work, x)
+        known = work[:, : n + n_u]
+        yield known, y[part] - known @ out
+
+
+def _triangle(point: Point, ways: Array, u: Array, y: Array) -> Array:
+    """Triangular factor of [first states, constants, directions, errors], rows whitened by the errors' covariance."""
+    model, n_y = point.model, y.shape[1]
+    d, n = ways.shape[1], model.order
+    root = np.linalg.cholesky(point.noise)
+    whiten = solve_triangular(root, np.eye(n_y), lower=True)
+    along = Sensitivities(model, ways, initial=True)
+    width = n + n_y + d + 1
+    factor = np.zeros((width, width), order="F")
+    for known, e in _blocks(model, point.x0, u, y):
+        slopes = along.block(np.hstack([known, e]))
+        m = e.shape[0]
+        rows = np.empty((n_y, m, width))
+        rows[:, :, :n] = slopes[:, :, d:]
+        rows[:, :, n : n + n_y] = np.eye(n_y)[:, None, :]
+        rows[:, :, n + n_y : -1] = slopes[:, :, :d]
+        rows[:, :, -1] = (e - point.constant).T
+        white = (whiten @ rows.reshape(n_y, m * width)).reshape(n_y * m, width)
+        factor, _, _, _ = dtpqrt(0, min(_PANEL, width), factor, np.asfortranarray(white), overwrite_a=1, overwrite_b=1)
+    return np.triu(factor)
+
+
+_LOOSE = 1e6  # condition of the scaled information's root from which states are told apart by rounding alone
+
+
+def sspem(
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:
+    """Identify a state-space model by prediction error (local coordinates: McKelvey et al. 2004, Automatica 40, 1629).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping
+        ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
+        or one for each, at least 1 (default); larger ones become states of their own.
+    horizon, past : int, optional
+        Samples of future and past of the subspace estimate it starts from.
+    feedthrough : bool, optional
+        Whether to estimate D; as for `n4sid` if missing.
+    tick : callable, optional
+        Called between steps.
+
+    Returns
+    -------
+    BlackBoxFit
+        Consistent under feedback as long as n states hold plant and noise.
+
+    Raises
+    ------
+    EstimationError
+        If orders or horizons break a rule, a channel is constant, the record is too short, or no subspace estimate has
+        a stable predictor.
+    """
+    with one_thread():
+        first = first_model("pbsid", data, orders, horizon, past, feedthrough, tick)
+        n, given = first.full.A.shape[0], first.plan.channels
+        u, y = (given.u - given.mean_u) / given.scale_u, (given.y - given.mean_y) / given.scale_y
+        numbers = n * (u.shape[1] + 2 * y.shape[1] + 1) + y.shape[1] * (1 + first.plan.feedthrough * u.shape[1])
+        if y.size < 2 * numbers:
+            raise EstimationError(
+                f"sspem: {y.shape[0]} samples for {numbers} numbers; it wants at least {2 * numbers} values. "
+                "Lower n, or take a longer record"
+            )
+        method, start = _start(data, first, orders, u, y, horizon, past, tick)
+        found = search(start, u, y, feedthrough=first.plan.feedthrough, tick=tick)
+    return _result(data, first, found, method, start)
+
+
+def _start(
+    data: IOData,
+    first: FirstModel,
+    orders: Orders,
+    u: Array,
+    y: Array,
+    horizon: int | None,
+    past: int | None,
+    tick: Tick,
+) -> tuple[Method, Point]:
+    """Take the subspace estimate with the smallest determinant: pbsid, and cva where there is no feedback."""
+    n = first.full.A.shape[0]
+    tried: list[tuple[Method, Realisation]] = [("pbsid", first.full)]
+    if data.open_loop or not data.n_inputs:
+        try:
+            both = {**orders, "n": n}
+            other = first_model("cva", data, both, horizon, past, first.plan.feedthrough, tick)
+            tried.append(("cva", other.full))
+        except EstimationError:  # a record too short for cva may still do for pbsid
+            pass
+    points = list[tuple[Method, Point]]()
+    for method, one in tried:
+        point = start_point(_model(one, one.K, data.dt), one.innovation + 1e-12 * np.eye(y.shape[1]), u, y)
+        if point is None:
+            K, noise, _ = kalman_gain(one.A, one.C, np.eye(n), np.zeros_like(one.K), np.eye(y.shape[1]))
+            point = start_point(_model(one, K, data.dt), noise, u, y)
+        if point is not None:
+            points.append((method, point))
+    if not points:
+        raise EstimationError(
+            "sspem: no subspace estimate of this order has a stable predictor to start from. Change n"
+        )
+    return min(points, key=lambda pair: pair[1].cost)
+
+
+def _model(one: Realisation, K: Array, dt: float) -> StateSpaceModel:
+    return StateSpaceModel(A=one.A, B=one.B, C=one.C, D=one.D, K=K, dt=dt)
+
+
+def _result(data: IOData, first: FirstModel, found: Found, method: Method, start: Point) -> BlackBoxFit:
+    """Give the numbers their units and say what has to be said of them."""
+    m, plan, given = found.point.model, first.plan, first.plan.channels
+    n_samples, n_y = given.y.shape
+    # each output has its share of the numbers
+    widened = n_samples / (n_samples - found.n_numbers / n_y)
+    noise = found.point.noise * widened
+    scaled = _realisation(m, noise)
+    core, scale = to_units(scaled, given, data.dt)
+    model, places = embed_delays(core, plan.nk)
+    half = found.tangent * scale[:, None]
+    own = half @ directions(found.information).inverse() @ half.T * widened
+    covariance = np.zeros((model.theta.size, model.theta.size))
+    covariance[np.ix_(places, places)] = 0.5 * (own + own.T)
+    condition = _condition(found.information)
+    warnings = []
+    if found.point.exact:
+        warnings.append(
+            "the record shows no noise: the errors are rounding, and so are the standard deviations. The noise model K "
+            "means nothing"
+        )
+    elif condition > _LOOSE:
+        warnings.append(
+            f"the record does not tell all {m.order} states apart (condition {condition:.1g}): standard deviations "
+            "along what it does not show mean little. Lower n"
+        )
+    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
+    return build_fit(
+        "sspem",
+        data,
+        orders={"n": m.order, **delays},
+        model=model,
+        covariance=covariance,
+        n_estimated=found.tangent.shape[1],
+        offsets=operating_point(scaled, given, found.point.constant),
+        noise_covariance=noise * np.outer(given.scale_y, given.scale_y),
+        status="converged" if found.converged else "stalled",
+        warnings=warnings,
+        details={
+            "start": method,
+            "iterations": found.iterations,
+            "gain_nats": 0.5 * (start.cost - found.point.cost),
+            "left_nats": 0.5 * found.promise,
+            "condition_number": condition,
+            "covariance": {"kind": "information"},
+            "feedthrough": plan.feedthrough,
+            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
+            "order_criterion": None if first.criterion is None else first.criterion.tolist(),
+        },
+    )
+
+
+def _realisation(m: StateSpaceModel, noise: Array) -> Realisation:
+    return Realisation(
+        A=m.A, B=m.B, C=m.C, D=m.D, K=m.K, innovation=noise, Q=m.K @ noise @ m.K.T, S=m.K @ noise, R=noise
+    )
+
+
+def _condition(root: Array) -> float:
+    """Condition number of the columns over their sizes, at most 1e18."""
+    s = np.linalg.svd(root / np.maximum(np.linalg.norm(root, axis=0), 1e-150), compute_uv=False)
+    return float(s[0] / max(s[-1], 1e-18 * s[0]))

@@ -1,0 +1,772 @@
+"""N4SID, PO-MOESP, CVA and PBSID-opt: state-space models in innovations form without a search (thesis eq. 1.1-1.3).
+
+Solves: x+ = A x + B u + w, y = C x + D u + v, cov [w; v] = [Q S; S' R], and its Kalman gain, for stable and unstable
+plants, any number of inputs (none: a time series) and outputs. N4SID, MOESP and CVA are biased under feedback; PBSID
+is not. The record is compressed once to triangular factors; everything else is done on those, once more without each
+group of time for the covariance (delete-a-group jackknife; Shao and Tu 1995, ch. 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData, Orders, check_order_names, left_open, order_per_input, single_order
+from ambid.blackbox.fit import BlackBoxFit, build_fit
+from ambid.blackbox.response import Offsets
+from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.subspace_projection import (
+    Channels,
+    Factors,
+    Prediction,
+    Prior,
+    Projection,
+    Realisation,
+    autoregression_criterion,
+    channels,
+    check_inputs_differ,
+    classical_columns,
+    compress,
+    fit_prior,
+    input_relation,
+    least_squares,
+    leave_each_out,
+    merge_factors,
+    observability,
+    predict_states,
+    predictor_columns,
+    project,
+    realise,
+    regress_states,
+    state_criterion,
+    triangular_factor,
+)
+from ambid.errors import EstimationError
+from ambid.estimation.threads import one_thread
+
+Method = Literal["n4sid", "moesp", "cva", "pbsid"]
+
+_GROUPS = 20  # of time, for the jackknife: its standard deviations are good to 1 / sqrt(2 * 19)
+_AUTO_MAX = 10  # largest order tried where none is given
+_LONGEST = {"n4sid": 20, "moesp": 20, "cva": 20, "pbsid": 60}  # samples of past
+_WIDEST = {"n4sid": 100, "moesp": 100, "cva": 100, "pbsid": 240}  # columns of past
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """All that an estimate needs."""
+
+    method: Method
+    n: int | None  # order; None to choose it
+    n_max: int  # largest order that the horizons and the record allow, or that was asked for
+    nk: tuple[int, ...]  # delay of every input in samples, at least 1
+    past: int  # samples
+    future: int
+    feedthrough: bool
+    channels: Channels
+    factors: Factors
+    total: Array  # (n_columns, n_columns), all groups together
+    autoregression: int  # lags that an autoregression wants, and half as many again
+    past_limited: bool  # whether the criterion wanted a longer past than was tried
+
+
+def plan_estimate(
+    method: Method,
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None,
+    past: int | None,
+    feedthrough: bool | None,
+    n_max: int | None = None,
+    tick: Callable[[], None] | None = None,
+) -> Plan:
+    """Check what was asked for, compress the record and choose what was left open.
+
+    `horizon`, `past`: samples of future and past; chosen if missing; `n_max`: largest order to try; `tick`: called
+    between steps.
+    """
+    n, nk = _read_orders(method, data, orders)
+    _check_finite(data)
+    given = channels(data, tuple(k - 1 for k in nk))
+    largest = n or n_max or _AUTO_MAX
+    longest = _longest(method, data, given.n_samples, largest, horizon, past)
+    length = _window(method, longest, horizon, past)
+    factors = compress(given, length, _GROUPS)
+    if tick is not None:
+        tick()
+    total = merge_factors(factors.groups)
+    check_inputs_differ(factors, total, data.inputs, 1)
+    criterion = autoregression_criterion(factors, total)
+    wanted = wanted_lags = int(np.argmin(criterion))
+    least = _shortest(data, largest, bool(n or n_max))
+    if method == "pbsid":  # the prior makes a long past cheap, and a short one is what leaves bias
+        least, wanted = max(least, 20), wanted + wanted // 2
+    chosen = past or min(max(wanted, least), longest)
+    future = horizon or (min(chosen, longest) if method != "pbsid" else chosen)
+    if method == "pbsid" and future > chosen:
+        raise EstimationError(f"{method}: horizon {future} is longer than the past {chosen}. Lower it, or raise past")
+    largest = min(largest, (future - 1) * data.n_outputs, chosen * (data.n_inputs + data.n_outputs))
+    return Plan(
+        method=method,
+        n=n,
+        n_max=largest,
+        nk=nk,
+        past=chosen,
+        future=future,
+        feedthrough=_feedthrough(data, factors, total, chosen) if feedthrough is None else feedthrough,
+        channels=given,
+        factors=factors,
+        total=total,
+        autoregression=max(20, wanted_lags + wanted_lags // 2),
+        past_limited=past is None and wanted_lags >= length - 1,
+    )
+
+
+def _read_orders(method: str, data: IOData, orders: Orders) -> tuple[int | None, tuple[int, ...]]:
+    """Return n (None for automatic) and nk for each input."""
+    check_order_names(method, orders, ("n", "nk"))
+    n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or say 'auto'")
+    least, remedy = 1, "For an input that acts at once say feedthrough"
+    return n, order_per_input(method, {"nk": least, **orders}, "nk", least, data.n_inputs, remedy=remedy)
+
+
+def _check_finite(data: IOData) -> None:
+    """Refuse samples that are not numbers."""
+    for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
+        bad = ~np.isfinite(values)
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            raise EstimationError(f"sample {row} of {names[column]!r} is not a finite number. Mend or cut it")
+
+
+def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int | None, past: int | None) -> int:
+    """Return the longest past to try: what the record carries at two rows for a column, within the method's bounds."""
+    n_z = data.n_inputs + data.n_outputs
+    spans = 1 if method == "pbsid" else 2
+    carried = int(n_samples / (2.5 * spans * n_z + spans)) - 1
+    needed = _shortest(data, n, strict=False)
+    for what, value in (("horizon", horizon), ("past", past)):
+        if value is not None and value < 2:
+            raise EstimationError(f"{method}: {what} = {value} samples; it must be at least 2. Raise it")
+    if horizon is not None and (horizon - 1) * data.n_outputs < n:
+        raise EstimationError(
+            f"{method}: a horizon of {horizon} samples shows at most {(horizon - 1) * data.n_outputs} states of "
+            f"{data.n_outputs} output(s), not {n}. Raise it, or lower n"
+        )
+    asked = max(x for x in (horizon, past, needed) if x is not None)
+    if carried < asked:
+        raise EstimationError(
+            f"{method}: {n_samples} samples carry horizons of {max(carried, 0)}; order {n} needs {asked}. "
+            "Lower the order, or take a longer record"
+        )
+    bound = min(_LONGEST[method], _WIDEST[method] // n_z)
+    return min(carried, max(bound, asked, needed + 5))
+
+
+def _shortest(data: IOData, n: int, strict: bool = True) -> int:
+    """Return the shortest horizon that shows n states; with some room where the order is settled and that is cheap."""
+    least = max(-(-n // data.n_outputs) + 1, 2)
+    return max(least, min(n + 5, 10)) if strict else least
+
+
+def _window(method: Method, longest: int, horizon: int | None, past: int | None) -> int:
+    if method == "pbsid":
+        return (past or max(longest, horizon or 0)) + 1
+    return (past or longest) + (horizon or longest)
+
+
+def _feedthrough(data: IOData, factors: Factors, total: Array, past: int) -> bool:
+    """Say whether u(t) acts on y(t) at once: by Bayes' criterion, and only where no feedback can feign it."""
+    n_u, n_y = data.n_inputs, data.n_outputs
+    if not (n_u and data.open_loop):
+        return False
+    now = factors.length - 1
+    columns: Sequence[int] = [
+        0,
+        *factors.columns("z", now - min(past, now), now),
+        *factors.columns("u", now, now + 1),
+        *factors.columns("y", now, now + 1),
+    ]
+    y = triangular_factor(total[:, columns])[-(n_u + n_y) :, -n_y:]
+    without, with_it = (np.linalg.slogdet(e.T @ e / factors.n_rows + 1e-18 * np.eye(n_y))[1] for e in (y, y[n_u:]))
+    return bool(factors.n_rows * (without - with_it) > n_u * n_y * np.log(factors.n_rows))
+
+
+def to_units(scaled: Realisation, given: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
+    """Return the model in SI, and what its coefficients were multiplied by.
+
+    Returns `scale`: (n_theta,).
+    """
+    u, y = given.scale_u, given.scale_y
+    n = scaled.A.shape[0]
+    factors = {
+        "A": np.ones((n, n)),
+        "B": np.ones((n, 1)) / u,
+        "C": y[:, None] * np.ones((1, n)),
+        "D": y[:, None] / u,
+        "K": np.ones((n, 1)) / y,
+    }
+    model = StateSpaceModel(**{m: getattr(scaled, m) * f for m, f in factors.items()}, dt=dt)
+    return model, np.concatenate([f.ravel() for f in factors.values()])
+
+
+def embed_delays(core: StateSpaceModel, nk: tuple[int, ...]) -> tuple[StateSpaceModel, NDArray[np.intp]]:
+    """Put known input delays back as states that hand the input on.
+
+    `core`: for inputs that come nk - 1 samples early. Returns `model`: for the inputs as recorded; `places`: (n_theta
+    of core,), where each coefficient of the core is among those of the model.
+    """
+    n, extra = core.order, sum(k - 1 for k in nk)
+    N, n_u, n_y = n + extra, core.n_inputs, core.n_outputs
+    value = {m: np.zeros(s) for m, s in zip("ABCDK", ((N, N), (N, n_u), (n_y, N), (n_y, n_u), (N, n_y)), strict=True)}
+    value["A"][:n, :n], value["C"][:, :n], value["K"][:n] = core.A, core.C, core.K
+    home = {
+        "A": [(i, j) for i in range(n) for j in range(n)],
+        "B": [],
+        "C": [(i, j) for i in range(n_y) for j in range(n)],
+        "D": [],
+        "K": [(i, j) for i in range(n) for j in range(n_y)],
+    }
+    entry: list[tuple[str, int]] = []  # for each input: matrices and column by which it enters the core
+    first = n
+    for j, k in enumerate(nk):
+        if k == 1:
+            entry.append(("now", j))
+            continue
+        for i in range(first, first + k - 2):
+            value["A"][i, i + 1] = 1.0
+        value["B"][first + k - 2, j] = 1.0
+        entry.append(("late", first))
+        first += k - 1
+    for j, (when, column) in enumerate(entry):
+        value["B" if when == "now" else "A"][:n, column] = core.B[:, j]
+        value["D" if when == "now" else "C"][:, column] = core.D[:, j]
+    model = StateSpaceModel(**value, dt=core.dt)
+    index = {name: i for i, name in enumerate(model.names)}
+    places = [index[f"A[{i},{j}]"] for i, j in home["A"]]
+    places += [index[f"{'B' if w == 'now' else 'A'}[{i},{c}]"] for i in range(n) for w, c in entry]
+    places += [index[f"C[{i},{j}]"] for i, j in home["C"]]
+    places += [index[f"{'D' if w == 'now' else 'C'}[{i},{c}]"] for i in range(n_y) for w, c in entry]
+    places += [index[f"K[{i},{j}]"] for i, j in home["K"]]
+    return model, np.array(places, dtype=np.intp)
+
+
+def offsets(scaled: Realisation, plan: Plan) -> Offsets:
+    """Return the operating point at which the innovations have no mean.
+
+    A shift of y by dy and of u by du moves their mean by Py dy - Pu du, the predictor's answers at frequency zero:
+    finite and solvable for unstable plants and integrators too. The shortest shift of means is taken.
+    """
+    f, s = plan.factors, scaled
+    mean = plan.total[0] / plan.total[0, 0]
+    now = f.length - 1
+    error = mean[f.columns("y", now, now + 1)] - s.D @ mean[f.columns("u", now, now + 1)]
+    F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
+    row = s.C
+    for k in range(now - 1, -1, -1):
+        error = error - row @ (G @ mean[f.columns("z", k, k + 1)])
+        row = row @ F
+    return operating_point(scaled, plan.channels, error)
+
+
+def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offsets:
+    """Return the shortest shift of the channels' means that takes a mean off the innovations.
+
+    `error`: (n_outputs,), mean of the innovations of the centred, scaled channels.
+    """
+    s = scaled
+    n, n_u = s.A.shape[0], s.B.shape[1]
+    F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
+    at_rest = s.C @ np.linalg.solve(np.eye(n) - F, G)
+    by = np.hstack([np.eye(s.C.shape[0]) - at_rest[:, n_u:], -(s.D + at_rest[:, :n_u])])
+    shift = np.linalg.lstsq(by, -error, rcond=1e-6)[0]
+    n_y = s.C.shape[0]
+    return Offsets(u=given.mean_u - shift[n_y:] * given.scale_u, y=given.mean_y - shift[:n_y] * given.scale_y)
+
+
+def align_states(one: Realisation, like: Realisation, length: int) -> Realisation:
+    """Return a realisation in the state basis of another.
+
+    `one`, `like`: of equal order; `length`: block rows of the observability matrices that are compared.
+    """
+    T = least_squares(observability(one.A, one.C, length), observability(like.A, like.C, length))
+    back = np.linalg.inv(T)
+    return Realisation(
+        A=back @ one.A @ T,
+        B=back @ one.B,
+        C=one.C @ T,
+        D=one.D,
+        K=back @ one.K,
+        innovation=one.innovation,
+        Q=back @ one.Q @ back.T,
+        S=back @ one.S,
+        R=one.R,
+        stable_predictor=one.stable_predictor,
+    )
+
+
+def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, with_bias: bool) -> Array | None:
+    """Return the covariance of vec(A, B, C, D, K), each row by row.
+
+    `full`: from all groups; `others`: each without one group; `length`: block rows of the observability matrices that
+    are compared; `with_bias`: whether to add the square of the bias that leaving out data shows. Returns (n_theta,
+    n_theta), or None, none where a basis cannot be matched.
+    """
+    rows = []
+    for one in others:
+        try:
+            same = align_states(one, full, length)
+        except np.linalg.LinAlgError:
+            return None
+        rows.append(theta(same))
+    values = np.array(rows)
+    if not np.all(np.isfinite(values)):
+        return None
+    deviations = values - values.mean(0)
+    groups = values.shape[0]
+    covariance = (groups - 1) / groups * deviations.T @ deviations
+    if with_bias:
+        bias = (groups - 1) * (values.mean(0) - theta(full))
+        covariance = covariance + np.outer(bias, bias)
+    return np.asarray(covariance)
+
+
+def theta(one: Realisation) -> Array:
+    """Return the coefficients in the order of `StateSpaceModel.theta`.
+
+    Returns (n_theta,).
+    """
+    return np.concatenate([getattr(one, m).ravel() for m in "ABCDK"])
+
+
+Tick = Callable[[], None] | None
+
+_HORIZONS = (4, 6, 8, 11, 15, 20)  # samples of future that are tried
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FirstModel:
+    """An estimate without covariance, and what it came from."""
+
+    plan: Plan
+    given: Prior | None  # of the autoregression, where there is one
+    found: Projection | Prediction  # states of all orders
+    full: Realisation  # scaled channels
+    criterion: Array | None  # (n_states + 1,), or None, by which the order was chosen; None where it was given
+
+
+def estimate(
+    method: Method,
+    data: IOData,
+    orders: Orders,
+    horizon: int | None,
+    past: int | None,
+    feedthrough: bool | None,
+    tick: Tick,
+) -> BlackBoxFit:
+    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance.
+
+    `horizon`, `past`: samples.
+    """
+    with one_thread():
+        first = first_model(method, data, orders, horizon, past, feedthrough, tick)
+        plan, given, found, full, criterion = first.plan, first.given, first.found, first.full, first.criterion
+        n, others = full.A.shape[0], []
+        for factor in leave_each_out(plan.factors.arranged(_columns(plan))):
+            if tick is not None:
+                tick()
+            others.append(model_of(plan, _decompose(plan, factor, given), n))
+        covariance = jackknife(full, others, plan.future, with_bias=method != "pbsid")
+    return _result(method, data, plan, found, given, full, covariance, criterion)
+
+
+def first_model(
+    method: Method,
+    data: IOData,
+    orders: Orders,
+    horizon: int | None,
+    past: int | None,
+    feedthrough: bool | None,
+    tick: Tick,
+) -> FirstModel:
+    """Compress, decompose, choose the order, regress.
+
+    `horizon`, `past`: samples.
+    """
+    plan = plan_estimate(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
+    criterion = None if plan.n else order_criterion(plan)
+    n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
+    if method != "pbsid" and horizon is None:
+        plan = _choose_horizons(plan, n, keep_past=past is not None)
+    check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
+    given, found = decomposition(plan)
+    return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
+
+
+def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
+    """Decompose what all data say.
+
+    Returns `given`: of the autoregression, where there is one; `found`: states of all orders.
+    """
+    total = triangular_factor(plan.total[:, [0, *_columns(plan)]])
+    given = _prior(plan, total)
+    return given, _decompose(plan, total, given)
+
+
+def _choose_horizons(plan: Plan, n: int, *, keep_past: bool) -> Plan:
+    """Return the plan with the horizon whose model leaves the least innovations, freedom taken into account.
+
+    A long horizon averages noise out of slow states and brings it into fast ones; no rule knows which a plant has.
+    """
+    f, n_y = plan.factors, plan.factors.n_outputs
+    best, best_cost = plan, np.inf
+    for future in sorted({*_HORIZONS, plan.future}):
+        past = plan.past if keep_past else max(plan.past, future)
+        if (future - 1) * n_y < n or past + future > f.length:
+            continue
+        tried = replace(plan, past=past, future=future)
+        found = decomposition(tried)[1]
+        if found.values.size < n:
+            continue
+        model = model_of(tried, found, n)
+        free = f.n_rows - past * (f.n_inputs + n_y) - future * f.n_inputs
+        if not model.stable_predictor or free < 1:
+            continue
+        spread = model.innovation * (f.n_rows / free) + 1e-18 * np.eye(n_y)
+        cost = float(np.linalg.slogdet(spread)[1])
+        if cost < best_cost:
+            best, best_cost = tried, cost
+    return best
+
+
+def _columns(plan: Plan) -> list[int]:
+    if plan.method == "pbsid":
+        return predictor_columns(plan.factors, plan.past)
+    return classical_columns(plan.factors, plan.past, plan.future)
+
+
+def _prior(plan: Plan, total: Array) -> Prior | None:
+    """Return the prior of the autoregression, from all data: it stays when groups are left out."""
+    if plan.method != "pbsid":
+        return None
+    return fit_prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
+
+
+def _decompose(plan: Plan, factor: Array, given: Prior | None) -> Projection | Prediction:
+    if given is not None:
+        sizes = {"past": plan.past, "future": plan.future}
+        return predict_states(factor, **sizes, feedthrough=plan.feedthrough, like=plan.factors, given=given)
+    assert plan.method != "pbsid"
+    return project(factor, plan.method, past=plan.past, future=plan.future, like=plan.factors)
+
+
+def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
+    """Return the model of one order."""
+    shown = found.values.size
+    if n > shown:
+        states = "1 state" if shown == 1 else f"{shown} states"
+        raise EstimationError(f"{plan.method}: the record shows {states}, not {n}. Lower n, or excite the plant more")
+    if isinstance(found, Prediction):
+        return regress_states(found, n, feedthrough=plan.feedthrough)
+    return realise(found, n, feedthrough=plan.feedthrough)
+
+
+def order_criterion(plan: Plan) -> Array:
+    """Return Bayes' criterion for 0, 1, 2 ... states, for every method from the autoregression's states.
+
+    Their order is that of their use for prediction, under feedback too, which oblique projections do not give.
+
+    Returns (n_states + 1,).
+    """
+    past = plan.past if plan.method == "pbsid" else min(max(plan.autoregression, plan.past), plan.factors.length - 1)
+    future = max(min(past, plan.future), -(-plan.n_max // plan.factors.n_outputs))
+    states = decomposition(replace(plan, method="pbsid", past=past, future=min(future, past)))[1]
+    assert isinstance(states, Prediction)
+    most = min(plan.n_max, states.values.size)
+    return state_criterion(states.state[:most], states.y, plan.factors.n_inputs, plan.factors.n_rows)
+
+
+def _result(
+    method: Method,
+    data: IOData,
+    plan: Plan,
+    found: Projection | Prediction,
+    given: Prior | None,
+    full: Realisation,
+    covariance: Array | None,
+    criterion: Array | None,
+) -> BlackBoxFit:
+    """Give the numbers their units and say what has to be said of them."""
+    core, scale = to_units(full, plan.channels, data.dt)
+    model, places = embed_delays(core, plan.nk)
+    if covariance is not None:
+        wide = np.zeros((model.theta.size, model.theta.size))
+        wide[np.ix_(places, places)] = covariance * np.outer(scale, scale)
+        covariance = 0.5 * (wide + wide.T)
+    n, n_y, n_u = full.A.shape[0], data.n_outputs, data.n_inputs
+    y = plan.channels.scale_y
+    warnings = []
+    if covariance is None:
+        warnings.append("no standard deviations: parts of the record do not show the same states. Lower n")
+    if not full.stable_predictor:
+        warnings.append("no gain was found with which the predictor is stable: its predictions run away. Change n")
+    related = input_relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
+    if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
+        warnings.append(f"{related}: pbsid may share their effects out wrongly. Use cva or n4sid, or leave one out")
+    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
+    return build_fit(
+        method,
+        data,
+        orders={"n": n, **delays},
+        model=model,
+        covariance=covariance,
+        n_estimated=n * (2 * n_y + n_u) + (n_u * n_y if plan.feedthrough else 0),
+        offsets=offsets(full, plan),
+        noise_covariance=full.innovation * np.outer(y, y),
+        warnings=warnings,
+        details={
+            "singular_values": found.values.tolist(),
+            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
+            "order_criterion": None if criterion is None else criterion.tolist(),
+            "feedthrough": plan.feedthrough,
+            "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
+            "condition_number": _condition(plan),
+            "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
+            "Q": full.Q.tolist(),
+            "S": (full.S * y).tolist(),
+            "R": (full.R * np.outer(y, y)).tolist(),
+        },
+    )
+
+
+def _condition(plan: Plan) -> float:
+    """Return the condition number of the scaled regressors, at most 1e18: beyond is rounding."""
+    n_y = plan.factors.n_outputs
+    columns = _columns(plan)[: -n_y if plan.method == "pbsid" else -n_y * plan.future]
+    values = np.linalg.svd(triangular_factor(plan.total[:, [0, *columns]])[1:, 1:], compute_uv=False)
+    return float(values[0] / max(values[-1], 1e-18 * values[0]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OrderModel:
+    """The model of one order among several from one factorisation."""
+
+    order: int  # number of states, those of known delays not counted
+    model: StateSpaceModel  # in SI, known delays included
+    innovation: Array  # (n_outputs, n_outputs), SI, covariance of the innovations
+    criterion: float  # bayes' criterion by which orders are compared
+    singular_value: float  # the `order`-th one
+
+
+def subspace_models(
+    data: IOData,
+    method: Method,
+    n_max: int,
+    *,
+    nk: int | tuple[int, ...] = 1,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> tuple[OrderModel, ...]:
+    """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram wants them.
+
+    Parameters
+    ----------
+    data : IOData
+    method : {"n4sid", "moesp", "cva", "pbsid"}
+    n_max : int
+        Largest order.
+    nk : int or tuple of int, optional
+        Known delay of the inputs in samples.
+    horizon, past : int, optional
+        Samples of future and past.
+    feedthrough : bool, optional
+        As for `n4sid`.
+    tick : callable, optional
+        Called between steps.
+
+    Returns
+    -------
+    tuple of OrderModel
+        Orders 1, 2 ... n_max; fewer where horizons or data show fewer states. Without covariance: `n4sid` and its
+        kin give that for one order.
+
+    Raises
+    ------
+    EstimationError
+        As for `n4sid`.
+    """
+    if n_max < 1:
+        raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
+    with one_thread():
+        plan = plan_estimate(
+            method, data, {"nk": nk}, horizon=horizon, past=past, feedthrough=feedthrough, n_max=n_max, tick=tick
+        )
+        _, found = decomposition(plan)
+        criterion = order_criterion(plan)
+        out = []
+        for n in range(1, min(plan.n_max, found.values.size, criterion.size - 1) + 1):
+            scaled = model_of(plan, found, n)
+            model, _ = to_units(scaled, plan.channels, data.dt)
+            scale = plan.channels.scale_y
+            out.append(
+                OrderModel(
+                    order=n,
+                    model=embed_delays(model, plan.nk)[0],
+                    innovation=scaled.innovation * np.outer(scale, scale),
+                    criterion=float(criterion[n]),
+                    singular_value=float(found.values[n - 1]),
+                )
+            )
+            if tick is not None:
+                tick()
+    return tuple(out)
+
+
+def n4sid(
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:
+    """Identify a state-space model by N4SID (Van Overschee and De Moor 1996, fig. 4.8; thesis eq. 1.1-1.3).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping
+        ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
+        or one for each, at least 1 (default); larger ones become states of their own.
+    horizon, past : int, optional
+        Samples of future and past; chosen by an autoregression if missing.
+    feedthrough : bool, optional
+        Whether to estimate D. Missing: only where the record is said to be open loop and shows one, because a
+        controller that acts within the sample cannot be told from a feedthrough.
+    tick : callable, optional
+        Called between steps.
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        If orders or horizons break a rule, a channel is constant, or the record is too short.
+    """
+    return estimate("n4sid", data, orders, horizon, past, feedthrough, tick)
+
+
+def moesp(
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:
+    """Identify a state-space model by PO-MOESP (Verhaegen 1994; Van Overschee and De Moor 1996, sec. 4.3.2).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping
+        As for `n4sid`.
+    horizon, past : int, optional
+        Samples of future and past.
+    feedthrough : bool, optional
+        As for `n4sid`.
+    tick : callable, optional
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        As for `n4sid`.
+    """
+    return estimate("moesp", data, orders, horizon, past, feedthrough, tick)
+
+
+def cva(
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:
+    """Identify a state-space model by canonical variates (Larimore 1990; Van Overschee and De Moor 1996, sec. 4.3.3).
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping
+        As for `n4sid`.
+    horizon, past : int, optional
+        Samples of future and past.
+    feedthrough : bool, optional
+        As for `n4sid`.
+    tick : callable, optional
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        As for `n4sid`.
+    """
+    return estimate("cva", data, orders, horizon, past, feedthrough, tick)
+
+
+def pbsid(
+    data: IOData,
+    orders: Orders,
+    *,
+    horizon: int | None = None,
+    past: int | None = None,
+    feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:
+    """Identify a state-space model by PBSID-opt, consistent under feedback (Chiuso 2007, Automatica 43, 1034).
+
+    The controller has to hold a delay of a sample; where it does not, D stays zero (the default) and the estimate
+    stays consistent, but D itself cannot be identified.
+
+    Parameters
+    ----------
+    data : IOData
+    orders : Mapping
+        As for `n4sid`.
+    horizon, past : int, optional
+        Samples of future and past, horizon <= past.
+    feedthrough : bool, optional
+        As for `n4sid`.
+    tick : callable, optional
+
+    Returns
+    -------
+    BlackBoxFit
+
+    Raises
+    ------
+    EstimationError
+        As for `n4sid`.
+    """
+    return estimate("pbsid", data, orders, horizon, past, feedthrough, tick)
