@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox import frequency_subspace as state_search
+from ambid.blackbox import frequency_subspace
 from ambid.blackbox.frequency_lines import check_lines
 from ambid.blackbox.frequency_subspace import frf_subspace
 from ambid.blackbox.model import pole_covariance
@@ -115,7 +115,7 @@ def test_no_continuous_form_of_a_negative_pole():
     frf = noisy(F, plant("unstable-bearing", F, hold="zoh"), 0.01, 3, hold="zoh")
     model = frf_subspace(frf, {"n": 3}, domain="z", p=300.0).model
     turned = replace(model, A=-model.A)
-    assert state_search.continuous(turned, np.zeros((turned.theta.size,) * 2)) is None
+    assert frequency_subspace.to_continuous(turned, np.zeros((turned.theta.size,) * 2)) is None
 
 
 def test_units_do_not_matter():
@@ -155,7 +155,7 @@ def test_the_gauge_carries_no_information():
     frf = noisy(F, plant("unstable-bearing", F), 0.02, 5)
     fit, ln = frf_subspace(frf, {"n": 3}, p=300.0), check_lines(frf, 9)
     T = np.random.default_rng(0).normal(size=(3, 3)) + 2 * np.eye(3)
-    turned = state_search._turned(fit.model, T)
-    other, _ = state_search.information(ln, turned, False)
+    turned = frequency_subspace._change_states(fit.model, T)
+    other, _ = frequency_subspace.information(ln, turned, False)
     one, two = pole_covariance(fit.model, fit.covariance), pole_covariance(turned, other)
     np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-9)
