@@ -34,6 +34,35 @@ def test_a_caller_is_compiled_again_after_an_edit_of_what_it_calls(tmp_path: Pat
     assert printed == [["2.0", "0"], ["2.0", "1"], ["5.0", "0"]]  # compiled, from the cache, compiled again
 
 
+ALLOCATES = (
+    "import numpy as np\nfrom ambid.compiled import compiled\n\n\n@compiled\ndef run(n):\n"
+    "    if n < 0:\n        raise ValueError('below zero')\n"
+    "    return np.ones(n).sum() + np.dot(np.eye(2), np.ones(2))[0]\n"
+)
+SAYS = (
+    "from ambid import compiled\ncompiled.announce = lambda: print('first')\n"
+    "from ambid.kernel import run\nprint(run(3))\n"
+    "try:\n    run(-1)\nexcept ValueError as error:\n    print(error)\n"
+)
+
+
+def test_a_first_compilation_is_announced_once_and_a_kernel_from_the_cache_works_as_the_compiled_one(
+    tmp_path: Path,
+) -> None:
+    package = tmp_path / "ambid"
+    package.mkdir()
+    for name in ("__init__.py", "compiled.py"):
+        (package / name).write_text("" if name == "__init__.py" else (PACKAGE / name).read_text(encoding="utf-8"))
+    (package / "kernel.py").write_text(ALLOCATES)
+    printed = [
+        subprocess.run(
+            [sys.executable, "-c", SAYS], env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True
+        ).stdout.split("\n")
+        for _ in range(2)
+    ]
+    assert printed == [["first", "4.0", "below zero", ""], ["4.0", "below zero", ""]]
+
+
 def test_what_a_kernel_takes_in_is_followed_through_files() -> None:
     kernels = PACKAGE / "bearing" / "magnet" / "_kernels.py"
     found = {shown(path) for path in _imported(kernels, set())}

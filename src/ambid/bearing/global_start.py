@@ -125,7 +125,6 @@ class LikelihoodCost:
         first = problem.slices["noise"].start
         vector[first : first + len(self.model.disturbances)] = at["level"]
         work = self._workspace(problem) if shared else Workspace(problem)
-        work.gain = None  # a gain of the last one would let the result hang on the order
         value, _ = evaluate(problem, at_first_sample(problem, vector), work)
         if not np.isfinite(value):
             return None

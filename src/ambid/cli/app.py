@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ambid import compiled
 from ambid.cli import (
     acquire,
     commission,
@@ -65,6 +66,10 @@ def _global(
         typer.echo(context.get_help())
 
 
+def _say_compiling() -> None:
+    print("compiling the numerical kernels, once on this machine: some seconds", file=sys.stderr)
+
+
 def run_verb(words: Sequence[str]) -> int:
     """Parse the words, run the verb and return its exit code.
 
@@ -74,6 +79,7 @@ def run_verb(words: Sequence[str]) -> int:
     """
     plain_where_needed(sys.stdout)
     plain_where_needed(sys.stderr)
+    compiled.announce = _say_compiling if sys.stderr.isatty() else None
     command = typer.main.get_command(app)
     try:
         with command.make_context("ambid", list(words)) as context:

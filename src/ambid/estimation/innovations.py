@@ -34,12 +34,14 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
     K = near if near is not None and stable(A - near @ C) else None
     P = None if K is None else _newton(A, C, Q, R, K)
     if P is None:
-        start = _symplectic_gain(A, C, Q, R)
-        P = None if start is None or not stable(A - start @ C) else _newton(A, C, Q, R, start)
+        rough = _stable_subspace(A, C, Q, R)
+        K = None if rough is None else _gain_of(A, C, rough, R)
+        P = None if K is None or not stable(A - K @ C) else _newton(A, C, Q, R, K, rough)
     if P is None:
         from scipy.linalg import solve_discrete_are
 
-        P = solve_discrete_are(A.T, C.T, Q, R)
+        with np.errstate(invalid="ignore", over="ignore"):
+            P = solve_discrete_are(A.T, C.T, Q, R)
         # the general solver's accuracy suffers where poles crowd at one; Newton takes it to rounding
         P = _newton(A, C, Q, R, _gain_of(A, C, P, R))
         if P is None:
@@ -48,8 +50,8 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
     return Innovations(K=_gain_of(A, C, P, R), P=P, S=S)
 
 
-def _symplectic_gain(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
-    """Gain from the stable eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd."""
+def _stable_subspace(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
+    """P from the eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd."""
     n = A.shape[0]
     try:
         back = np.linalg.inv(A).T
@@ -57,15 +59,13 @@ def _symplectic_gain(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
         values, vectors = np.linalg.eig(np.vstack([np.hstack([back, left]), np.hstack([Q @ back, A + Q @ left])]))
         chosen = vectors[:, np.argsort(np.abs(values))[n:]]
         P = np.real(np.linalg.solve(chosen[:n].T, chosen[n:].T).T)
-        gain = _gain_of(A, C, 0.5 * (P + P.T), R)
     except np.linalg.LinAlgError:
         return None
-    return gain if np.all(np.isfinite(gain)) else None
+    return 0.5 * (P + P.T) if np.all(np.isfinite(P)) else None
 
 
-def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array) -> Array | None:
+def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | None = None) -> Array | None:
     """Iterate Newton-Kleinman from a stabilising gain; None where it does not settle in a few steps."""
-    before = None
     for _ in range(8):
         P = solve_lyapunov(A - K @ C, Q + K @ R @ K.T)
         # quadratic convergence: a step of 1e-7 leaves an error of about 1e-14

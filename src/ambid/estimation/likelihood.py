@@ -20,7 +20,7 @@ from ambid.estimation.sensitivity import Linearisation, Workspace, innovations, 
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
 _MOST = 60  # steps of a search
-_SETTLED = 1e-3  # squared length of a step in standard deviations below which a search has converged
+_SETTLED = 1e-5  # squared length of a step in standard deviations below which a search has converged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,7 +190,15 @@ def search(
     work = Workspace(problem) if work is None else work.of(problem)
     vector = with_linear_part(problem, start, work)
     target = _Likelihood(problem, work, tick)
-    found = damped_search(target, vector, most=most, tolerance=0.0, settled=settled, damping=1e-4)
+    found = damped_search(
+        target,
+        vector,
+        most=most,
+        tolerance=0.0,
+        settled=settled,
+        wanted=slice(0, problem.n_physical or None),
+        damping=1e-4,
+    )
     at = target.linearisation(found.theta) if np.isfinite(found.cost) else None
     if at is None:
         return _failed(problem, start)

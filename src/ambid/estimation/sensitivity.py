@@ -23,8 +23,8 @@ _TURNED = 1e-9  # least singular value, over the largest, of the scaled triangle
 
 
 class Workspace:
-    """What repeated evaluations of one problem share: scaled data, the last gain to start the next Riccati solve, and
-    the last triangle with its inverse, along whose columns the next Jacobian is taken.
+    """What repeated evaluations of one problem share: scaled data, and the last triangle with its inverse, along
+    whose columns the next Jacobian is taken.
 
     `y`: (n_used, n_outputs), scaled outputs; `w`: (n_used, n_states + n_lags n_inputs + n_outputs + 1), room for the
     states of the predictor, and what drives it: inputs at the problem's lags, y, 1; `z`: (n_used, n_lags n_inputs +
@@ -41,7 +41,6 @@ class Workspace:
         n = len(problem.model.states)
         self.w = np.hstack([np.zeros((at.size, n)), *lagged, self.y, np.ones((at.size, 1))])
         self.z = self.w[:, n:]
-        self.gain: Array | None = None
         self.turn: tuple[Array, Array] | None = None
         self._problem = problem
         self._weight, self._weighted = np.zeros((0, 0)), self.y
@@ -100,10 +99,9 @@ def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None
     from ambid.estimation.kernels import state_scan
 
     work = work or Workspace(problem)
-    predictor = assemble(problem, vector, near=work.gain, with_derivatives=False)
+    predictor = assemble(problem, vector, with_derivatives=False)
     if predictor is None:
         return None
-    work.gain = predictor.gain
     state_scan(predictor.M, work.w, predictor.x0.copy())
     e = work.y - work.w[:, : predictor.x0.size] @ predictor.C.T
     return e if np.all(np.isfinite(e[-1])) else None
@@ -262,10 +260,9 @@ def residual_blocks(
     """
     from ambid.estimation.kernels import sensitivity_scan, state_scan
 
-    predictor = assemble(problem, vector, near=work.gain)
+    predictor = assemble(problem, vector)
     if predictor is None:
         return
-    work.gain = predictor.gain
     n, p, n_y, n_used = predictor.x0.size, problem.size, work.y.shape[1], work.y.shape[0]
     # a state basis whose first states are the weighted predicted outputs with their sign turned: weighted innovations
     # are then W y plus a state, and sensitivities of innovations are read off, not multiplied
