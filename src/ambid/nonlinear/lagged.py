@@ -583,24 +583,42 @@ class LaggedFunction(ABC):
 
         NaN from where innovations diverge on.
         """
-        x = self.regressors
-        if not x.noisy.size and not self.folded:
-            return self.values(theta, rows), rows
-        z, lag, p = rows.z.copy(), self.lag, self.n_outputs
-        if self.affine:
-            from ambid.nonlinear.lagged_kernels import propagate
+        found, z = self._predicted(theta, rows)
+        if z is None:
+            return found, rows
+        measured = np.concatenate([z[: self.lag, : self.n_outputs], rows.y])
+        return found, self.rows_of(z, measured, None if self.folded else rows)
 
-            E = rows.y - self.values(theta, rows)
-            gain = -self.derivatives(theta, rows, x.noisy, np.zeros(self.n_theta, np.bool_))[1]
-            propagate(E[:, :, None], np.ascontiguousarray(gain), *self._recurrence(x.noisy), 0)
-            far = np.flatnonzero(~np.all(np.abs(E) < _FAR, axis=1))
-            if far.size:
-                E[far[0] :] = np.nan
-            z[lag:, p + x.n_inputs :] = E
-            found = rows.y - E
-        else:
-            found = self._run(theta, z, free=False)[lag:]
-        return found, self.rows_of(z, np.concatenate([z[:lag, :p], rows.y]), None if self.folded else rows)
+    def errors(self, theta: Array, rows: Rows) -> Array:
+        """Return one-step errors, shape (n, n_outputs), NaN from a divergence on."""
+        return rows.y - self._predicted(theta, rows)[0]
+
+    def _predicted(self, theta: Array, rows: Rows) -> tuple[Array, Array | None]:
+        """One-step predictions, and the signals with innovations in them if the model looks at any."""
+        x, lag, p = self.regressors, self.lag, self.n_outputs
+        if not x.noisy.size and not self.folded:
+            return self.values(theta, rows), None
+        z = rows.z.copy()
+        if not self.affine:
+            return self._run(theta, z, free=False)[lag:], z
+        from ambid.nonlinear.lagged_kernels import propagate
+
+        E = rows.y - self.values(theta, rows)
+        propagate(E[:, :, None], self._noise_gain(theta, rows), *self._recurrence(x.noisy), 0)
+        far = np.flatnonzero(~np.all(np.abs(E) < _FAR, axis=1))
+        if far.size:
+            E[far[0] :] = np.nan
+        z[lag:, p + x.n_inputs :] = E
+        return rows.y - E, z
+
+    def _noise_gain(self, theta: Array, rows: Rows) -> Array:
+        """What past innovations take off errors, (n or 1, n_outputs, n_noisy), where they enter without bends."""
+        at, out = self.regressors.noisy, np.zeros((1, self.n_outputs, self.regressors.noisy.size))
+        for block, own, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True):
+            if block.uses(at):
+                few = tuple(a[:0] for a in r) if isinstance(block, Linear) else r  # whose slopes are the same in all
+                out = out - block.derivatives(own, few, np.zeros(block.n_theta, dtype=np.bool_), at)[1]
+        return np.ascontiguousarray(out)
 
     def free_run(self, theta: Array, y: Array, u: Array) -> Array:
         """Return a run on own outputs from sample `lag` on, shape (n_samples, n_outputs); NaN where it has diverged."""

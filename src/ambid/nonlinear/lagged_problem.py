@@ -80,7 +80,7 @@ class LaggedProblem:
             if self.free:
                 yield rows.y - of.free_run(theta, y, u)[of.lag :]
             else:
-                yield rows.y - of.predict(theta, rows)[0]
+                yield of.errors(theta, rows)
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squared weighted errors and of the prior's rows; infinite where the model diverges."""
@@ -386,21 +386,13 @@ def finish(
     )
 
 
-def cautions(
-    structure: str, records: Sequence[IOData], draft: Draft, problem: LaggedProblem, found: Laplace, units: str
-) -> list[str]:
-    """Return what a reader must be told of a model without a noise model; `units` are what it has too many of."""
+def cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -> list[str]:
+    """Return what a reader must be told of any lagged model; `units` are what it has too many of."""
     out, taken = [], found.effective / problem.n_errors
     if taken > _CROWDED:
         out.append(
             f"the data determine {taken:.0%} as many numbers as there are errors: the model follows the noise, and "
             f"standard deviations are not to be trusted. Fewer {units}, or a longer record"
-        )
-    if not problem.function.regressors.noisy.size and records[0].n_inputs and not all(x.open_loop for x in records):
-        what = "the free run" if draft.free else "one-step errors"
-        out.append(
-            f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are "
-            "white, and nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
         )
     if draft.stopped_early:
         out.append(
@@ -412,3 +404,14 @@ def cautions(
             "the free run diverges on the records that the model was trained on: it predicts, but does not simulate"
         )
     return out
+
+
+def bias_caution(structure: str, records: Sequence[IOData], draft: Draft) -> list[str]:
+    """Return what a reader must be told of a model without a noise model, unless there is no feedback."""
+    if not records[0].n_inputs or all(x.open_loop for x in records):
+        return []
+    what = "the free run" if draft.free else "one-step errors"
+    return [
+        f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are white, "
+        "and nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
+    ]

@@ -14,7 +14,7 @@ from ambid.nonlinear.model import NonlinearModel
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.nonlinear.narmax.model:PolynomialNarmax.from_json",
-        "hybrid": "ambid.nonlinear.hybrid.model:HybridNarmax.from_json",
+        "hybrid": "ambid.nonlinear.hybrid_function:read_model",
         "rbf": "ambid.nonlinear.rbf_network:read_model",
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",

@@ -30,6 +30,7 @@ from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Linear, R
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
+    bias_caution,
     cautions,
     finish,
     guarded,
@@ -347,7 +348,7 @@ def _finish(
     if not np.isfinite(problem.cost(draft.theta)):
         return failed_fit("narx", records, used, seed, NO_WEIGHTS, draft.timing_s)
     found = laplace(problem, draft.theta)
-    draft.warnings += cautions("narx", records, draft, problem, found, "neurons or lags")
+    draft.warnings += [*bias_caution("narx", records, draft), *cautions(draft, problem, found, "neurons or lags")]
     covariance, origin = found.covariance, "laplace"
     if spread:
         covariance, origin = spread[0], "bootstrap"

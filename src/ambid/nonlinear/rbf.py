@@ -26,6 +26,7 @@ from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
     Laplace,
+    bias_caution,
     cautions,
     finish,
     guarded,
@@ -444,7 +445,7 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
     covariance, origin = _covariance(work, problem, found, s.uncertainty)
     if covariance is not None:
         work.warnings += _open(problem, covariance)
-    work.warnings += cautions("rbf", records, work, problem, found, "units or lags")
+    work.warnings += [*bias_caution("rbf", records, work), *cautions(work, problem, found, "units or lags")]
     work.details = {
         "condition": found.condition,
         "prior_by_output": work.prior.tolist(),

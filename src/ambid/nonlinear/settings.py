@@ -52,9 +52,9 @@ def number(says: str, low: float, high: float, default: float | None = None) -> 
     return field(default=default, metadata={"rule": _Rule(says, low, high)})
 
 
-def choice(says: str, *options: str) -> Any:
-    """Return a field for one of some words, the first of which is the default."""
-    return field(default=options[0], metadata={"rule": _Rule(says, options=options)})
+def choice(says: str, *options: str, default: str = "") -> Any:
+    """Return a field for one of some words; the first of them is the default where nothing else is said."""
+    return field(default=default or options[0], metadata={"rule": _Rule(says, options=options)})
 
 
 def rules(settings: type) -> dict[str, _Rule]:

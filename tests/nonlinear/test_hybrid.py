@@ -10,14 +10,13 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.hybrid import HybridNarmax, hybrid
-from ambid.nonlinear.hybrid.choice import chosen_noise
-from ambid.nonlinear.hybrid.function import HybridShape
-from ambid.nonlinear.hybrid.result import laplace
-from ambid.nonlinear.hybrid.train import HybridProblem, problem_at
+from ambid.nonlinear.hybrid import hybrid
+from ambid.nonlinear.hybrid_choice import choose_noise
+from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem
+from ambid.nonlinear.lagged import LaggedModel
+from ambid.nonlinear.lagged_problem import laplace
 from ambid.nonlinear.narmax import Factor, narmax
 from ambid.nonlinear.narx import narx
-from ambid.nonlinear.networks.narx_function import NarxShape
 from tests.nonlinear.narmax.systems import coefficients, polynomial, record
 
 TRUTH = {"y(t-1)": 0.5, "y(t-2)": -0.2, "u(t-1)*y(t-1)": 0.3, "u(t-2)": 0.4, "e(t-1)": 0.7}
@@ -36,8 +35,8 @@ def bent(n: int, seed: int, *, noise: float = 0.1, loop: bool = False) -> tuple[
     return u, y
 
 
-def model_of(fit: NonlinearFit) -> HybridNarmax:
-    assert isinstance(fit.model, HybridNarmax)
+def model_of(fit: NonlinearFit) -> LaggedModel:
+    assert isinstance(fit.model, LaggedModel)
     return fit.model
 
 
@@ -130,53 +129,30 @@ def test_a_polynomial_truth_gets_no_neurons_and_is_told() -> None:
     assert [x["neurons"] for x in found.details["tried"]][:3] == [0, 1, 2]
 
 
-def random_model(p: int, m: int, *, deep: bool, ne: int = 2) -> tuple[HybridShape, np.ndarray, np.ndarray, np.ndarray]:
-    """A shape with random numbers and signals."""
-    rng = np.random.default_rng(3)
-    y1, y2, u1 = Factor("y", 0, 1), Factor("y", p - 1, 2), Factor("u", m - 1, 1)
-    terms = tuple((tuple(sorted((y1, y1))), (u1,), tuple(sorted((y2, u1))))[: 3 - o] for o in range(p))
-    network = NarxShape(n_outputs=p, n_inputs=m, ny=2, nu=2, nk=0, neurons=3)
-    shape = HybridShape(terms=terms, ne=ne, network=network, deep=deep)
-    theta = 0.3 * rng.standard_normal(shape.n_theta)
-    return shape, theta, rng.standard_normal((200, p)), rng.standard_normal((200, m))
-
-
 @pytest.mark.parametrize(("p", "m", "deep"), [(1, 1, False), (1, 1, True), (2, 1, False), (2, 2, True)])
 def test_slopes_through_the_innovations_are_exact(p: int, m: int, deep: bool) -> None:
-    shape, theta, y, u = random_model(p, m, deep=deep)
-    rows = shape.rows(y, u)
-    E, T = shape.innovations(theta, rows)
-    D = shape.slopes(theta, rows, E, T, slice(None))
-    assert len(set(shape.names)) == shape.n_theta
-    for k in range(shape.n_theta):
+    rng = np.random.default_rng(3)
+    y1, y2, u1 = Factor("y", 0, 1), Factor("y", p - 1, 2), Factor("u", m - 1, 3)  # a lag that the network does not see
+    terms = tuple((tuple(sorted((y1, y1))), (u1,), tuple(sorted((y2, u1))))[: 3 - o] for o in range(p))
+    of = HybridFunction(terms=terms, ne=2, p=p, m=m, ny=2, nu=2, nk=0, neurons=3, deep=deep)
+    theta, y, u = 0.3 * rng.standard_normal(of.n_theta), rng.standard_normal((200, p)), rng.standard_normal((200, m))
+    rows = of.rows(y, u)
+    assert of.affine != deep
+    assert len(set(of.names)) == of.n_theta
+    D = of.slopes(theta, of.predict(theta, rows)[1], free=False)
+    for k in range(of.n_theta):
         d = np.zeros(theta.size)
         d[k] = 1e-5
-        four = [shape.innovations(theta + s * d, rows)[0] for s in (1, -1, 2, -2)]
-        slope = -(8 * (four[0] - four[1]) - (four[2] - four[3])) / 12e-5
+        four = [of.predict(theta + s * d, rows)[0] for s in (1, -1, 2, -2)]
+        slope = (8 * (four[0] - four[1]) - (four[2] - four[3])) / 12e-5
         np.testing.assert_allclose(D[:, :, k], slope, atol=1e-8 * max(1.0, np.abs(D).max()))
-    head = shape.slopes(theta, rows, E, T, slice(0, 77))
-    tail = shape.slopes(theta, rows, E, T, slice(77, None), head[-shape.ne :])
-    np.testing.assert_allclose(np.concatenate([head, tail]), D, rtol=1e-12, atol=1e-12)
 
 
-def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior() -> None:
-    shape, theta, y, u = random_model(2, 1, deep=False, ne=1)
-    held = np.arange(200) < 150
-    at = problem_at(shape, ((y, u), (y[:50], u[:50])), theta, 2.0, counted=(held, np.ones(50, dtype=bool)))
-    at = replace(at, weight=np.array([[0.5, 0.0], [-1.5, 2.0]]))
-    R = at.triangle(theta)
-    rows = shape.rows(y, u)
-    E, T = shape.innovations(theta, rows)
-    J = shape.slopes(theta, rows, E, T, slice(None))
-    n = 150 - shape.lag
-    weighted = np.einsum("op,tpk->tok", at.weight, np.dstack([J, E]))
-    first, second = (weighted[:k].reshape(-1, theta.size + 1) for k in (n, 50 - shape.lag))
-    prior = np.hstack([np.diag(at.precision), -(at.precision * theta)[:, None]])
-    whole = np.concatenate([first, second, prior])
-    np.testing.assert_allclose(R.T @ R, whole.T @ whole, rtol=1e-9, atol=1e-9)
-    assert at.cost(theta) == pytest.approx(float(np.sum(whole[:, -1] ** 2)))
-    assert not np.any(at.precision[: shape.n_linear])
-    assert isinstance(at, HybridProblem)
+def test_polynomial_and_noise_model_have_no_prior() -> None:
+    of = two_lags(ne=1)
+    assert not np.any(of.precision(2.0)[: of.n_linear])
+    of = replace(of, neurons=1)
+    assert np.all(of.precision(2.0)[of.n_linear :] == 0.5)
 
 
 def two_axes(n: int, seed: int, c: np.ndarray, rho: float) -> tuple[np.ndarray, np.ndarray]:
@@ -190,10 +166,9 @@ def two_axes(n: int, seed: int, c: np.ndarray, rho: float) -> tuple[np.ndarray, 
     return y, u
 
 
-def two_lags(*, ne: int) -> HybridShape:
+def two_lags(*, ne: int) -> HybridFunction:
     terms = tuple(((Factor("y", o, 1),), (Factor("u", o, 1),)) for o in range(2))
-    network = NarxShape(n_outputs=2, n_inputs=2, ny=1, nu=1, nk=1, neurons=0)
-    return HybridShape(terms=terms, ne=ne, network=network)
+    return HybridFunction(terms=terms, ne=ne, p=2, m=2, ny=1, nu=1, nk=1, neurons=0)
 
 
 def test_innovations_that_hang_together_are_weighted_as_such() -> None:
@@ -202,9 +177,10 @@ def test_innovations_that_hang_together_are_weighted_as_such() -> None:
     shape, z, off = two_lags(ne=1), [], []
     for seed in range(seeds):
         y, u = two_axes(300, seed, c, rho)
-        problem = problem_at(shape, ((y, u),), truth, 3.0)
+        problem = hybrid_problem(shape, ((y, u),), truth, 3.0)
         theta = search(problem, truth, stage="", most=30).theta
-        P, noise, *_ = laplace(problem, theta)
+        found = laplace(problem, theta)
+        P, noise = found.covariance, found.noise
         assert P is not None
         np.testing.assert_allclose(noise[0, 1] / np.sqrt(noise[0, 0] * noise[1, 1]), rho, atol=0.03)
         z.append((theta - truth) / np.sqrt(np.diag(P)))
@@ -220,8 +196,8 @@ def test_the_order_of_the_noise_model_pays_for_all_outputs_and_is_paid_by_all() 
     start, orders = np.array([0.5, 1.0, 0.3, 1.0]), []
     for c in (0.15, 0.0):
         for seed in range(6):
-            problem = problem_at(two_lags(ne=0), (two_axes(1000, seed, c * np.eye(2), 0.0),), start, 3.0)
-            orders.append(chosen_noise(problem, start, "ebic", None)[0].ne)
+            problem = hybrid_problem(two_lags(ne=0), (two_axes(1000, seed, c * np.eye(2), 0.0),), start, 3.0)
+            orders.append(choose_noise(problem, start, 3.0, "ebic", None)[0].ne)
     assert orders[:6].count(1) >= 5  # gain about 2 n c^2 = 45, price 4 log n = 28
     assert orders[6:].count(0) == 6
 
