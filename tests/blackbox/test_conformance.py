@@ -14,8 +14,8 @@ from ambid.blackbox.fit_file import fit_from_json, fit_text
 from ambid.blackbox.model import response_covariance
 from ambid.blackbox.structures import STRUCTURES, Structure
 from ambid.errors import EstimationError
-from ambid.validate.blackbox import judged
-from ambid.validate.blackbox.predictor import innovations_form
+from ambid.validate.blackbox import judge
+from ambid.validate.blackbox_predictor import innovations_form
 from tests.blackbox import systems
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 40, 12)
@@ -131,7 +131,7 @@ def test_units_of_the_channels_only_scale_the_result(s: Structure) -> None:
 
 @pytest.mark.parametrize("s", ALL, ids=names(ALL))
 def test_saved_and_loaded_results_are_equal(s: Structure) -> None:
-    found = judged(usual(s), data_for(s), second=data_for(s, seed=1))
+    found = judge(usual(s), data_for(s), second=data_for(s, seed=1))
     text = fit_text(found)
     back = fit_from_json(json.loads(text), "here")
     np.testing.assert_array_equal(back.model.theta, found.model.theta)
@@ -147,7 +147,7 @@ def test_saved_and_loaded_results_are_equal(s: Structure) -> None:
 
 @pytest.mark.parametrize("s", ALL, ids=names(ALL))
 def test_a_second_record_of_the_same_plant_is_fitted_as_well(s: Structure) -> None:
-    found = judged(usual(s), data_for(s), second=data_for(s, seed=7))
+    found = judge(usual(s), data_for(s), second=data_for(s, seed=7))
     assert found.validation is not None
     here, there = found.fit["place"].one_step, found.validation["place"]["one_step"]["fit"]
     assert here == pytest.approx(there, abs=0.05)

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from ambid.blackbox.data import IOData
 from ambid.blackbox.structures import structure
 from ambid.report.fit_figures import fit_overview
-from ambid.validate.blackbox import judged
+from ambid.validate.blackbox import judge
 
 POLES, ZEROS = 0.9 * np.exp(0.4j), 0.8 * np.exp(1.2j)
 
@@ -29,7 +29,7 @@ def data() -> IOData:
 
 
 def test_poles_and_zeros_are_drawn_with_their_regions(data: IOData) -> None:
-    fit = judged(structure("oe").estimator(data, {"nb": 3, "nf": 2, "nk": 1}), data)
+    fit = judge(structure("oe").estimator(data, {"nb": 3, "nf": 2, "nk": 1}), data)
     (axes,) = (a for a in fit_overview(fit, data).findobj(Axes) if "zeros" in a.get_title())
     regions = [p for p in axes.patches if isinstance(p, Ellipse)]
     centres = np.array([complex(*p.get_center()) for p in regions])

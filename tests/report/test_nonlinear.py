@@ -20,7 +20,7 @@ from ambid.report.fit_text import (
     term_lines,
 )
 from ambid.report.nonlinear_figures import bars_of, columns_of, nonlinear_overview, traces_of
-from ambid.validate.nonlinear import judged
+from ambid.validate.nonlinear import judge
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
 
 
@@ -35,7 +35,7 @@ class Renamed:
 @pytest.fixture(scope="module")
 def fit() -> NonlinearFit:
     data = squared(500, 1)
-    return judged(narmax([data], {"selection": "all", "pruning": "none", "ny": 3, "nu": 3, "ne": 0}), [data])
+    return judge(narmax([data], {"selection": "all", "pruning": "none", "ny": 3, "nu": 3, "ne": 0}), [data])
 
 
 def test_the_first_twenty_terms_with_ratio_and_spread(fit: NonlinearFit) -> None:

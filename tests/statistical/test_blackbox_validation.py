@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.polynomial import arma, armax, arx, oe
-from ambid.validate.blackbox import judged
-from ambid.validate.blackbox.gradient import gradient
-from ambid.validate.blackbox.predictor import errors
-from ambid.validate.blackbox.residual_tests import correlations
+from ambid.validate.blackbox import judge, residuals_of
+from ambid.validate.blackbox_predictor import errors, gradient
+from ambid.validate.residuals import correlations
 from tests.validate.blackbox.fits import io, polynomial, run
 
 RUNS, N = 200, 400
@@ -43,7 +42,7 @@ def coloured_fits():
     for seed in range(RUNS):
         data = record(COLOURED, seed)
         plain = oe(data, {"nb": 2, "nf": 2, "nk": 1})
-        out.append((plain, judged(plain, data)))
+        out.append((plain, judge(plain, data)))
     return out
 
 
@@ -57,7 +56,7 @@ def p_values(name):
 
     def fit(seed):
         estimator, data, orders = make[name](seed)
-        return judged(estimator(data, orders), data)
+        return judge(estimator(data, orders), data)
 
     fits = [f for _, f in coloured_fits()] if name == "oe, coloured" else [fit(seed) for seed in range(RUNS)]
     tests = ("residuals_white", "residuals_uncorrelated", "feedback")
@@ -78,16 +77,18 @@ def test_false_alarms_are_as_rare_as_promised(name, test):
     assert np.mean(p < 1e-3) <= 0.01
 
 
+def shown(fit, data, n_lags):
+    found = errors(fit, data)
+    residuals = residuals_of(fit, data, found, gradient(fit, data, found))
+    return correlations(residuals, data.inputs, data.outputs, n_lags=n_lags)
+
+
 def test_bands_hold_99_percent_of_the_correlations():
     inside = []
     for seed in range(60):
         data = record(ARX, seed)
         fit = arx(data, {"na": 2, "nb": 2, "nk": 1})
-        found = errors(fit, data)
-        auto, cross = correlations(fit, data, found, gradient(fit, data, found))
-        assert (auto.kind, cross.kind) == ("auto", "cross")
-        assert cross.lags[0] == -cross.lags[-1]
-        inside += [np.mean(np.abs(x.values) <= x.band) for x in (auto, cross)]
+        inside += [np.mean(np.abs(x.values) <= x.band) for x in shown(fit, data, 30)]
     assert 0.98 < np.mean(inside) < 0.999
 
 
@@ -97,8 +98,7 @@ def test_the_band_of_an_autoregression_is_the_published_one():
     rng = np.random.default_rng(0)
     data = io(np.zeros((n, 0)), run(polynomial(A=(1, -a), B=(), F=()), np.zeros((n, 0)), rng.standard_normal((n, 1))))
     fit = arma(data, {"na": 1, "nc": 0})
-    found = errors(fit, data)
-    band = correlations(fit, data, found, gradient(fit, data, found), n_lags=6)[0].band
+    band = shown(fit, data, 6)[0].band
     k = np.arange(1, 7)
     wanted = 2.5758 * np.sqrt((1 - (1 - a**2) * a ** (2 * k - 2)) / n)
     np.testing.assert_allclose(band, wanted, rtol=0.05)

@@ -12,12 +12,12 @@ from functools import cache
 import numpy as np
 
 from ambid.bearing.magnet.likelihood import search
-from ambid.bearing.magnet.residual_test import whiteness
 from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.job.bearing_estimate import judged
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
+from ambid.validate.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 
 RUNS, SAMPLES = 40, 3000

@@ -10,7 +10,7 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.report.tables import comparison_text
 from ambid.validate.comparison import compare
-from ambid.validate.holdout import folds, hold_out
+from ambid.validate.orders import folds, hold_out
 from tests.validate.blackbox.fits import io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))

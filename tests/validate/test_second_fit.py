@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.nonlinear import judged, validation
-from ambid.validate.second_fit import objections
+from ambid.validate.nonlinear import judge, validation
+from ambid.validate.second_record import objections
 from tests.nonlinear.systems import smooth
 
 
 @pytest.fixture(scope="module")
 def fit():
     data = smooth()
-    return judged(narmax([data], {}), [data])
+    return judge(narmax([data], {}), [data])
 
 
 def test_a_record_of_the_same_plant_has_nothing_against_it(fit):

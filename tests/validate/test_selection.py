@@ -7,8 +7,7 @@ import pytest
 
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.validate.arx_orders import arx_candidates
-from ambid.validate.selection import select
+from ambid.validate.orders import arx_candidates, select
 from tests.validate.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = {

@@ -74,5 +74,3 @@ def test_the_figure_shows_every_pole():
 def test_what_is_unknown_is_refused():
     with pytest.raises(EstimationError, match="pbsid"):
         stabilisation(record(n=500), "pbsidd")
-    with pytest.raises(EstimationError, match="tolerances"):
-        stabilisation(record(n=500), shape=2.0)

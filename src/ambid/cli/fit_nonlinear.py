@@ -102,7 +102,7 @@ def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
 
     Returns a line for each reason; empty where it holds, or was not judged there.
     """
-    from ambid.validate.second_fit import objections
+    from ambid.validate.second_record import objections
 
     judged: Any = found.validation
     return [] if judged is None else [f"it does not hold on the second record: {x}" for x in objections(found, judged)]

@@ -113,8 +113,8 @@ def _judged_fit(
     from ambid.job import read_data
     from ambid.job.blackbox import same_bench
     from ambid.report.fit_text import second_lines
-    from ambid.validate.blackbox.judge import validation
-    from ambid.validate.second_fit import objections
+    from ambid.validate.blackbox import validation
+    from ambid.validate.second_record import objections
 
     found: Mapping[str, Any]
     data = read_data(record, known.inputs, known.outputs, part=part, rate_hz=rate, gaps=gaps)

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ambid.bearing.magnet.likelihood import BearingFit
-    from ambid.bearing.magnet.residual_test import WhitenessTest
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
     from ambid.bearing.magnet.uncertainty import BearingUncertainty
     from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+    from ambid.validate.nonlinear_bearing import WhitenessTest
 
 _P_LEAST = 1e-3  # as for the linear model
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -33,8 +33,8 @@ def judged(
     import numpy as np
 
     from ambid.bearing.magnet.problem import LEVELS
-    from ambid.bearing.magnet.residual_test import whiteness
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.validate.nonlinear_bearing import whiteness
 
     problem, names = fit.problem, _names(fit)
     tests = [whiteness(fit, r) for r in range(len(problem.records))]

@@ -67,7 +67,7 @@ def fit(
     orders : Mapping[str, int, "auto" or tuple of int], optional
         A tuple has one number for each input. None: all are chosen by `criterion`.
     criterion : str, optional
-        For the choice of orders, see `ambid.validate.selection`.
+        For the choice of orders, see `ambid.validate.orders`.
     fixed : Mapping[str, float], optional
         Coefficients that are known, for polynomial structures, by name (``a1``, ``b2``).
     at_rest : bool, optional
@@ -105,7 +105,7 @@ def fit(
         If nothing can be estimated.
     """
     from ambid.estimation.threads import one_thread
-    from ambid.validate.blackbox import judged
+    from ambid.validate.blackbox import judge
 
     say = tick or silent
     of = structure(structure_name)
@@ -131,7 +131,7 @@ def fit(
     with one_thread():
         chosen: dict[str, object] = {}
         if orders is None:
-            from ambid.validate.selection import select
+            from ambid.validate.orders import select
 
             say("orders", 0.0)
             tried = count()
@@ -147,7 +147,7 @@ def fit(
         found = of.estimator(data, orders, **options)
         laps["fit"], last = time.perf_counter() - last, time.perf_counter()
         say("check")
-        found = judged(found, data, second=second)
+        found = judge(found, data, second=second)
         laps["checks"] = time.perf_counter() - last
     return replace(found, timing_s=laps, details={**found.details, **chosen})
 
@@ -308,7 +308,7 @@ def same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:
 
 
 def _check_criterion(criterion: str, orders: Orders | None) -> None:
-    from ambid.validate.selection import Criterion
+    from ambid.validate.orders import Criterion
 
     known = get_args(Criterion)
     if criterion not in known:

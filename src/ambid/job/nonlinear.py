@@ -90,7 +90,7 @@ def fit_nonlinear(
         If nothing can be estimated.
     """
     from ambid.estimation.threads import one_thread
-    from ambid.validate.nonlinear import judged
+    from ambid.validate.nonlinear import judge
 
     say = tick or silent
     of = nonlinear_structure(structure_name)
@@ -115,7 +115,7 @@ def fit_nonlinear(
         found = of.estimator(data, settings or {}, seed=seed, tick=part_of(say, 0.0, _SEARCH))
         laps["fit"], last = time.perf_counter() - last, time.perf_counter()
         say("check", _SEARCH)
-        found = judged(found, data, second=second)
+        found = judge(found, data, second=second)
         say("check", 1.0)
         laps["checks"] = time.perf_counter() - last
     return replace(found, timing_s=laps, details={**found.details, "fit_timing_s": dict(found.timing_s)})

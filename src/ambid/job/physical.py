@@ -132,17 +132,21 @@ def judged(
 
     from ambid.bearing.result import estimate_of
     from ambid.estimation.sensitivity import innovations
-    from ambid.validate.agreement import agreement
-    from ambid.validate.assumptions import assumption_checks
-    from ambid.validate.checks import physical_checks, residual_checks
-    from ambid.validate.prediction import fit_of, simulation_error
+    from ambid.validate.physical import (
+        agreement,
+        assumption_checks,
+        innovation_checks,
+        physical_checks,
+        simulation_error,
+    )
+    from ambid.validate.residuals import fit_of
 
     problem = fit.problem
     e = innovations(problem, fit.vector)
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     moved = agreement(fit)
-    checks = residual_checks(fit, e, known, moved)
+    checks = innovation_checks(fit, e, known, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
     checks |= assumption_checks(fit, known, delay_how)

@@ -38,7 +38,7 @@ from ambid.report.drawing import (
 )
 from ambid.report.fit_text import pole_lines, response_unit
 from ambid.report.numbers import sized
-from ambid.validate.blackbox.predictor import innovations_form, plant_form
+from ambid.validate.blackbox_predictor import innovations_form, plant_form
 from ambid.validate.stabilisation import ModePole, Stabilisation
 
 if TYPE_CHECKING:

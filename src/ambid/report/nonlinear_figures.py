@@ -32,9 +32,8 @@ from ambid.report.drawing import (
 from ambid.report.fit_text import is_weight
 from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
-from ambid.validate.nonlinear.judge import leaves_colour_open
-from ambid.validate.nonlinear.residual_tests import Correlation, correlations, material
-from ambid.validate.nonlinear.runs import beyond, model_of, run
+from ambid.validate.nonlinear import beyond, leaves_colour_open, model_of, residuals_of, run
+from ambid.validate.residuals import Correlation, correlations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -153,7 +152,7 @@ def correlations_of(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correl
     found = [run(fit, x) for x in records]
     if not all(x.finite for x in found):
         return []
-    prepared = material(fit, records, found, coloured=leaves_colour_open(fit, records, found))
+    prepared = residuals_of(fit, records, found, coloured=leaves_colour_open(fit, records, found))
     return [] if prepared is None else correlations(prepared, records[0].inputs, records[0].outputs)[:_MOST]
 
 

@@ -13,9 +13,8 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.validate.blackbox import judged
-from ambid.validate.holdout import HELD_OUT, hold_out
-from ambid.validate.selection import select
+from ambid.validate.blackbox import judge
+from ambid.validate.orders import HELD_OUT, hold_out, select
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,7 +91,7 @@ def compare(
     """Fit structures to the same samples and judge them on others.
 
     `candidates`: structures with their orders; None chooses them by `criterion`; `second`: other data to judge on; then
-    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validate.selection.select`; `tick`:
+    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validate.orders.select`; `tick`:
     called with the structure before each fit; may raise to interrupt. Returns a structure that cannot be fitted is in
     it, with the reason.
     """
@@ -132,7 +131,7 @@ def _entry(name: str, orders: Orders | None, fitted: IOData, other: IOData, crit
             orders = select(name, fitted, criterion=criterion).orders
         fit = structure(name).estimator(fitted, orders)
         seconds = time.perf_counter() - start
-        fit = judged(fit, fitted, second=other)
+        fit = judge(fit, fitted, second=other)
     except EstimationError as refusal:
         return Entry(
             structure=name,

@@ -1,27 +1,92 @@
-"""Residual tests: is anything left in the innovations that the past explains?
+"""How large residuals are, and whether anything is left in them that the past explains: tests, and their words.
 
-Both tests are score tests: lagged signals are added to the weighted Jacobian as further regressors of the innovations,
-and the fall of their sum of squares is chi-squared with as many degrees of freedom if the model is right. Because the
-regressors compete with the Jacobian, the estimated numbers are accounted for, and because only the past is used,
-feedback does not disturb them: future inputs do depend on present innovations when a controller is at work (Ljung 1999,
-sec. 16.6).
+Every test is a score test. The residuals of a consistent estimate are e0 - J (theta - theta0): with J projected out of
+the regressors, what is left does not see the error of the estimate, whichever estimator made it (Neyman's C(alpha)
+test; for innovations Ljung 1999, sec. 16.6, Soederstrom and Stoica 1989, sec. 11.2). If the model is right, the part of
+the residual that the regressors explain is chi-squared, and each correlation is normal with the variance computed here.
+Regressors are the past alone, so that feedback does not disturb the test: future inputs do depend on present residuals
+when a controller is at work.
+
+The suite for black-box and nonlinear fits tests the residual e against its own past and against past inputs. Linear
+correlations miss what a nonlinear model leaves over, as a residual that holds u^2 is uncorrelated with u: so its e is
+tested against past u^2 and past e u as well, and e^2 against past u^2 (Billings and Voon 1986). Whether inputs depend
+on past residuals is a question of its own, about the loop. Outputs are tested one by one, over all records together,
+and their p-values joined by Bonferroni's rule.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.estimation.likelihood import Fit, weight_of
-from ambid.estimation.linear import column_sizes
-from ambid.estimation.sensitivity import Products, Workspace, products
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check, OutputFit
+from ambid.estimation.linear import column_sizes, directions, triangle_of
 
 P_LEAST = 1e-3  # 99.9 % bounds
-_WHITE_LAGS = (1, 2, 3, 5, 8, 13)
-_BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither record nor priors see
-_SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
+_SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
+_SAME = 1e-6  # the same where several residuals are tested together: lags of a slow input are nearly one column
+_PREDICTED = 1e-16  # power from which a residual is more than rounding
+_DEPENDENT = 1e-9  # singular value from which a direction of J counts
+LEAST = 60  # samples of a record from which its residuals are tested
+MOST = 2e7  # numbers in a test's regressors: of longer records the last part is tested
+_WHITE_LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 13, 16, 20, 25)
+_PRODUCT_LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
+_INPUT_LAGS, _LONGEST = 16, 400
+_LOOP_LAGS, _OWN_LAGS = 10, 20
+_NORMAL_99 = 2.5758293035489004
+
+Sizes = list[dict[str, float]]
+"""Of each output: ``fit``, 1 - |e| / |y - mean|, and ``rmse``, SI."""
+
+
+def fit_of(error: Array, y: Array) -> Array:
+    """Return ``1 - |e| / |y - mean|`` of each column: 1 is perfect, 0 as good as the mean.
+
+    `error`, `y`: (n_samples, n_outputs). Returns (n_outputs,).
+    """
+    spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
+    return np.asarray(1 - np.linalg.norm(error, axis=0) / np.where(spread > 0, spread, np.nan))
+
+
+def error_sizes(errors: Sequence[Array], outputs: Sequence[Array]) -> Sizes:
+    """Return fit and root mean square error of each output over several records.
+
+    `errors`, `outputs`: (n_samples, n_outputs), SI, one for each record. The fit takes the mean of each record: a level
+    that differs from record to record does not help.
+    """
+    e, y = np.concatenate(errors), np.concatenate([x - x.mean(axis=0) for x in outputs])
+    fits, rmse = fit_of(e, y), np.sqrt(np.mean(e**2, axis=0))
+    return [{"fit": float(f), "rmse": float(s)} for f, s in zip(fits, rmse, strict=True)]
+
+
+def output_fits(
+    outputs: Sequence[str], one_step: Sizes | None, simulation: Sizes | None, noise: Array
+) -> dict[str, OutputFit]:
+    """Return how well each output is explained; `noise` is the covariance of the innovations."""
+    sd = np.sqrt(np.maximum(np.diag(noise), 0.0))
+    return {
+        name: OutputFit(
+            one_step=float("nan") if one_step is None else one_step[j]["fit"],
+            simulation=None if simulation is None else simulation[j]["fit"],
+            innovation_sd=float(sd[j]),
+        )
+        for j, name in enumerate(outputs)
+    }
+
+
+def refuse_constant(second: IOData) -> None:
+    """Refuse a second record on which nothing can be judged."""
+    for name, y in zip(second.outputs, second.y.T, strict=True):
+        if not np.any(y != y[0]):
+            raise EstimationError(
+                f"output {name!r} is constant over the second record; nothing can be judged on it. Give another record"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +98,7 @@ class ResidualTest:
     degrees: int  # degrees of freedom
     largest: float  # largest correlation coefficient among the tested pairs, in magnitude
     largest_lag: int  # its lag in samples
+    channel: str = ""  # whose residual, or which input, this is the worst of
 
     @property
     def passed(self) -> bool:
@@ -40,75 +106,458 @@ class ResidualTest:
         return self.p >= P_LEAST
 
 
-def residual_tests(fit: Fit, e: Array) -> tuple[ResidualTest, ResidualTest]:
-    """Test the innovations against their own past, and against past inputs.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Score:
+    """Outcome of a score test."""
 
-    `e`: (n_used, n_outputs), innovations at the fit, scaled.
+    p: float  # probability of at least this much if the model is right
+    statistic: float
+    degrees: int
+    correlation: Array  # (n_regressors,), correlation coefficient of the residual with each regressor
+    # (n_regressors,), its standard deviation if the model is right; smaller than 1/sqrt(N) where estimated numbers
+    # take part
+    sd: Array
+
+
+def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None) -> Score:
+    """Test whether regressors explain a residual of unknown variance and any mean.
+
+    `e`: (n_used,); `J`: (n_used, n_directions), derivative of the prediction by what was estimated; `regressors`:
+    (n_used, n_regressors), known before each residual, or, where the residuals have a `colour` (see `autoregression`),
+    independent of all of them.
     """
-    problem, weight = fit.problem, weight_of(fit.covariance)
-    white, n = e @ weight.T, len(e)
-    u = problem.u[problem.skip :: problem.stride] / problem.scales.input
-    longest = max(2, n // 20)
-    own = tuple(k for k in _WHITE_LAGS if k < n // 10)
-    inputs = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
-    lagged = np.hstack([_lagged(white, own), _lagged(u, inputs)])
-    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
-    work = fit.work if fit.work is not None else Workspace(problem)
-    found = products(problem, fit.vector, weight, work.of(problem), lagged)
-    if found is None:
-        raise ValueError("the fit has no predictor; it has failed")
-    first = len(own) * white.shape[1]
-    return (
-        _score_test(fit, found, white, lagged, own, slice(0, first)),
-        _score_test(fit, found, white, lagged, inputs, slice(first, None)),
-    )
-
-
-def _score_test(
-    fit: Fit, found: Products, white: Array, lagged: Array, lags: tuple[int, ...], which: slice
-) -> ResidualTest:
-    """Score test of some lagged columns as further regressors of every whitened innovation."""
     from scipy.special import chdtrc
 
-    columns = lagged[:, which]
-    statistic, degrees = _explained(fit, found, columns.T @ columns, which)
-    correlation = (white.T @ columns) / np.linalg.norm(white, axis=0)[:, None]
-    place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
-    return ResidualTest(
-        p=float(chdtrc(max(degrees, 1), statistic)),
+    n, rows = e.size, np.hstack([J, np.ones((e.size, 1)), regressors, e[:, None]])
+    colour = None if colour is None or colour.size == 1 else colour
+    if colour is None:  # inner products are all that counts: those of the triangle are the same
+        rows = triangle_of([rows])
+    L, rest, rank = _project(rows, J.shape[1] + 1)
+    power = float(rest @ rest)
+    if power <= _PREDICTED * float(rows[:, -1] @ rows[:, -1]) or not L.shape[1]:
+        nothing = np.zeros(L.shape[1])
+        return Score(p=1.0, statistic=0.0, degrees=0, correlation=nothing, sd=nothing)
+    variance = power / max(n - rank, 1)
+    inner = rest @ L
+    half, z = _explain(L, inner, _SEEN)
+    if colour is None:
+        spread = np.sqrt(np.sum(L**2, axis=0))
+        statistic = float(z @ z) / variance
+    else:
+        M = filter_backwards(L, colour)
+        gain = variance / power_gain(colour)
+        spread = np.sqrt(np.sum(M**2, axis=0) * gain / variance)
+        W = triangle_of([M @ half])
+        statistic = float(np.sum(np.linalg.lstsq(W.T, z, rcond=1e-8)[0] ** 2)) / gain
+    return Score(
+        p=float(chdtrc(z.size, statistic)) if z.size else 1.0,
         statistic=statistic,
-        degrees=degrees,
-        largest=float(np.abs(correlation[place])),
-        largest_lag=lags[int(place[1]) // (columns.shape[1] // len(lags))],
+        degrees=z.size,
+        correlation=inner / np.sqrt(power),
+        sd=np.asarray(spread * np.sqrt(variance / power)),
     )
 
 
-def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
-    """Columns of all signals at all lags, lag by lag, zero before the record."""
-    out = np.zeros((signals.shape[0], len(lags) * signals.shape[1]))
-    for j, lag in enumerate(lags):
-        out[lag:, j * signals.shape[1] : (j + 1) * signals.shape[1]] = signals[:-lag]
-    return out
+def joint_score(slopes: Array, residuals: Array, regressors: Array) -> tuple[float, float, int]:
+    """Test whether regressors explain any of several residuals of unit variance.
 
-
-def _explained(fit: Fit, found: Products, inner: Array, which: slice) -> tuple[float, int]:
-    """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
-
-    What the Jacobian and the priors explain is taken off by the Schur complement of their products, which lose no
-    digits because the Jacobian is nearly orthonormal there.
+    `slopes`: (n_used, n_outputs, n_directions); `residuals`: (n_used, n_outputs); `regressors`: (n_used,
+    n_regressors). Returns p, the statistic and its degrees of freedom.
     """
-    p, (n_y, _, _) = fit.problem.size, found.cross.shape
-    prior = fit.J_prior @ found.turn
-    own = found.rows[:p, :p] + prior.T @ prior
-    pull = found.rows[:p, p] + prior.T @ fit.r_prior
-    cross = np.hstack([found.cross[o, :p, which] for o in range(n_y)])
-    size = column_sizes(np.sqrt(np.diag(own))[None, :])
-    values, vectors = np.linalg.eigh(own / np.outer(size, size))
-    seen = values > _BLIND * values[-1]
-    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([cross, pull]) / size[:, None])
-    rest = np.kron(np.eye(n_y), inner) - factor[:, :-1].T @ factor[:, :-1]
-    left = np.concatenate([found.cross[o, p, which] for o in range(n_y)]) - factor[:, :-1].T @ factor[:, -1]
-    values, vectors = np.linalg.eigh(rest)
-    kept = values > _SAME**2
-    inside = (vectors[:, kept].T @ left) / np.sqrt(values[kept])
-    return float(inside @ inside), int(np.count_nonzero(kept))
+    from scipy.special import chdtrc
+
+    (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[1]
+    rows = np.zeros((n, n_y, p + n_y * width + 1))
+    rows[:, :, :p], rows[:, :, -1] = slopes, residuals
+    for o in range(n_y):
+        rows[:, o, p + o * width : p + (o + 1) * width] = regressors
+    L, rest, _ = _project(triangle_of([rows.reshape(n * n_y, -1)]), p)
+    _, z = _explain(L, rest @ L, _SAME)
+    statistic = float(z @ z)
+    return (float(chdtrc(z.size, statistic)) if z.size else 1.0), statistic, z.size
+
+
+def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array | None) -> Score:
+    """Test whether instruments explain a residual that feedback makes depend on `J`.
+
+    There J cannot be projected out, because the noise is part of it. Instead only those combinations of the instruments
+    count that are orthogonal to J, so that the error of the estimate does not reach them (the overidentification
+    test of Sargan 1958). Correlations are those with the instruments (n_used, n_regressors), independent of all noise.
+    """
+    centred, rest = instruments - instruments.mean(axis=0), e - e.mean()
+    L = centred / column_sizes(centred)
+    u, s, _ = np.linalg.svd(L.T @ (J / column_sizes(J)))
+    rank = int(np.count_nonzero(s > _DEPENDENT * max(float(s[0]), 1e-300))) if s.size else 0
+    inner = score(rest, np.zeros((e.size, 0)), L @ u[:, rank:], colour=colour)
+    power = float(np.linalg.norm(rest))
+    return Score(
+        p=inner.p,
+        statistic=inner.statistic,
+        degrees=inner.degrees,
+        correlation=rest @ L / power if power > 0 else np.zeros(L.shape[1]),
+        sd=np.full(L.shape[1], 1 / np.sqrt(e.size)),
+    )
+
+
+def _project(rows: Array, n_base: int) -> tuple[Array, Array, int]:
+    """Regressors of unit length and residual (the last column), each less what the base columns explain; their rank."""
+    base = rows[:, :n_base]
+    Q, R = np.linalg.qr(base / column_sizes(base))
+    found = directions(np.asarray(R))
+    Q = Q @ found.U[:, found.s > _DEPENDENT * max(found.s[0], 1e-300)] if found.s.size else Q
+    L, e = rows[:, n_base:-1], rows[:, -1]
+    L = L / column_sizes(L)
+    for _ in range(2):  # twice is enough (Kahan): the first pass loses what cancels
+        L = L - Q @ (Q.T @ L)
+    return L, e - Q @ (Q.T @ e), Q.shape[1]
+
+
+def _explain(L: Array, inner: Array, least: float) -> tuple[Array, Array]:
+    """Orthonormal combinations of regressors, one a column, and their inner products with the residual."""
+    _, s, right = np.linalg.svd(triangle_of([L]), full_matrices=False)
+    half = right[s > least].T / s[s > least]
+    return half, inner @ half
+
+
+def autoregression(e: Array) -> Array:
+    """Describe the colour of a residual: an autoregression by Yule-Walker, its order by BIC.
+
+    `e`: (n_used,). Returns (n + 1,), [1, a1, ..., an], stable; [1] for a white residual.
+    """
+    n = e.size
+    longest = max(1, min(int(10 * np.log10(n)), n // 10))
+    v = e - e.mean()
+    r = np.array([v[k:] @ v[: n - k] for k in range(longest + 1)]) / n
+    best, a, power = np.ones(1), np.ones(1), float(r[0])
+    if power <= 0:
+        return best
+    least = n * np.log(power)
+    for k in range(1, longest + 1):  # Levinson's recursion
+        reflection = -float(a @ r[k:0:-1]) / power
+        a = np.concatenate([a, [0.0]]) + reflection * np.concatenate([[0.0], a[::-1]])
+        power *= 1 - reflection**2
+        if power <= 0:
+            break
+        bic = n * np.log(power) + k * np.log(n)
+        if bic < least:
+            least, best = bic, a
+    return best
+
+
+def filter_backwards(L: Array, a: Array) -> Array:
+    """Return H' L for residuals H w of white w: L filtered by 1/A backwards in time.
+
+    `L`: (n_used, n_columns); `a`: (n + 1,).
+    """
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], a, L[::-1], axis=0)[::-1])
+
+
+def power_gain(a: Array) -> float:
+    """Return the variance of an autoregressive residual over that of the white noise behind it."""
+    from scipy.signal import lfilter
+
+    impulse = np.zeros(20_000)
+    impulse[0] = 1.0
+    return float(np.sum(lfilter([1.0], a, impulse) ** 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Residuals:
+    """What the tests look at; of each signal one array for each record."""
+
+    e: Sequence[Array]  # (n_samples, n_outputs), one-step errors
+    u: Sequence[Array]  # (n_samples, n_inputs), deviations of the inputs from their mean over all records
+    J: Sequence[Sequence[Array]]  # of each output: (n_samples, n_directions), derivatives of the predictions
+    first: int = 0  # samples at the start of a record that are past only
+    # autoregression of each output's error; None where the model describes the noise
+    colours: Sequence[Array | None]
+    source: Sequence[Array]  # (n_samples, n_sources), what errors are tested against: inputs, or references
+    # whether `J` holds noise that errors depend on, as it does in a loop for a model without noise; the sources then
+    # serve as instruments
+    instrumental: bool = False
+    nonlinear: bool  # whether squares and products are tested, too
+    outputs: Sequence[str] = ()  # names, where words are to use them
+    inputs: Sequence[str] = ()
+
+    @property
+    def shortest(self) -> int:
+        """Samples of the shortest record."""
+        return min(len(x) for x in self.e)
+
+    @property
+    def squares(self) -> list[Array]:
+        """Squares of the inputs' deviations, less their mean over all records."""
+        level = np.mean(np.concatenate(self.u) ** 2, axis=0)
+        return [x**2 - level for x in self.u]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualTests:
+    """What the residuals say; each the worst output, or input."""
+
+    white: ResidualTest  # e against past e
+    # e against past inputs; None without inputs, and where the model has more parameters than a test has instruments
+    uncorrelated: ResidualTest | None = None
+    feedback: ResidualTest | None = None  # inputs against past e: small p is evidence for feedback
+    squares: ResidualTest | None = None  # e against past u^2, e^2 against past u^2; None for a linear model
+    variance: ResidualTest | None = None
+    products: ResidualTest | None = None  # e against past e u; None where the colour of the noise is left open
+
+    @property
+    def feedback_seen(self) -> bool:
+        """Whether the data show feedback."""
+        return self.feedback is not None and not self.feedback.passed
+
+    @property
+    def explained_by_inputs(self) -> bool:
+        """Whether residuals hold a function of past inputs: then inputs depend on them without any feedback."""
+        return any(x is not None and not x.passed for x in (self.uncorrelated, self.squares))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Correlation:
+    """Correlation coefficients, ready to be drawn."""
+
+    output: str  # whose error; what is correlated with what
+    title: str
+    lags: NDArray[np.int64]  # (n_lags,), samples, the second comes before the first by this much
+    values: Array  # (n_lags,)
+    # (n_lags,), 99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for
+    band: Array
+
+
+def residual_tests(of: Residuals, *, open_loop: bool) -> ResidualTests:
+    """Test the residuals; in open loop the present input may explain the present residual, too."""
+    white, products = (tuple(k for k in x if k < of.shortest // 10) or (1,) for x in (_WHITE_LAGS, _PRODUCT_LAGS))
+    tests = ResidualTests(white=_worst([_score(of, o, of.e, white) for o in _outputs(of)], white, of.outputs))
+    if not of.u[0].shape[1]:
+        return tests
+    loop = _feedback(of)
+    # under feedback the present input may depend on the present residual, whatever the user says of the loop
+    lags = input_lags(of.shortest, with_now=open_loop and loop.passed)
+    tests = replace(tests, feedback=loop, uncorrelated=_against(of, of.source, lags))
+    if not of.nonlinear:
+        return tests
+    squares = of.squares
+    # as instruments, squares alone are too few for most models
+    instruments = [np.hstack([a, b]) for a, b in zip(of.u, squares, strict=True)] if of.instrumental else squares
+    variance = [_variance(of, o, squares, products) for o in _outputs(of)]
+    mixed = [_score(of, o, _times(of, o), products) for o in _outputs(of) if of.colours[o] is None]
+    return replace(
+        tests,
+        squares=_against(of, instruments, products),
+        variance=_worst(variance, products, of.outputs),
+        products=_worst(mixed, products, of.outputs) if mixed else None,
+    )
+
+
+def input_lags(n_samples: int, *, with_now: bool) -> tuple[int, ...]:
+    """Return the lags at which inputs are tested.
+
+    Every one up to 16, then in even ratios up to a twentieth of the record, at most 400.
+    """
+    longest = max(3, min(n_samples // 20, _LONGEST))
+    near = range(0 if with_now else 1, min(_INPUT_LAGS, longest) + 1)
+    far = (round(float(k)) for k in np.geomspace(_INPUT_LAGS, longest, 7)) if longest > _INPUT_LAGS else ()
+    return tuple(sorted({*near, *far}))
+
+
+def correlations(
+    of: Residuals, inputs: Sequence[str], outputs: Sequence[str], *, n_lags: int = 20
+) -> list[Correlation]:
+    """Correlate the errors of each output with what the tests look at, lag by lag.
+
+    Output by output: with its own past, then with each input; for a nonlinear model also with u^2 and e u, and e^2 with
+    u^2.
+    """
+    lags = tuple(range(1, min(n_lags, of.shortest // 4) + 1))
+    found, squares = list[Correlation](), of.squares
+    for o, output in enumerate(outputs):
+        one = [(f"e of {output}, its past", _score(of, o, [x[:, [o]] for x in of.e], lags))]
+        for i, name in enumerate(inputs):
+            u, u2 = [x[:, [i]] for x in of.u], [x[:, [i]] for x in squares]
+            one.append((f"e of {output}, {name}", _score(of, o, u, lags, against_inputs=True)))
+            if not of.nonlinear:
+                continue
+            one.append((f"e of {output}, {name}²", _score(of, o, u2, lags, against_inputs=True)))
+            if of.colours[o] is None:
+                mixed = [x[:, [i]] for x in _times(of, o)]
+                one.append((f"e of {output}, e × {name}", _score(of, o, mixed, lags)))
+            one.append((f"e² of {output}, {name}²", _variance(of, o, u2, lags)))
+        found += [
+            Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=_NORMAL_99 * s.sd)
+            for t, s in one
+        ]
+    return found
+
+
+def _outputs(of: Residuals) -> range:
+    return range(of.e[0].shape[1])
+
+
+def _rows(x: Array, lags: Sequence[int], first: int) -> Array:
+    """Columns of all signals at all lags, lag by lag, from a sample on that all lags reach back from."""
+    return np.hstack([x[first - k : x.shape[0] - k] for k in lags])
+
+
+def _score(
+    of: Residuals, o: int, signals: Sequence[Array], lags: tuple[int, ...], *, against_inputs: bool = False
+) -> Score:
+    """Score test of lagged signals as regressors of the errors of one output."""
+    width = max(1, of.J[o][0].shape[1] + len(lags) * signals[0].shape[1])
+    start = [max(of.first, *lags, x.shape[0] - int(MOST / width / len(of.e))) for x in of.e]
+    e = np.concatenate([x[k:, o] for x, k in zip(of.e, start, strict=True)])
+    J = np.concatenate([x[k:] for x, k in zip(of.J[o], start, strict=True)])
+    lagged = np.concatenate([_rows(s, lags, k) for s, k in zip(signals, start, strict=True)])
+    colour = of.colours[o] if against_inputs else None
+    if against_inputs and of.instrumental:
+        return instrumental_score(e, J, lagged, colour=colour)
+    return score(e, J, lagged, colour=colour)
+
+
+def _times(of: Residuals, o: int) -> list[Array]:
+    """One output's error times the inputs."""
+    return [e[:, [o]] * u for e, u in zip(of.e, of.u, strict=True)]
+
+
+def _against(of: Residuals, signals: Sequence[Array], lags: tuple[int, ...]) -> ResidualTest | None:
+    """Test errors against inputs; None where no instrument is left over."""
+    worst = _worst([_score(of, o, signals, lags, against_inputs=True) for o in _outputs(of)], lags, of.outputs)
+    return None if of.instrumental and not worst.degrees else worst
+
+
+def _variance(of: Residuals, o: int, squares: Sequence[Array], lags: tuple[int, ...]) -> Score:
+    """Test e^2 against past u^2; the estimated numbers shift e^2 in second order only, and need no account."""
+    first = max(of.first, *lags)
+    power = np.concatenate([x[first:, o] ** 2 for x in of.e])
+    colour = None if of.colours[o] is None else autoregression(power)
+    lagged = np.concatenate([_rows(x, lags, first) for x in squares])
+    return score(power, np.zeros((power.size, 0)), lagged, colour=colour)
+
+
+def _feedback(of: Residuals) -> ResidualTest:
+    """Granger's test of errors -> inputs: do past errors say more of an input than its own past (Caines 1975)?"""
+    own, loop = (tuple(range(1, max(1, min(k, of.shortest // 20)) + 1)) for k in (_OWN_LAGS, _LOOP_LAGS))
+    width = len(own) * of.u[0].shape[1] + len(loop) * of.e[0].shape[1]
+    start = [max(of.first, *own, x.shape[0] - int(MOST / width / len(of.e))) for x in of.e]
+    past = np.concatenate([_rows(u, own, k) for u, k in zip(of.u, start, strict=True)])
+    errors = np.concatenate([_rows(e, loop, k) for e, k in zip(of.e, start, strict=True)])
+    now = np.concatenate([u[k:] for u, k in zip(of.u, start, strict=True)])
+    return _worst([score(x, past, errors) for x in now.T], loop, of.inputs)
+
+
+def _worst(tests: Sequence[Score], lags: tuple[int, ...], channels: Sequence[str]) -> ResidualTest:
+    worst = min(range(len(tests)), key=lambda k: tests[k].p)
+    s = tests[worst]
+    k = int(np.argmax(np.abs(s.correlation))) if s.correlation.size else 0
+    return ResidualTest(
+        p=min(1.0, s.p * len(tests)),
+        statistic=s.statistic,
+        degrees=s.degrees,
+        largest=float(np.abs(s.correlation[k])) if s.correlation.size else 0.0,
+        largest_lag=lags[k // max(1, s.correlation.size // len(lags))],
+        channel=channels[worst] if channels else "",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Subject:
+    """Whose residuals are judged."""
+
+    name: str  # as in "this narx"
+    coloured: bool  # whether it leaves the colour of the noise open
+    biased: bool  # whether feedback biases it
+
+
+def residual_check(test: ResidualTest, what: str) -> Check:
+    """Put a residual test into words: what was tested against what, and what that means."""
+    verdict = "nothing is left" if test.passed else "something is left that the model does not explain"
+    return Check(
+        passed=test.passed,
+        p=test.p,
+        values={
+            "statistic": test.statistic,
+            "degrees_of_freedom": float(test.degrees),
+            "largest_correlation": test.largest,
+            "largest_lag": float(test.largest_lag),
+        },
+        detail=f"{what}: {verdict} "
+        f"(largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})",
+    )
+
+
+def residual_checks(tests: ResidualTests, subject: Subject) -> dict[str, Check]:
+    """Put residual tests into words.
+
+    Returns ``residuals_white``, with inputs ``residuals_uncorrelated`` and ``feedback``, and of a nonlinear model
+    ``residuals_nonlinear`` and ``residual_variance``.
+    """
+    e = _name_residuals(tests.white)
+    white = residual_check(tests.white, f"{e} against past residuals")
+    if not white.passed and subject.coloured:
+        detail = f"{e} are coloured; {subject.name} does not describe noise, and need not"
+        white = Check(passed=True, p=white.p, values=white.values, detail=detail)
+    checks = {"residuals_white": white}
+    if tests.uncorrelated is not None:
+        what = f"{_name_residuals(tests.uncorrelated)} against past inputs"
+        checks["residuals_uncorrelated"] = residual_check(tests.uncorrelated, what)
+    if tests.squares is not None:
+        checks["residuals_nonlinear"] = _check_nonlinear(tests.squares, tests.products)
+    if tests.variance is not None:
+        checks["residual_variance"] = _check_variance(tests.variance)
+    if tests.feedback is not None:
+        checks["feedback"] = _check_feedback(tests, tests.feedback, subject)
+    return checks
+
+
+def _name_residuals(test: ResidualTest) -> str:
+    return f"residuals of {test.channel}" if test.channel else "residuals"
+
+
+def _check_nonlinear(squares: ResidualTest, products: ResidualTest | None) -> Check:
+    """One verdict of both; p by Bonferroni's rule."""
+    both = [(squares, "residuals against squares of past inputs")]
+    if products is not None:
+        both.append((products, "residuals against past residuals times inputs"))
+    worst, what = min(both, key=lambda x: x[0].p)
+    check = residual_check(replace(worst, p=min(1.0, len(both) * worst.p)), what)
+    values = {**check.values, "p_squares": squares.p}
+    if products is not None:
+        values["p_products"] = products.p
+    return Check(passed=check.passed, p=check.p, detail=check.detail, values=values)
+
+
+def _check_variance(test: ResidualTest) -> Check:
+    check = residual_check(test, "squared residuals against squares of past inputs")
+    if check.passed:
+        return check
+    detail = (
+        "the size of the residuals depends on past inputs: standard deviations take it as constant, or a nonlinearity "
+        f"is missing (largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})"
+    )
+    return Check(passed=False, p=check.p, detail=detail, values=check.values)
+
+
+def describe_feedback(test: ResidualTest) -> str:
+    """Say which input depends on past residuals."""
+    return f"{f'input {test.channel!r} depends' if test.channel else 'inputs depend'} on past residuals"
+
+
+def _check_feedback(tests: ResidualTests, test: ResidualTest, subject: Subject) -> Check:
+    seen, evidence = tests.feedback_seen, describe_feedback(test)
+    if not seen:
+        detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
+    elif tests.explained_by_inputs:
+        detail = f"{evidence}, which hold what inputs explain: feedback, or what the model misses"
+    elif subject.biased:
+        detail = f"{evidence}: there is feedback, and {subject.name} is biased by it"
+    else:
+        detail = f"{evidence}: there is feedback, which {subject.name} allows for"
+    return Check(
+        passed=not (seen and subject.biased),
+        p=test.p,
+        values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
+        detail=f"{detail} (p = {test.p:.2g})",
+    )

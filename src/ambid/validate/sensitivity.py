@@ -20,7 +20,6 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import skipped
-from ambid.estimation.estimate import Estimate
 
 _PAIR = 0.9  # correlation from which two numbers are named as a pair
 _DEPENDENT = 1e-10  # eigenvalue of the correlation matrix under which a direction is not independent
@@ -94,18 +93,6 @@ def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
         response,
         np.asarray(spread),
     )
-
-
-def estimate_sensitivity(estimate: Estimate) -> SensitivityAnalysis:
-    """Analyse an estimate of physical parameters.
-
-    Returns without poles and frequency response.
-    """
-    names = estimate.covariance_names
-    if not names:
-        raise EstimationError("the estimate has no free parameter, so that nothing can be sensitive. Free one")
-    theta = np.array([estimate.values[k] for k in names])
-    return _analysis(names, theta, estimate.covariance, None, None, np.zeros(0))
 
 
 def _analysis(

@@ -8,7 +8,7 @@ share are one cluster, which is a mode of the plant; the others are of noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, cast, get_args
 
@@ -80,35 +80,25 @@ def stabilisation(
     method: str = "pbsid",
     n_max: int = 20,
     *,
-    frequency: float = _FREQUENCY,
-    damping: float = _DAMPING,
-    shape: float = _SHAPE,
     tick: Callable[[], None] | None = None,
 ) -> Stabilisation:
-    """Identify models of all orders and follow their poles.
+    """Identify models of all orders up to `n_max` and follow their poles.
 
-    `method`: all but pbsid are biased under feedback; `n_max`: largest order; `frequency`: relative change of a stable
-    frequency, at most; `shape`: modal assurance criterion of a stable shape, at least (0 to 1); `tick`: called between
-    steps; may raise to interrupt.
+    `method`: all but pbsid are biased under feedback; `tick`: called between steps; may raise to interrupt.
     """
     known = get_args(Method)
     if method not in known:
         raise EstimationError(f"method {method!r} is not one of {', '.join(known)}.{nearest(method, known)}")
-    if not (frequency > 0 and damping > 0 and 0 <= shape <= 1):
-        raise EstimationError(
-            f"tolerances of frequency {frequency:g}, damping {damping:g} and shape {shape:g}; the first two must be "
-            "positive, the last between 0 and 1. Leave them out for the usual ones"
-        )
     models = subspace_models(data, cast(Method, method), n_max, tick=tick)
     rows = [_poles(m.order, m.model.A, m.model.C, data) for m in models]
     found = list(rows[0])
     for before, after in pairwise(rows):
-        found += [_marked(p, before, frequency, damping, shape) for p in after]
+        found += [_mark(p, before) for p in after]
     return Stabilisation(
         method=cast(Method, method),
         orders=tuple(m.order for m in models),
         poles=tuple(found),
-        modes=_modes(found, models[-1].order, frequency, damping),
+        modes=_modes(found, models[-1].order),
         singular_values=tuple(m.singular_value for m in models),
         criteria=tuple(m.criterion for m in models),
     )
@@ -137,30 +127,19 @@ def _poles(order: int, A: Array, C: Array, data: IOData) -> list[ModePole]:
     return out
 
 
-def _marked(p: ModePole, before: Sequence[ModePole], frequency: float, damping: float, shape: float) -> ModePole:
+def _mark(p: ModePole, before: Sequence[ModePole]) -> ModePole:
     """Compare a pole with the nearest one of the order below that is of its kind."""
     same = [q for q in before if (q.pole.imag > 0) == (p.pole.imag > 0)]
     if not same:
         return p
     near = min(same, key=lambda q: abs(q.pole - p.pole))
-    return ModePole(
-        order=p.order,
-        pole=p.pole,
-        frequency_hz=p.frequency_hz,
-        damping=p.damping,
-        shape=p.shape,
-        stable_frequency=_close(p.frequency_hz, near.frequency_hz, frequency),
-        stable_damping=_damped_alike(p, near, damping),
-        stable_shape=assurance(p.shape, near.shape) >= shape,
+    f, g, c, d = p.frequency_hz, near.frequency_hz, p.damping, near.damping
+    return replace(
+        p,
+        stable_frequency=abs(f - g) <= _FREQUENCY * max(f, g, 1e-300),
+        stable_damping=abs(c - d) <= _DAMPING * max(abs(c), abs(d), 0.1),
+        stable_shape=assurance(p.shape, near.shape) >= _SHAPE,
     )
-
-
-def _close(a: float, b: float, tolerance: float) -> bool:
-    return abs(a - b) <= tolerance * max(abs(a), abs(b), 1e-300)
-
-
-def _damped_alike(p: ModePole, q: ModePole, tolerance: float) -> bool:
-    return abs(p.damping - q.damping) <= tolerance * max(abs(p.damping), abs(q.damping), 0.1)
 
 
 def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
@@ -173,11 +152,11 @@ def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
     return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
 
 
-def _modes(poles: Sequence[ModePole], largest: int, frequency: float, damping: float) -> tuple[Mode, ...]:
+def _modes(poles: Sequence[ModePole], largest: int) -> tuple[Mode, ...]:
     """Gather stable poles: from the highest order down, each joins the cluster it is near to, or begins one."""
     clusters = list[list[ModePole]]()
     for p in sorted((p for p in poles if p.stable), key=lambda p: -p.order):
-        fitting = [c for c in clusters if _belongs(p, c, frequency, damping)]
+        fitting = [c for c in clusters if _belongs(p, c)]
         if fitting:
             min(fitting, key=lambda c: abs(_centre(c) - p.pole)).append(p)
         else:
@@ -201,11 +180,11 @@ def _modes(poles: Sequence[ModePole], largest: int, frequency: float, damping: f
     return tuple(sorted(out, key=lambda m: m.frequency_hz))
 
 
-def _belongs(p: ModePole, cluster: Sequence[ModePole], frequency: float, damping: float) -> bool:
+def _belongs(p: ModePole, cluster: Sequence[ModePole]) -> bool:
     centre = _centre(cluster)
     size = max(abs(centre), abs(p.pole))
     same = (p.pole.imag > 0) == (cluster[0].pole.imag > 0) and all(q.order != p.order for q in cluster)
-    reach = 2 * size * (frequency + damping * max(abs(p.damping), 0.1))
+    reach = 2 * size * (_FREQUENCY + _DAMPING * max(abs(p.damping), 0.1))
     return same and abs(p.pole - centre) <= reach
 
 

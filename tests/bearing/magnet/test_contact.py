@@ -8,11 +8,11 @@ import pytest
 from ambid.bearing.magnet.contact import touching
 from ambid.bearing.magnet.estimate import estimate_bearing
 from ambid.bearing.magnet.likelihood import search
-from ambid.bearing.magnet.residual_test import whiteness
 from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.bearing.magnet.weight import weight_carried
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
+from ambid.validate.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import problem_of
 from tests.bearing.magnet.stops import NOISE, RATE, STOPS, TRUTH, ball_between_stops, lying
 

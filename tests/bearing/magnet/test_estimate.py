@@ -7,12 +7,12 @@ import pytest
 
 from ambid.bearing.magnet.estimate import estimate_bearing
 from ambid.bearing.magnet.likelihood import criterion, search
-from ambid.bearing.magnet.residual_test import whiteness
 from ambid.bearing.magnet.start import balance
 from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
+from ambid.validate.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, problem_of, unstable
 
 KNOWN = {

@@ -7,13 +7,13 @@ import pytest
 
 from ambid.bearing.magnet.estimate import estimate_bearing
 from ambid.bearing.magnet.likelihood import criterion, search
-from ambid.bearing.magnet.residual_test import whiteness
 from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.physics.power_stage import PowerStage
 from ambid.physics.presets import preset
+from ambid.validate.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 
 KNOWN = {

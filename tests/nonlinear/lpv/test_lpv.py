@@ -10,7 +10,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.nonlinear.lpv.estimate import lpv
-from ambid.validate.nonlinear import judged
+from ambid.validate.nonlinear import judge
 from tests.nonlinear.lpv.plants import damped, levitated, record, truth
 
 KNOWN = {"schedule": "p", "degree": 2, "form": "output", "error_form": "ar"}
@@ -79,8 +79,8 @@ def test_it_beats_a_linear_fit_where_the_plant_is_scheduled(usual):
 
 def test_judgement_tells_a_right_model_from_one_that_misses_the_schedule(usual):
     data, fit = usual
-    assert judged(fit, [data]).passed
-    linear = judged(lpv([data], {**KNOWN, "degree": 0}), [data])
+    assert judge(fit, [data]).passed
+    linear = judge(lpv([data], {**KNOWN, "degree": 0}), [data])
     assert not linear.passed
     assert not linear.checks["residual_variance"].passed
 
@@ -260,7 +260,7 @@ def test_short_records_are_not_given_a_model_that_looks_back_over_all_of_them():
     several = [record(k, 40) for k in range(8)]
     fit = lpv(several, {"schedule": "p"})
     assert fit.model.lag + 20 <= 40
-    assert judged(fit, several).fit
+    assert judge(fit, several).fit
     with pytest.raises(EstimationError, match="record 1 has 40 samples; 50 are needed"):
         lpv(several, {"schedule": "p", "form": "output", "error_form": "ma"})
 

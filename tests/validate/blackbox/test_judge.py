@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria, skipped
-from ambid.validate.blackbox import judged
+from ambid.validate.blackbox import judge
 from tests.validate.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
@@ -21,7 +21,7 @@ def record(seed, n=600, model=TRUTH, sd=0.3):
 
 def test_fit_is_one_minus_the_relative_error():
     data = record(0)
-    found = judged(arx(data, 2, 2), data)
+    found = judge(arx(data, 2, 2), data)
     y, spread = data.y[:, 0], np.linalg.norm(data.y - data.y.mean())
     a, b = found.model.outputs[0].A, found.model.outputs[0].B[0]
     v, w = y - found.offsets.y, data.u[:, 0] - found.offsets.u
@@ -33,7 +33,7 @@ def test_fit_is_one_minus_the_relative_error():
 def test_an_unstable_model_has_no_simulation():
     truth = polynomial(A=(1, -1.02), B=((0, 1.0),))
     data = record(1, n=300, model=truth)
-    assert judged(arx(data, 1, 1), data).fit["y0"].simulation is None
+    assert judge(arx(data, 1, 1), data).fit["y0"].simulation is None
 
 
 @pytest.mark.parametrize("n_y", [1, 2])
@@ -56,13 +56,13 @@ def test_criteria_are_those_of_the_gaussian_likelihood(n_y):
 
 def test_bic_prefers_the_true_orders():
     data = record(3)
-    scores = {(na, nb): judged(arx(data, na, nb), data).criteria["bic"] for na in (1, 2, 3) for nb in (1, 2, 3)}
+    scores = {(na, nb): judge(arx(data, na, nb), data).criteria["bic"] for na in (1, 2, 3) for nb in (1, 2, 3)}
     assert min(scores, key=scores.get) == (2, 2)
 
 
 def test_a_second_record_is_judged_by_output():
     data, second = record(4), record(5)
-    found = judged(arx(data, 2, 2), data, second=second).validation["y0"]
+    found = judge(arx(data, 2, 2), data, second=second).validation["y0"]
     assert found["one_step"]["rmse"] == pytest.approx(0.3, rel=0.1)
     assert set(found["simulation"]) == {"fit", "rmse"}
 
@@ -71,7 +71,7 @@ def test_another_operating_point_is_no_error():
     data, second = record(6), record(7)
     moved = io(second.u, second.y + 100.0)
     fit = arx(data, 2, 2)
-    plain, shifted = (judged(fit, data, second=x).validation["y0"]["simulation"]["rmse"] for x in (second, moved))
+    plain, shifted = (judge(fit, data, second=x).validation["y0"]["simulation"]["rmse"] for x in (second, moved))
     assert shifted == pytest.approx(plain, rel=0.05)
 
 
@@ -80,4 +80,4 @@ def test_a_second_record_of_another_rate_is_refused():
 
     data = record(8)
     with pytest.raises(EstimationError, match="Hz"):
-        judged(arx(data, 2, 2), data, second=replace(data, dt=0.02))
+        judge(arx(data, 2, 2), data, second=replace(data, dt=0.02))

@@ -10,8 +10,7 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria
 from ambid.nonlinear.narmax.estimate import narmax
-from ambid.validate.nonlinear import judged, validation
-from ambid.validate.nonlinear.runs import beyond
+from ambid.validate.nonlinear import beyond, judge, validation
 from tests.validate.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit
 
 
@@ -25,7 +24,7 @@ def static_record(n: int, seed: int, *, level: float = 0.0, noise: float = 0.2, 
 def test_fit_and_rmse_leave_the_first_samples_out_and_take_each_record_s_own_mean() -> None:
     one, other = static_record(400, 1), static_record(300, 2, noise=0.5)
     away = io(other.u[:, 0], other.y[:, 0])
-    found = judged(static_fit(Static(), one, away), [one, away])
+    found = judge(static_fit(Static(), one, away), [one, away])
     errors = [(x.y[1:] - x.u[:-1])[1:, 0] for x in (one, away)]
     spreads = [x.y[2:, 0] - x.y[2:, 0].mean() for x in (one, away)]
     expected = 1 - np.linalg.norm(np.concatenate(errors)) / np.linalg.norm(np.concatenate(spreads))
@@ -39,40 +38,40 @@ def test_fit_and_rmse_leave_the_first_samples_out_and_take_each_record_s_own_mea
 def test_a_level_that_differs_from_record_to_record_does_not_raise_the_fit() -> None:
     low, high = static_record(400, 3, noise=1.0), static_record(400, 4, noise=1.0)
     apart = io(high.u[:, 0] + 100.0, high.y[:, 0] + 100.0)
-    together, far = (judged(static_fit(Static(), low, x), [low, x]).fit["y"].one_step for x in (high, apart))
+    together, far = (judge(static_fit(Static(), low, x), [low, x]).fit["y"].one_step for x in (high, apart))
     assert far == pytest.approx(together, rel=1e-9)
 
 
 def test_criteria_are_those_of_a_linear_fit_with_the_same_errors() -> None:
     data = static_record(500, 5)
-    found = judged(static_fit(Static(), data), [data])
+    found = judge(static_fit(Static(), data), [data])
     e = data.y - np.vstack([[0.0], data.u[:-1]])
     assert found.criteria == pytest.approx(criteria(e, data.y, 1))
 
 
 def test_a_free_run_that_diverges_is_no_simulation_and_fails_its_check() -> None:
     data = static_record(300, 6)
-    found = judged(static_fit(Static(diverges_at=120), data), [data])
+    found = judge(static_fit(Static(diverges_at=120), data), [data])
     assert found.fit["y"].simulation is None
     check = found.checks["simulation_stable"]
     assert not check.passed
     assert "diverges 1.2 s after" in check.detail
-    assert judged(static_fit(Static(), data), [data]).checks["simulation_stable"].passed
-    big = judged(static_fit(Static(gain=40.0), data), [data]).checks["simulation_stable"]
+    assert judge(static_fit(Static(), data), [data]).checks["simulation_stable"].passed
+    big = judge(static_fit(Static(gain=40.0), data), [data]).checks["simulation_stable"]
     assert not big.passed
     assert big.values["reach"] > 10
 
 
 def test_an_unstable_plant_in_a_loop_is_not_blamed_for_its_free_run() -> None:
     data = levitated(1500, 1)
-    fit = judged(narmax([data], {}), [data])
+    fit = judge(narmax([data], {}), [data])
     assert fit.fit["y"].one_step > 0.5
     assert fit.checks["feedback"].values["seen"] == 1.0
     assert fit.checks["feedback"].passed  # narmax has a noise model
     assert fit.checks["simulation_stable"].passed
     assert fit.fit["y"].simulation is None or fit.checks["simulation_stable"].values["reach"] < 10
     told_open = replace(data, open_loop=True)
-    said = judged(narmax([told_open], {}), [told_open])
+    said = judge(narmax([told_open], {}), [told_open])
     assert any("said to be open loop" in x for x in said.warnings)
 
 
@@ -82,19 +81,19 @@ def test_what_a_model_misses_is_not_called_feedback() -> None:
     y = np.zeros(1500)
     for t in range(1, 1500):
         y[t] = 0.6 * y[t - 1] + u[t - 1] + u[t - 1] ** 2 + 0.05 * rng.standard_normal()
-    found = judged(narmax([io(u, y)], {"degree": 1}), [io(u, y)])
+    found = judge(narmax([io(u, y)], {"degree": 1}), [io(u, y)])
     assert not found.checks["residuals_nonlinear"].passed
     assert not any("said to be open loop" in x for x in found.warnings)
 
 
 def test_extrapolation_is_the_share_outside_the_training_data_and_is_warned_of() -> None:
     data = static_record(1000, 7)
-    inside = judged(static_fit(Static(edge=10.0), data), [data], second=static_record(500, 8))
+    inside = judge(static_fit(Static(edge=10.0), data), [data], second=static_record(500, 8))
     assert inside.validation is not None
     assert inside.validation["y"]["extrapolated"] == 0.0
     assert not any("outside" in x for x in inside.warnings)
     other = static_record(500, 8)
-    beyond = judged(static_fit(Static(edge=1.0), data), [data], second=other)
+    beyond = judge(static_fit(Static(edge=1.0), data), [data], second=other)
     assert beyond.validation is not None
     share = np.mean(np.abs(other.u[2:, 0]) > 1)
     assert beyond.validation["y"]["extrapolated"] == pytest.approx(share)
@@ -104,7 +103,7 @@ def test_extrapolation_is_the_share_outside_the_training_data_and_is_warned_of()
 def test_a_real_model_knows_when_a_second_record_leaves_its_data() -> None:
     data = squared(600, 1)
     fit = narmax([data], {})
-    near, far = (judged(fit, [data], second=squared(400, 2, size=s)) for s in (1.0, 4.0))
+    near, far = (judge(fit, [data], second=squared(400, 2, size=s)) for s in (1.0, 4.0))
     assert not any("extrapolates" in x for x in near.warnings)
     assert any("extrapolates" in x for x in far.warnings)
 
@@ -112,24 +111,24 @@ def test_a_real_model_knows_when_a_second_record_leaves_its_data() -> None:
 def test_a_fit_to_the_free_run_may_leave_coloured_errors_and_is_biased_by_feedback() -> None:
     settings = {"focus": "simulation", "ne": 0}
     data = output_error(1500, 1)
-    fit = judged(narmax([data], settings), [data])
+    fit = judge(narmax([data], settings), [data])
     assert fit.settings["focus"] == "simulation"
     assert (fit.checks["residuals_white"].p or 0) < 1e-3  # one-step errors of an output-error plant
     assert fit.checks["residuals_white"].passed
     assert fit.checks["residuals_uncorrelated"].passed
     assert fit.checks["residuals_nonlinear"].passed
-    linear = judged(narmax([data], {**settings, "degree": 1}), [data])
+    linear = judge(narmax([data], {**settings, "degree": 1}), [data])
     assert not linear.checks["residuals_nonlinear"].passed
     assert not any("biased" in x for x in fit.warnings)
     unsaid = output_error(1500, 1, open_loop=False)
-    warned = judged(static_fit(Static(), unsaid), [unsaid])
+    warned = judge(static_fit(Static(), unsaid), [unsaid])
     assert sum("biased" in x for x in warned.warnings) == 1
 
 
 def test_a_failed_fit_stays_as_it_is_and_cannot_be_validated() -> None:
     data = static_record(300, 9)
     failed = replace(static_fit(Static(), data), model=None, status="failed", reason="it broke")
-    assert judged(failed, [data]) is failed
+    assert judge(failed, [data]) is failed
     with pytest.raises(EstimationError, match="it broke"):
         validation(failed, data)
 
@@ -138,26 +137,26 @@ def test_records_that_do_not_belong_to_the_fit_are_refused() -> None:
     data = static_record(300, 10)
     fit = static_fit(Static(), data)
     with pytest.raises(EstimationError, match="50 Hz"):
-        judged(fit, [replace(data, dt=0.02)])
+        judge(fit, [replace(data, dt=0.02)])
     with pytest.raises(EstimationError, match="same channels"):
-        judged(fit, [replace(data, inputs=("other",), units={"other": "V", "y": "m"})])
+        judge(fit, [replace(data, inputs=("other",), units={"other": "V", "y": "m"})])
     with pytest.raises(EstimationError, match="looks back"):
-        judged(fit, [data.part(0, 2)])
+        judge(fit, [data.part(0, 2)])
     with pytest.raises(EstimationError, match="constant"):
         validation(fit, io(data.u[:, 0], np.ones(300)))
 
 
 def test_a_stalled_search_is_said_once() -> None:
     data = static_record(300, 11)
-    silent = judged(replace(static_fit(Static(), data), status="stalled"), [data])
+    silent = judge(replace(static_fit(Static(), data), status="stalled"), [data])
     assert any("did not converge" in x for x in silent.warnings)
     told = replace(static_fit(Static(), data), status="stalled", warnings=("interrupted: the best model so far",))
-    assert judged(told, [data]).warnings == told.warnings
+    assert judge(told, [data]).warnings == told.warnings
 
 
 def test_short_records_are_judged_without_residual_tests() -> None:
     data = static_record(40, 12)
-    found = judged(static_fit(Static(), data), [data])
+    found = judge(static_fit(Static(), data), [data])
     assert set(found.checks) == {"finite_prediction", "simulation_stable"}
     assert found.criteria
 

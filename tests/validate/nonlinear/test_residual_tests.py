@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax.estimate import narmax
-from ambid.validate.nonlinear import judged
-from ambid.validate.nonlinear.residual_tests import correlations, material
-from ambid.validate.nonlinear.runs import run
+from ambid.validate.nonlinear import judge, residuals_of, run
+from ambid.validate.residuals import correlations
 from tests.validate.nonlinear.plants import io, levitated, output_error, squared
 
 TRUE = {"ny": 1, "nu": 1, "ne": 0, "constant": 0, "selection": "frols"}
@@ -22,7 +21,7 @@ def chances() -> dict[str, list[float]]:
     found: dict[str, list[float]] = {name: [] for name in TESTS}
     for seed in range(RUNS):
         data = squared(500, seed)
-        fit = judged(narmax([data], TRUE), [data])
+        fit = judge(narmax([data], TRUE), [data])
         for name in TESTS:
             p = fit.checks[name].p
             assert p is not None
@@ -43,7 +42,7 @@ def test_a_right_model_is_refused_as_often_as_p_says(chances: dict[str, list[flo
 
 def test_a_missing_square_is_found_by_the_nonlinear_test_alone() -> None:
     data = squared(1500, 1)
-    fit = judged(narmax([data], {**TRUE, "degree": 1, "constant": 1}), [data])
+    fit = judge(narmax([data], {**TRUE, "degree": 1, "constant": 1}), [data])
     assert fit.checks["residuals_white"].passed
     assert fit.checks["residuals_uncorrelated"].passed
     check = fit.checks["residuals_nonlinear"]
@@ -54,7 +53,7 @@ def test_a_missing_square_is_found_by_the_nonlinear_test_alone() -> None:
 
 def test_noise_that_grows_with_the_input_is_found_by_the_variance_test_alone() -> None:
     data = squared(1500, 2, spread=3.0)
-    fit = judged(narmax([data], TRUE), [data])
+    fit = judge(narmax([data], TRUE), [data])
     assert not fit.checks["residual_variance"].passed
     assert fit.checks["residuals_nonlinear"].passed
     assert fit.checks["residuals_uncorrelated"].passed
@@ -63,23 +62,21 @@ def test_noise_that_grows_with_the_input_is_found_by_the_variance_test_alone() -
 
 def test_a_missing_linear_lag_is_found() -> None:
     data = squared(1500, 3)
-    fit = judged(narmax([data], {**TRUE, "ny": 0}), [data])
+    fit = judge(narmax([data], {**TRUE, "ny": 0}), [data])
     assert not fit.checks["residuals_uncorrelated"].passed
     assert "need not" in fit.checks["residuals_white"].detail  # a model that looks at no outputs leaves colour open
 
 
 def test_noise_that_a_predictor_does_not_describe_is_found() -> None:
     data = output_error(1500, 4)
-    fit = judged(narmax([data], {**TRUE, "constant": 1}), [data])
+    fit = judge(narmax([data], {**TRUE, "constant": 1}), [data])
     assert not fit.checks["residuals_white"].passed
-    described = judged(narmax([data], {**TRUE, "ne": 2}), [data])
+    described = judge(narmax([data], {**TRUE, "ne": 2}), [data])
     assert described.checks["residuals_white"].passed
 
 
 def test_feedback_is_seen_in_a_loop_and_not_without() -> None:
-    seen = [
-        judged(narmax([x], {}), [x]).checks["feedback"].values["seen"] for x in (levitated(800, 4), squared(800, 4))
-    ]
+    seen = [judge(narmax([x], {}), [x]).checks["feedback"].values["seen"] for x in (levitated(800, 4), squared(800, 4))]
     assert seen == [1.0, 0.0]
 
 
@@ -88,7 +85,7 @@ def test_bounds_hold_99_percent_of_the_correlations() -> None:
     for seed in range(15):
         data = [squared(400, 1000 + seed), squared(300, 2000 + seed)]
         fit = narmax(data, TRUE)
-        prepared = material(fit, data, [run(fit, x) for x in data], coloured=False)
+        prepared = residuals_of(fit, data, [run(fit, x) for x in data], coloured=False)
         assert prepared is not None
         shown = correlations(prepared, ["u"], ["y"])
         assert [c.title for c in shown] == [
@@ -106,7 +103,7 @@ def test_a_level_error_at_one_operating_point_is_left_in_the_residuals() -> None
     fit = narmax([low], {**TRUE, "degree": 1, "constant": 1})
     assert fit.model is not None
     shifted = io(high.u[:, 0], high.y[:, 0] + 0.3)
-    assert not judged(fit, [low, shifted]).checks["residuals_white"].passed
+    assert not judge(fit, [low, shifted]).checks["residuals_white"].passed
 
 
 def test_instruments_refuse_right_free_run_models_as_often_as_p_says() -> None:
@@ -114,6 +111,6 @@ def test_instruments_refuse_right_free_run_models_as_often_as_p_says() -> None:
     for seed in range(40):
         data = output_error(400, seed)
         fit = narmax([data], {"focus": "simulation", "ne": 0, "ny": 1, "nu": 1, "constant": 0})
-        p.append([judged(fit, [data]).checks[name].p for name in ("residuals_uncorrelated", "residuals_nonlinear")])
+        p.append([judge(fit, [data]).checks[name].p for name in ("residuals_uncorrelated", "residuals_nonlinear")])
     hits = np.mean(np.array(p, dtype=float) < 0.1, axis=0)
     assert np.all(hits < 0.1 + 3.5 * np.sqrt(0.09 / 40))

@@ -1,0 +1,1 @@
+"""Judging estimates: on their own record, on another, and against each other."""

@@ -1,0 +1,458 @@
+"""All checks of a physical estimate on its own record, in the order of the report; its simulation and predictions.
+
+The residual tests are score tests (`ambid.validate.residuals`): lagged signals beside the weighted Jacobian as further
+regressors of all innovations together, from the scalar products of one pass of sensitivities.
+
+Under the right model the estimate does not depend on how far ahead the predictor has to look. So the same record is
+fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor
+gain that follows from the fit, and the parameters are compared: the specification test of Hausman (1978). Where they
+move by more than chance allows, the model is wrong in a way that the residuals of one step may hide, and the difference
+says how much.
+
+From x+ = A x + B u + K e, y = C x + D u + e the error k steps ahead, inputs known, is the sum of the innovations since,
+e(t) + C K e(t-1) + ... + C A^(k-2) K e(t-k+1) (Ljung 1999, sec. 3.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.greybox import carry
+from ambid.bearing.hints import experiment_hint
+from ambid.bearing.multistart import MAX_DELAY
+from ambid.bearing.uncertainty import Uncertainty
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near
+from ambid.estimation.linear import column_sizes, directions
+from ambid.estimation.predictor import Predictor, assemble
+from ambid.estimation.sensitivity import Products, Workspace, innovations, products, run
+from ambid.physics.linear_model import LinearModel
+from ambid.record import Record
+from ambid.signals.faults import find_dropouts, find_outliers, find_saturation
+from ambid.validate.residuals import P_LEAST, ResidualTest, residual_check
+
+_INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
+_ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
+_SATURATED = 0.005  # part of the samples at a limit that a check lets pass
+_WHITE_LAGS = (1, 2, 3, 5, 8, 13)
+_BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither record nor priors see
+_SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
+_STRIDES = (2, 4)
+_MOST = 4.0  # shift in its standard deviations that chance allows
+_FAR = 3.3  # standard deviations between a prior and the record
+_SIZES = {"m": (1e-5, 1e5), "k_x": (0.0, 1e11), "k_i": (0.0, 1e6), "R": (1e-4, 1e5), "L": (1e-7, 1e3), "c": (0.0, 1e8)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Agreement:
+    """Estimates from a record used in other ways."""
+
+    names: tuple[str, ...]  # estimated physical parameters
+    shift: Array  # (n_refits, n), SI, refitted value minus estimate
+    # (n_refits, n), SI, standard deviation of the shift under the right model: the refit uses less of the data, so
+    # that its variance less that of the fit is that of their difference (Hausman 1978)
+    sd: Array
+    strides: tuple[int, ...]  # of the refits that converged
+
+    @property
+    def largest(self) -> float:
+        """Largest shift in standard deviations; 0 where no refit converged."""
+        return float(np.max(np.abs(self.shift / self.sd), initial=0.0))
+
+    @property
+    def passed(self) -> bool:
+        """Whether there was a refit, and every shift is within 4 standard deviations."""
+        return bool(self.strides) and self.largest < _MOST
+
+    def disagreement(self) -> Array:
+        """Return how far the parameters move in the refit in which they move most.
+
+        Returns (n,), SI, zeros where no refit converged.
+        """
+        if not self.strides:
+            return np.zeros(len(self.names))
+        return np.asarray(self.shift[np.argmax(np.max(np.abs(self.shift / self.sd), axis=1))])
+
+
+def innovation_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
+    """Check what the innovations say of the model, and with that of its standard deviations.
+
+    `e`: (n_used, n_outputs), innovations, scaled; `moved`: estimates from the record used in other ways. Returns
+    ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
+    the robust standard deviations are to be used.
+    """
+    own, inputs = innovation_tests(fit, e)
+    return {
+        "residuals_white": residual_check(own, "innovations against their own past"),
+        "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
+        "uncertainty_consistent": Check(
+            passed=known.inflation < _INFLATION,
+            values={"inflation": known.inflation},
+            detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from "
+            f"the information matrix (at most {_INFLATION:g})",
+        ),
+        "estimates_agree": _estimates_agree(moved),
+    }
+
+
+def innovation_tests(fit: Fit, e: Array) -> tuple[ResidualTest, ResidualTest]:
+    """Test the innovations against their own past, and against past inputs.
+
+    `e`: (n_used, n_outputs), innovations at the fit, scaled.
+    """
+    problem, weight = fit.problem, weight_of(fit.covariance)
+    white, n = e @ weight.T, len(e)
+    u = problem.u[problem.skip :: problem.stride] / problem.scales.input
+    longest = max(2, n // 20)
+    own = tuple(k for k in _WHITE_LAGS if k < n // 10)
+    inputs = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
+    lagged = np.hstack([_lagged(white, own), _lagged(u, inputs)])
+    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
+    work = fit.work if fit.work is not None else Workspace(problem)
+    found = products(problem, fit.vector, weight, work.of(problem), lagged)
+    if found is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    first = len(own) * white.shape[1]
+    return (
+        _test_columns(fit, found, white, lagged, own, slice(0, first)),
+        _test_columns(fit, found, white, lagged, inputs, slice(first, None)),
+    )
+
+
+def _test_columns(
+    fit: Fit, found: Products, white: Array, lagged: Array, lags: tuple[int, ...], which: slice
+) -> ResidualTest:
+    """Score test of some lagged columns as further regressors of every whitened innovation."""
+    from scipy.special import chdtrc
+
+    columns = lagged[:, which]
+    statistic, degrees = _explain_columns(fit, found, columns.T @ columns, which)
+    correlation = (white.T @ columns) / np.linalg.norm(white, axis=0)[:, None]
+    place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
+    return ResidualTest(
+        p=float(chdtrc(max(degrees, 1), statistic)),
+        statistic=statistic,
+        degrees=degrees,
+        largest=float(np.abs(correlation[place])),
+        largest_lag=lags[int(place[1]) // (columns.shape[1] // len(lags))],
+    )
+
+
+def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
+    """Columns of all signals at all lags, lag by lag, zero before the record."""
+    out = np.zeros((signals.shape[0], len(lags) * signals.shape[1]))
+    for j, lag in enumerate(lags):
+        out[lag:, j * signals.shape[1] : (j + 1) * signals.shape[1]] = signals[:-lag]
+    return out
+
+
+def _explain_columns(fit: Fit, found: Products, inner: Array, which: slice) -> tuple[float, int]:
+    """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
+
+    What the Jacobian and the priors explain is taken off by the Schur complement of their products, which lose no
+    digits because the Jacobian is nearly orthonormal there.
+    """
+    p, (n_y, _, _) = fit.problem.size, found.cross.shape
+    prior = fit.J_prior @ found.turn
+    own = found.rows[:p, :p] + prior.T @ prior
+    pull = found.rows[:p, p] + prior.T @ fit.r_prior
+    cross = np.hstack([found.cross[o, :p, which] for o in range(n_y)])
+    size = column_sizes(np.sqrt(np.diag(own))[None, :])
+    values, vectors = np.linalg.eigh(own / np.outer(size, size))
+    seen = values > _BLIND * values[-1]
+    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([cross, pull]) / size[:, None])
+    rest = np.kron(np.eye(n_y), inner) - factor[:, :-1].T @ factor[:, :-1]
+    left = np.concatenate([found.cross[o, p, which] for o in range(n_y)]) - factor[:, :-1].T @ factor[:, -1]
+    values, vectors = np.linalg.eigh(rest)
+    kept = values > _SAME**2
+    inside = (vectors[:, kept].T @ left) / np.sqrt(values[kept])
+    return float(inside @ inside), int(np.count_nonzero(kept))
+
+
+def _estimates_agree(moved: Agreement) -> Check:
+    every = " and ".join(f"{s}{'nd' if s == 2 else 'th'}" for s in moved.strides)
+    if not moved.strides:
+        detail = "the record could not be fitted with every 2nd or 4th output alone: one step ahead is all that fits"
+    elif moved.passed:
+        detail = f"refits with every {every} output give the same parameters (largest shift {moved.largest:.1f} sd)"
+    else:
+        far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
+        detail = (
+            f"refits with every {every} output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): "
+            "the model does not fit this record; excite more, work in a smaller range, or look for what is missing"
+        )
+    return Check(
+        passed=moved.passed,
+        values={"largest_shift_sd": moved.largest, "refits": float(len(moved.strides))},
+        detail=detail,
+    )
+
+
+def agreement(fit: Fit) -> Agreement:
+    """Refit a record with every second and every fourth output.
+
+    `fit`: not failed. Returns refits that do not converge are left out.
+    """
+    problem = fit.problem
+    size, n = problem.magnitude, problem.n_physical
+    shifts, spreads, strides = [], [], []
+    own = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
+    for stride in _STRIDES:
+        sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
+        start = carry(fit, sparse)
+        again = search(sparse, start, most=20, work=workspace_near(fit, sparse))
+        if again.status != "converged":
+            continue
+        spread = directions(np.vstack([again.J, again.J_prior])).inverse()[:n, :n]
+        shifts.append((again.vector[:n] - fit.vector[:n]) * size)
+        # at least a quarter of its variance: the difference of two nearly equal variances is not known better
+        spreads.append(np.sqrt(np.maximum(np.diag(spread - own), 0.25 * np.diag(spread))) * size)
+        strides.append(stride)
+    return Agreement(
+        names=problem.estimated,
+        shift=np.array(shifts).reshape(-1, n),
+        sd=np.array(spreads).reshape(-1, n),
+        strides=tuple(strides),
+    )
+
+
+def _sparse_gain(fit: Fit, stride: int) -> Array:
+    """Predictor gain for every stride-th output, from the innovations form of the fit: x+ = A x + K e, y = C x + e."""
+    from scipy.linalg import solve_discrete_are
+
+    predictor = _predictor(fit)
+    A, C, K, S = predictor.A, predictor.C, predictor.gain, fit.covariance
+    if not np.any(K):  # sensor noise alone: no state is ever corrected
+        return K
+    powers = [np.linalg.matrix_power(A, stride - 1 - j) for j in range(stride)]
+    Q = sum((p @ K @ S @ K.T @ p.T for p in powers), np.zeros_like(A))
+    cross, whole = powers[0] @ K @ S, A @ powers[0]
+    P = solve_discrete_are(whole.T, C.T, Q, S, s=cross)
+    return np.asarray(np.linalg.solve(C @ P @ C.T + S, (whole @ P @ C.T + cross).T).T)
+
+
+def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
+    """Check what was taken for known.
+
+    Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``long_enough``.
+    """
+    return {
+        "fixed_agree": _fixed_agree(fit),
+        "priors_agree": _priors_agree(fit),
+        "delay_in_range": _delay_in_range(fit, delay_how),
+        "long_enough": _long_enough(known),
+    }
+
+
+def _fixed_agree(fit: Fit) -> Check:
+    """Score test of each fixed value: would the record, if asked, put it elsewhere?"""
+    from scipy.special import chdtrc
+
+    units = {p.name: p.unit for p in fit.problem.model.parameters}
+    worst, detail = 1.0, "the record does not speak against any fixed value"
+    for name, value in fit.problem.known.items():
+        statistic, there = freed(fit, name)
+        p = float(chdtrc(1, statistic))
+        if p < min(worst, P_LEAST):
+            detail = (
+                f"the record speaks against {name} = {value:.4g} {units[name]}, which was fixed, and wants a "
+                f"{'larger' if there > value else 'smaller'} value (p = {p:.2g}). Check that value, or free it"
+            )
+        worst = min(worst, p)
+    return Check(passed=worst >= P_LEAST, p=worst, detail=detail)
+
+
+def _priors_agree(fit: Fit) -> Check:
+    """Each prior against where one Newton step without it would take its parameter."""
+    problem = fit.problem
+    worst, name = 0.0, ""
+    for row, r in zip(fit.J_prior, fit.r_prior, strict=True):
+        j = int(np.argmax(np.abs(row)))
+        if j >= problem.n_physical:
+            continue
+        others = fit.J_prior[fit.J_prior[:, j] == 0.0]
+        # at the optimum the pull of the prior is what the data and the other priors hold against
+        without = directions(np.vstack([fit.J, others])).inverse()
+        step, variance = float(without[j] @ row) * float(r), float(without[j, j])
+        size = problem.magnitude[j]
+        # r = (value - mean) / sd, so that the data alone would be at mean + r sd + step
+        far = abs(step * size + float(r) * problem.prior_sd[j])
+        far /= float(np.hypot(np.sqrt(variance) * size, problem.prior_sd[j]))
+        if not name or far > worst:
+            worst, name = far, problem.estimated[j]
+    if worst > _FAR:
+        detail = f"the record puts {name} {worst:.1f} sd away from its prior: one of them is wrong. Check the prior"
+    else:
+        detail = "priors and record agree" if name else "there are no priors"
+    return Check(passed=worst <= _FAR, values={"largest_sd": worst}, detail=detail)
+
+
+def _delay_in_range(fit: Fit, how: Literal["estimated", "given"]) -> Check:
+    total = fit.problem.delay_samples(fit.vector)
+    inside = how == "given" or total < 2 * MAX_DELAY
+    doubt = "" if inside else ". That is long for a bench: check the columns, or give channels.<input>.delay"
+    return Check(passed=inside, values={"samples": total}, detail=f"the input acts {total:.3g} samples late{doubt}")
+
+
+def _long_enough(known: Uncertainty) -> Check:
+    enough = known.widening == 1.0
+    detail = (
+        "the record is long enough to tell the noise levels"
+        if enough
+        else "the record is too short to tell the noise levels: standard deviations are widened by up to "
+        f"{known.widening:.2g}. Record longer"
+    )
+    return Check(passed=enough, values={"widening": known.widening}, detail=detail)
+
+
+def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
+    """Check whether the parameters are shown by the data, can exist, and come from signals within their limits.
+
+    `record`: channels named by role; `robust`: which standard deviations count. Returns ``identifiable``,
+    ``plausible``, ``within_limits``, ``signals_sound``.
+    """
+    theta = fit.problem.parameters(fit.vector)
+    sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
+    wrong = implausible(fit.problem.model, theta, sd)
+    return {
+        "identifiable": _identifiable(fit, known, theta, robust=robust),
+        "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical and the coil is passive"),
+        "within_limits": _within_limits(record),
+        "signals_sound": _signals_sound(record, fit.problem.model.outputs),
+    }
+
+
+def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, robust: bool) -> Check:
+    seen = known.identifiable_at(robust=robust)
+    unseen = [
+        f"{name} (sd {100 * r:.0f} %)"
+        for name, ok, r in zip(known.names, seen, known.relative_sd(robust=robust), strict=True)
+        if not ok
+    ]
+    values = {"condition": float(known.singular_values[0] / known.singular_values[-1])}
+    if not unseen:
+        return Check(passed=True, values=values, detail="the record shows every estimated parameter")
+    if np.any(np.abs(known.disagreement) > 0.5 * known.standard_deviations(robust=robust)):
+        hint = "Not noise but disagreement of the refits makes it so: repeat it away from limits, with more excitation"
+        return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
+    rate, length = fit.problem.rate_hz, fit.problem.u.shape[0]
+    band = (rate / length, lowest_power_hz(fit.problem.u, rate), rate / 2)
+    hint = experiment_hint(known, theta, band, robust=robust) or ""
+    return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
+
+
+def lowest_power_hz(u: Array, rate_hz: float) -> float:
+    """Return the frequency below which the inputs have 0.1 % of their power.
+
+    `u`: (n_samples, n_inputs). Returns hz.
+    """
+    power = np.sum(np.abs(np.fft.rfft(u - u.mean(axis=0), axis=0)) ** 2, axis=1)
+    total = np.cumsum(power)
+    return float(np.searchsorted(total, 1e-3 * total[-1]) * rate_hz / u.shape[0])
+
+
+def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
+    """List what physics forbids in an estimate.
+
+    Mass, resistance and inductance have to be positive: a coil with R > 0 and L > 0 is passive, it never gives out more
+    energy than was put in; damping may not be negative beyond its uncertainty. Sizes outside what is built, from
+    micro-bearings to turbines, are a slip of units.
+
+    `values`, `sd`: parameters and their standard deviations, SI. Returns one line each; empty where all is well.
+    """
+    found = []
+    for spec in model.parameters:
+        value, spread = values[spec.name], sd.get(spec.name, 0.0)
+        if spec.positive and value <= 0:
+            found.append(f"{spec.name} = {value:.4g} {spec.unit} is not positive ({spec.meaning})")
+        low, high = _SIZES.get(spec.name, (0.0, float("inf")))
+        if not low <= abs(value) <= high:
+            found.append(
+                f"{spec.name} = {value:.4g} {spec.unit} is of a size that no bearing has: check the units of the "
+                "columns, their calibration and the sampling rate"
+            )
+        if spec.name == "c" and value < -3.3 * spread:
+            found.append(f"c = {value:.4g} {spec.unit} is negative: the rotor would gain energy by moving")
+    return found
+
+
+def _within_limits(record: Record) -> Check:
+    found = {c.name: find_saturation(record, c.name) for c in record.channels}
+    bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
+    detail = "; ".join(str(s) for s in bad.values())
+    return Check(
+        passed=not bad,
+        values={f"{name}_fraction": s.fraction for name, s in found.items()},
+        detail=f"{detail}. Lower the excitation, or cut those parts out" if bad else "no channel dwells at its limits",
+    )
+
+
+def _signals_sound(record: Record, outputs: tuple[str, ...]) -> Check:
+    """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
+    found = [(role, find(record, role)) for role in outputs for find in (find_outliers, find_dropouts)]
+    some = [f"{role}: {f}" for role, f in found if f.count]
+    few = max(f.count for _, f in found) <= _ERRONEOUS * record.n_samples
+    return Check(
+        passed=few,
+        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in found},
+        detail=f"{'; '.join(some)}. They are used as they are; replace them (signals.replace_samples) or cut them out"
+        if some
+        else "no outliers and no drop-outs in the measured outputs",
+    )
+
+
+def simulation_error(fit: Fit) -> Array | None:
+    """Return y minus its simulation from the input, offsets and initial state alone, SI.
+
+    Returns (n_used, n_outputs); None where the plant is unstable in open loop: its simulation runs away and says
+    nothing.
+    """
+    predictor = _predictor(fit)
+    A = predictor.A
+    if np.max(np.abs(np.linalg.eigvals(A))) >= 1.0:
+        return None
+    work, n = Workspace(fit.problem), A.shape[0]
+    M = predictor.M.copy()
+    M[:, :n] = A
+    M[:, -1 - work.y.shape[1] : -1] = 0.0  # the gain is off: measurements do not correct the state
+    e = work.y - run(M, work.z, predictor.x0)[:-1] @ predictor.C.T
+    return np.asarray(e * fit.problem.scales.output)
+
+
+def prediction_error(fit: Fit, steps: int) -> Array:
+    """Return y minus its prediction `steps` samples ahead, SI, with the inputs known up to then.
+
+    Returns (n_used - steps + 1, n_outputs), row k is the error at sample k + steps - 1, predicted from outputs before
+    sample k.
+    """
+    predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
+    if e is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    n, out, power = e.shape[0], e[steps - 1 :].copy(), predictor.gain
+    for j in range(1, steps):
+        out += e[steps - 1 - j : n - j] @ (predictor.C @ power).T
+        power = predictor.A @ power
+    return np.asarray(out * fit.problem.scales.output)
+
+
+def expected_prediction_sd(fit: Fit, steps: int) -> Array:
+    """Return the standard deviation (n_outputs,) that the model gives its predictions `steps` samples ahead, SI."""
+    predictor = _predictor(fit)
+    total, power = fit.covariance.copy(), predictor.gain
+    for _ in range(1, steps):
+        h = predictor.C @ power
+        total += h @ fit.covariance @ h.T
+        power = predictor.A @ power
+    return np.asarray(np.sqrt(np.diag(total)) * fit.problem.scales.output)
+
+
+def _predictor(fit: Fit) -> Predictor:
+    predictor = assemble(fit.problem, fit.vector, with_derivatives=False)
+    if predictor is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    return predictor
