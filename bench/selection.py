@@ -10,8 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambid.nonlinear.narmax.candidates import candidates
-from ambid.nonlinear.narmax.selection import Selection, select_terms
+from ambid.nonlinear.narmax.selection import Selection, candidates, select_terms
 from ambid.nonlinear.narmax.terms import Term, lagged, products
 from peers import Array, Bench, bench
 from table import Table

@@ -79,12 +79,12 @@ def test_words(seconds, words) -> None:
 
 SLOWLY = """
 import sys, time
-from ambid.nonlinear.narmax import search
-quick = search.evaluated
-def evaluated(*words, **named):
-    time.sleep(0.3)
-    return quick(*words, **named)
-search.evaluated = evaluated
+from ambid.nonlinear.narmax.model import Problem
+quick = Problem.cost
+def cost(*words):
+    time.sleep(0.2)
+    return quick(*words)
+Problem.cost = cost
 from ambid.cli import run
 sys.exit(run(sys.argv[1:]))
 """

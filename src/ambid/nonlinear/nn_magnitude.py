@@ -155,7 +155,7 @@ def grid_starts(parts: Parts, n: int, most: int, dt: float) -> list[tuple[Layout
     layout = magnitude_layout(n, m, 0, dt)
     y = np.concatenate([p[0][:, 0] for p in parts])
     scored: list[tuple[float, int, Array, int, float]] = []
-    for A in _denominators(n):
+    for A in pole_grid(n):
         for j in range(m):
             x = np.concatenate([np.abs(lfilter([0.0, 1.0], A, p[1][:, j])) for p in parts])
             size = float(x @ x)
@@ -192,9 +192,10 @@ def _weights_of(layout: Layout, A: Array, channel: int, gain: float) -> Array:
     return theta
 
 
-def _denominators(n: int) -> list[Array]:
-    if n == 1:
-        return [np.array([1.0, -p]) for p in _REAL]
+def pole_grid(n: int) -> list[Array]:
+    """Return denominators (n + 1,) of linear models of `n` poles, of q^0, q^-1, ..."""
+    if n < 2:
+        return [np.array([1.0, -p]) for p in _REAL] if n else [np.ones(1)]
     pairs = [np.array([1.0, -2 * r * np.cos(w), r * r]) for r in _RADII for w in _ANGLES]
     pairs += [np.convolve([1.0, -p], [1.0, -q]) for p in _REAL for q in _REAL if q >= p]
     for _ in range(n - 2):

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.lpv.beginning import beginning, settling
-from ambid.nonlinear.lpv.choice import information, slowest_mode, slowest_that_does, time_constants
+from ambid.nonlinear.lpv.candidates import (
+    LpvProblem,
+    carry_over,
+    information,
+    slowest_mode,
+    slowest_that_does,
+    time_constants,
+)
 from ambid.nonlinear.lpv.estimate import lpv
-from ambid.nonlinear.lpv.problem import LpvProblem
-from ambid.nonlinear.lpv.schedule import Schedule, basis_values
-from ambid.nonlinear.lpv.shape import LpvShape, errors, part_of, sound
-from ambid.nonlinear.lpv.start import padded
+from ambid.nonlinear.lpv.shape import LpvShape, Schedule, basis_values, beginning, errors, is_sound, part_of, settling
 from tests.nonlinear.lpv.plants import record
 
 
@@ -170,12 +173,12 @@ def test_an_unstable_predictor_counts_as_infinitely_bad():
     for name, value in (("c1", 1.2), ("a2", 1.1)):
         worse = theta.copy()
         worse[shape.place(shape.coefficients.index(name)).start] = value
-        assert not sound(shape, worse)
+        assert not is_sound(shape, worse)
         assert problem.cost(worse) == np.inf
     equation = shape_of("equation")
     worse = theta_of(equation)
     worse[equation.place(1).start] = 1.1
-    assert sound(equation, worse)  # its predictor does not feed x back
+    assert is_sound(equation, worse)  # its predictor does not feed x back
 
 
 def test_the_free_run_follows_its_own_set_point():
@@ -271,7 +274,7 @@ def test_a_model_is_carried_over_to_more_functions_of_p(basis):
     y, u, s = signals()
     theta = theta_of(old)
     one = errors(old, part_of(old, y, u, s), theta).x
-    same = errors(new, part_of(new, y, u, s), padded(new, old, theta)).x
+    same = errors(new, part_of(new, y, u, s), carry_over(new, old, theta)).x
     np.testing.assert_allclose(same, one, rtol=1e-10, atol=1e-12)
 
 

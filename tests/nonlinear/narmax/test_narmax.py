@@ -10,8 +10,7 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.narmax import Factor, PolynomialNarmax, narmax
-from ambid.nonlinear.narmax.model import Cloud
-from ambid.nonlinear.narmax.recursion import predicted, sensitivities
+from ambid.nonlinear.narmax.model import Cloud, derive, predict
 from tests.nonlinear.narmax.systems import TRUTH, coefficients, polynomial, rational, record
 
 
@@ -192,13 +191,13 @@ def test_slopes_of_magnitudes_are_exact() -> None:
         )  # fmt: skip
         t, theta = model.tables, model.theta
         for free in (False, True):
-            out, z = predicted(t, theta, y, u, free=free)
+            out, z = predict(t, theta, y, u, free=free)
             assert np.nanmin(out) >= 0
-            S = sensitivities(t, theta, z, free=free)
+            S = derive(t, theta, z, free=free)
             for k in range(3):
                 h = np.zeros(3)
                 h[k] = 1e-7
-                slope = predicted(t, theta + h, y, u, free=free)[0] - predicted(t, theta - h, y, u, free=free)[0]
+                slope = predict(t, theta + h, y, u, free=free)[0] - predict(t, theta - h, y, u, free=free)[0]
                 np.testing.assert_allclose(S[t.lag :, :, k], slope[t.lag :] / 2e-7, atol=1e-6)
 
 

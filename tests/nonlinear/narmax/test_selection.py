@@ -7,8 +7,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import CRITERIA, information, penalty
-from ambid.nonlinear.narmax.candidates import MatrixCandidates, candidates
-from ambid.nonlinear.narmax.selection import select_terms
+from ambid.nonlinear.narmax.selection import MatrixCandidates, candidates, select_terms
 from ambid.nonlinear.narmax.terms import lagged, products, term_name
 from tests.nonlinear.narmax.systems import polynomial
 

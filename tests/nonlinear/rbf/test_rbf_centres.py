@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.nonlinear.narmax.candidates import MatrixCandidates
-from ambid.nonlinear.narmax.selection import select_terms
+from ambid.nonlinear.narmax.selection import MatrixCandidates, select_terms
 from ambid.nonlinear.rbf_network import k_means, neighbour_widths, ols_order, typical_size
 
 

@@ -6,31 +6,31 @@ the one-step errors -> Levenberg-Marquardt with exact derivatives. Starts come f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from time import perf_counter
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, portions
-from ambid.nonlinear.failed import failed_fit
+from ambid.nonlinear.cloud import cloud_of
+from ambid.nonlinear.failed import failed_fit, provenance
 from ambid.nonlinear.fit import NonlinearFit, Settings
-from ambid.nonlinear.lpv.beginning import looks_back
 from ambid.nonlinear.lpv.candidates import (
-    Work,
+    Fitting,
     by_degree,
     by_form,
-    chosen_level,
+    choose_level,
+    least_squares,
     other_degrees,
-    searched,
+    search_from,
     wanted_shapes,
 )
-from ambid.nonlinear.lpv.result import finished
-from ambid.nonlinear.lpv.schedule import Schedule, schedule_over
-from ambid.nonlinear.lpv.settings import LpvSettings, lpv_settings
-from ambid.nonlinear.lpv.shape import LpvShape
-from ambid.nonlinear.lpv.start import least_squares
+from ambid.nonlinear.lpv.model import LpvModel, regressors
+from ambid.nonlinear.lpv.shape import LpvSettings, LpvShape, Schedule, looks_back, lpv_settings, schedule_over
 from ambid.nonlinear.records import scaled_records
 
 DIVERGED = "no one-step predictor that stays finite was found; lower degree, order or error_order, or check the columns"
@@ -38,6 +38,10 @@ UNSTABLE = (
     "the output form cannot be fitted: its process part diverges over the records, as that of an unstable plant does. "
     "Say form = equation"
 )
+_POINTS = 9  # of the table over the range of p
+_CLOSE = 2.0  # difference of Akaike's criterion that says nothing (Burnham and Anderson 2002, sec. 2.6)
+
+# --- stages -----------------------------------------------------------------------------------------------------------
 
 
 def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -53,28 +57,28 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
         raise EstimationError("lpv: no record is given. Pass one at least")
     s = lpv_settings(settings, records[0])
     began = perf_counter()
-    work = _begun(s, records)
+    fitting = _begin(s, records)
     reason = ""
     try:
-        reason = _identify(s, work, tick)
+        reason = _identify(s, fitting, tick)
     except KeyboardInterrupt:
-        work.status = "stalled"
-        work.warnings.insert(0, "interrupted: the best model so far")
+        fitting.status = "stalled"
+        fitting.warnings.insert(0, "interrupted: the best model so far")
     except np.linalg.LinAlgError as error:
         reason = f"the search broke down: {error}"
     else:
-        if work.status == "stalled":
-            work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
-    work.timing_s["all"] = perf_counter() - began
-    used = _used(s, work)
-    if not reason and not np.isfinite(work.problem(work.shape).cost(work.theta)):
+        if fitting.status == "stalled":
+            fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+    fitting.timing_s["all"] = perf_counter() - began
+    used = _used(s, fitting)
+    if not reason and not np.isfinite(fitting.problem(fitting.shape).cost(fitting.theta)):
         reason = DIVERGED
     if reason:
-        return failed_fit("lpv", records, used, seed, reason, work.timing_s)
-    return finished(records, used, work, seed=seed)
+        return failed_fit("lpv", records, used, seed, reason, fitting.timing_s)
+    return finish(records, used, fitting, seed=seed)
 
 
-def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
+def _begin(s: LpvSettings, records: Sequence[IOData]) -> Fitting:
     """A model by least squares: something to hand over when the very next thing is an interruption."""
     tau = 0.0 if s.column >= 0 else (s.time_constant if s.time_constant is not None else 50.0 * records[0].dt)
     last = Schedule(name=s.schedule, column=s.column, time_constant=tau, low=0.0, high=0.0).share(records[0].dt) == 1.0
@@ -90,7 +94,7 @@ def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
             schedule_over(records, s.schedule, s.column, 0.0)
     data = scaled_records("lpv", records, lag=max(first, min(looks_back(x) for x in wanted_shapes(s, shape))))
     _long_enough(s, shape, sum(x.n_samples - first for x in records))
-    work = Work(
+    fitting = Fitting(
         data=data,
         records=records,
         schedule=schedule_over(records, s.schedule, s.column, tau),
@@ -98,8 +102,8 @@ def _begun(s: LpvSettings, records: Sequence[IOData]) -> Work:
         theta=np.zeros(shape.n_theta),
         first=first,
     )
-    work.theta = least_squares(shape, work.parts(shape), first)[0]
-    return work
+    fitting.theta = least_squares(shape, fitting.parts(shape), first)[0]
+    return fitting
 
 
 def _long_enough(s: LpvSettings, shape: LpvShape, n: int) -> None:
@@ -112,38 +116,178 @@ def _long_enough(s: LpvSettings, shape: LpvShape, n: int) -> None:
         )
 
 
-def _used(s: LpvSettings, work: Work) -> dict[str, object]:
+def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
     """Settings with nothing left open."""
-    of = work.shape
+    of = fitting.shape
     form = {(False, False): "white", (True, False): "ar", (False, True): "ma", (True, True): "arma"}
     return {
         **s.as_mapping(),
         "degree": of.degree,
-        "time_constant": work.schedule.time_constant,
+        "time_constant": fitting.schedule.time_constant,
         "error_order": max(of.ar, of.ma),
         "form": of.form,
         "error_form": form[of.ar > 0, of.ma > 0],
     }
 
 
-def _identify(s: LpvSettings, work: Work, tick: Tick | None) -> str:
+def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
     """Choose and fit; returns why there is no model, or nothing."""
     ticks = portions(tick, (1.0, 4.0, 10.0, 0.0 if s.degree is not None else 6.0, 10.0))
     began = perf_counter()
     if ticks[0] is not None:
         ticks[0]("set point", 0.0)
     if s.time_constant is None:
-        tau = chosen_level(s, work, ticks[0])
-        work.schedule = schedule_over(work.records, s.schedule, s.column, tau)
-        work.theta = least_squares(work.shape, work.parts(work.shape), work.first)[0]
-    work.timing_s["set point"], began = perf_counter() - began, perf_counter()
-    best = by_degree(s, work, ticks[1])
-    work.timing_s["degree"], began = perf_counter() - began, perf_counter()
-    best = other_degrees(s, work, by_form(s, work, best, ticks[2]), ticks[3])
-    work.timing_s["form"], began = perf_counter() - began, perf_counter()
+        tau = choose_level(s, fitting, ticks[0])
+        fitting.schedule = schedule_over(fitting.records, s.schedule, s.column, tau)
+        fitting.theta = least_squares(fitting.shape, fitting.parts(fitting.shape), fitting.first)[0]
+    fitting.timing_s["set point"], began = perf_counter() - began, perf_counter()
+    best = by_degree(s, fitting, ticks[1])
+    fitting.timing_s["degree"], began = perf_counter() - began, perf_counter()
+    best = other_degrees(s, fitting, by_form(s, fitting, best, ticks[2]), ticks[3])
+    fitting.timing_s["form"], began = perf_counter() - began, perf_counter()
     if not np.isfinite(best.cost):
         return UNSTABLE if s.form == "output" else DIVERGED
-    work.shape, work.theta = best.shape, best.theta
-    searched(work, best.shape, best.theta, s.iterations, ticks[4], "prediction errors", last=True)
-    work.timing_s["search"] = perf_counter() - began
+    fitting.shape, fitting.theta = best.shape, best.theta
+    search_from(fitting, best.shape, best.theta, s.iterations, ticks[4], "prediction errors", last=True)
+    fitting.timing_s["search"] = perf_counter() - began
     return ""
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
+def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitting, *, seed: int) -> NonlinearFit:
+    """Return the fit of a model that runs.
+
+    `used`: settings.
+    """
+    problem, theta = fitting.problem(fitting.shape), fitting.theta
+    noise = problem.cost(theta) / problem.freedom
+    R = problem.triangle(theta)
+    inverse, condition = information_inverse(R[:, :-1]) if np.all(np.isfinite(R)) else (None, np.inf)
+    model = _make_model(records, fitting)
+    warnings = [*fitting.warnings, *_caution(records, fitting)]
+    covariance = None
+    if inverse is None:
+        warnings.append(
+            "no covariance, and so no standard deviations: the data do not determine the coefficients (condition "
+            f"number {condition:.1e}). Lower degree or error_order, or give records at more set points"
+        )
+    else:
+        covariance = noise * inverse * model.unit[:, None] * model.unit
+    return NonlinearFit(
+        structure="lpv",
+        settings=dict(used),
+        model=model,
+        covariance=covariance,
+        covariance_from="" if covariance is None else "information",
+        n_estimated=int(theta.size),
+        noise_covariance=np.array([[noise * float(fitting.data.y_scale[0]) ** 2]]),
+        seed=seed,
+        status=fitting.status,
+        curves=tuple(fitting.curves),
+        warnings=tuple(warnings),
+        timing_s=dict(fitting.timing_s),
+        details={
+            "schedule": {
+                "signal": fitting.schedule.name,
+                "low": fitting.schedule.low,
+                "high": fitting.schedule.high,
+                "time_constant_s": fitting.schedule.time_constant,
+                "unit": records[0].units[records[0].outputs[0] if model.schedule.column < 0 else fitting.schedule.name],
+            },
+            "condition": condition,
+            "frozen": frozen_table(model, covariance, records[0].inputs),
+            "tried": list(fitting.tried),
+        },
+        **provenance(records),
+    )
+
+
+def _make_model(records: Sequence[IOData], fitting: Fitting) -> LpvModel:
+    d, of = fitting.data, fitting.schedule
+    seen = [
+        regressors(fitting.shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
+        for x, (y, u) in zip(records, d.parts, strict=True)
+    ]
+    model = LpvModel(
+        dt=records[0].dt,
+        n_inputs=records[0].n_inputs,
+        shape=fitting.shape,
+        schedule=of,
+        theta=fitting.theta,
+        u_level=d.u_level,
+        u_scale=d.u_scale,
+        y_level=d.y_level,
+        y_scale=d.y_scale,
+        cloud=cloud_of(np.concatenate(seen)),
+    )
+    return model.with_theta(fitting.theta * model.unit)
+
+
+def frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:
+    """Return poles and gains over the range of the scheduling signal.
+
+    `covariance`: (n_theta, n_theta), SI, or None; `inputs`: names of all inputs. Returns by value of p: ``p``,
+    ``poles_rad_s`` (real and imaginary part, and their standard deviations) and ``dc_gain`` by input (value, standard
+    deviation); None where there is no number.
+    """
+    out = []
+    for p in np.linspace(model.schedule.low, model.schedule.high, _POINTS):
+        at = model.at(float(p), covariance)
+        poles_sd = np.full(at.poles.size, np.nan + 1j * np.nan) if at.poles_sd is None else at.poles_sd
+        gain_sd = np.full(at.dc_gain.size, np.nan) if at.dc_gain_sd is None else at.dc_gain_sd
+        poles = [
+            [_number(x) for x in (z.real, z.imag, sd.real, sd.imag)] for z, sd in zip(at.poles, poles_sd, strict=True)
+        ]
+        gains = {
+            inputs[column]: [_number(g), _number(sd)]
+            for column, g, sd in zip(model.shape.columns, at.dc_gain, gain_sd, strict=True)
+        }
+        out.append({"p": float(p), "poles_rad_s": poles, "dc_gain": gains})
+    return out
+
+
+def _number(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
+def _caution(records: Sequence[IOData], fitting: Fitting) -> list[str]:
+    found = []
+    of = fitting.shape
+    if of.columns and not (of.ar or of.ma) and not all(x.open_loop for x in records):
+        what = "noise is white" if of.form == "output" else "equation errors are white"
+        found.append(
+            f"without an error model (error_order = 0) lpv is biased under feedback unless its {what}, and nothing "
+            "says that these records are open loop: raise error_order, or say --open-loop if there was no feedback"
+        )
+    if not of.columns and records[0].n_inputs:
+        found.append(
+            f"no input acts on the output: {fitting.schedule.name!r}, the only one, moves coefficients alone. Say "
+            "exciting = yes if it does, or name the input that does"
+        )
+    if of.degree == 0:
+        found.append(
+            f"no coefficient depends on the scheduling signal {fitting.schedule.name!r} (degree 0"
+            f"{'' if not fitting.tried or len(fitting.tried) < 2 else ', by the criterion'}): this is a linear model"
+        )
+    return found + _close_calls(fitting)
+
+
+def _close_calls(fitting: Fitting) -> list[str]:
+    """Other degrees that the data hardly tell from the chosen one, everything else alike."""
+    of = fitting.shape
+    alike = {
+        str(x["degree"]): x["aicc"]
+        for x in fitting.tried
+        if (x["form"], x["ar"], x["ma"]) == (of.form, of.ar, of.ma) and isinstance(x["aicc"], float)
+    }
+    own = alike.pop(str(of.degree), None)
+    close = [k for k, value in alike.items() if own is not None and abs(value - own) < _CLOSE]
+    if not close:
+        return []
+    return [
+        f"degree {of.degree} is a close call: degree {' and '.join(close)} would explain the data about as "
+        "well. The standard deviations take the degree for given and are too small by that choice. Name it if you know "
+        "it"
+    ]

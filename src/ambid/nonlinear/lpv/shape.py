@@ -1,22 +1,171 @@
-"""The equations of an LPV model and its predictor, on scaled signals.
+"""The equations of an LPV model and its predictor, on scaled signals, and the scheduling signal p behind them.
+
+p is a column among the inputs (its value now), the output (its last value), or ``level``: the set point, as a causal
+first-order low-pass of the output before the present sample. It is scaled to -1 ... 1 over the training data; a
+coefficient is a sum of Legendre polynomials of it, or of hats (piecewise linear).
 
 Equation form: A(q, p) y = B(q, p) u + c(p) + v; output form: A(q, p) x = B(q, p) u + c(p), y = x + v; both with the
 error model D(q, p) v = C(q, p) e. All coefficients at time t are functions of p(t), and stand before the shifted
 signals: (A y)(t) = y(t) + a_1(p(t)) y(t - 1) + ... (Toth 2010, sec. 3.1: static dependence, shifted form). Operators do
 not commute with p, so that this is another model than one with p(t - k).
+
+States of the output form and first innovations, w, are those that make the innovations of the first samples small:
+min |e(theta, w)|^2 + w' Lambda w, with Lambda from their own size beside the innovations'. e is linear in w. Without
+it, a zero of C near the unit circle keeps an error of these alive for its time constant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.blackbox.data import IOData
 from ambid.blackbox.roots import stable
-from ambid.nonlinear.lpv.schedule import basis_values
+from ambid.errors import EstimationError, nearest
+from ambid.nonlinear.settings import checked
+
+LEVEL = "level"
+BASES = ("legendre", "hats")
+_EACH = 4  # samples for each number
+_STATES = 0.01  # variance of an innovation over that of what a state differs by
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "order": (1, 10),
+    "error_order": (0, 20),
+    "nb": (0, 50),
+    "nk": (0, 1000),
+    "degree": (0, 8),
+    "error_degree": (0, 8),
+    "time_constant": (0.0, 1e9),
+    "iterations": (1, 2000),
+}
+_CHOICES: Mapping[str, tuple[str, ...]] = {
+    "error_form": ("auto", "white", "ar", "ma", "arma"),
+    "form": ("auto", "equation", "output"),
+    "basis": BASES,
+    "exciting": ("no", "yes"),
+    "criterion": ("aicc", "aic", "bic"),
+}
+
+# --- schedule ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Schedule:
+    """A scheduling signal."""
+
+    name: str  # of the column; ``level`` for the set point
+    column: int  # which input it is; -1 where it is made of the output
+    # of the low-pass; 0 for the last value of the output itself. Without meaning for a column of the inputs.
+    time_constant: float
+    low: float  # range in training
+    high: float
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range, SI."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half(self) -> float:
+        """Half the range, SI."""
+        return 0.5 * (self.high - self.low)
+
+    def share(self, dt: float) -> float:
+        """Return the weight of the newest output in the low-pass.
+
+        Returns 0 for a column of the inputs, where there is no low-pass.
+        """
+        if self.column >= 0:
+            return 0.0
+        return 1.0 if self.time_constant <= 0 else -math.expm1(-dt / self.time_constant)
+
+    def signal(self, u: Array, y: Array, dt: float) -> Array:
+        """Return the scheduling signal.
+
+        `u`: (n_samples, n_inputs), SI; `y`: (n_samples, 1), SI. Returns (n_samples,), SI.
+        """
+        return scheduling_signal(u, y, self.column, self.share(dt))
+
+    def scaled(self, p: Array | float) -> Array:
+        """Return p as the functions of it take it, -1 to 1 in training.
+
+        `p`: (n_samples,), or float, SI.
+        """
+        return np.asarray((np.asarray(p, dtype=np.float64) - self.middle) / self.half)
+
+
+def scheduling_signal(u: Array, y: Array, column: int, share: float) -> Array:
+    """Return a column of the inputs, or the low-passed output.
+
+    `u`: (n_samples, n_inputs), SI; `y`: (n_samples, 1), SI; `column`: -1 for the output; `share`: weight of the newest
+    output in the low-pass. Returns (n_samples,), SI.
+    """
+    from ambid.nonlinear.lpv._kernels import set_points
+
+    if column >= 0:
+        return np.ascontiguousarray(u[:, column])
+    out = np.empty(y.shape[0])
+    set_points(np.ascontiguousarray(y[:, 0]), share, out)
+    return out
+
+
+def basis_values(s: Array, n: int, basis: str) -> Array:
+    """Return the functions of the scaled scheduling signal.
+
+    `s`: (n_samples,); `n`: how many: degree + 1. Returns (n_samples, n).
+    """
+    from ambid.nonlinear.lpv._kernels import basis_rows
+
+    out = np.empty((s.size, n))
+    basis_rows(np.ascontiguousarray(s), BASES.index(basis), out)
+    return out
+
+
+def schedule_column(name: str, first: IOData) -> int:
+    """Return which input a schedule names.
+
+    `name`: ``level``, an input, or the output; `first`: one of the records. Returns -1 where the scheduling signal is
+    made of the output.
+    """
+    columns = (*first.inputs, *first.outputs)
+    if name == LEVEL:
+        if LEVEL in columns:
+            raise EstimationError(
+                "lpv: schedule = level means the low-passed output, but there is a column of that name. Rename "
+                "the column"
+            )
+        return -1
+    if name not in columns:
+        raise EstimationError(
+            f"lpv: schedule is {name!r}; it must be an input, the output or level: {', '.join((*columns, LEVEL))}. "
+            f"Name the column as an input too; it does not excite unless exciting = yes.{nearest(name, list(columns))}"
+        )
+    return first.inputs.index(name) if name in first.inputs else -1
+
+
+def schedule_over(records: Sequence[IOData], name: str, column: int, time_constant: float) -> Schedule:
+    """Return a schedule with the range that it has in the records.
+
+    `column`: as `schedule_column` says.
+    """
+    of = Schedule(name=name, column=column, time_constant=time_constant, low=0.0, high=0.0)
+    whole = np.concatenate([of.signal(x.u, x.y, x.dt)[1:] for x in records])
+    low, high = float(whole.min()), float(whole.max())
+    if not high - low > 1e-12 * max(abs(low), abs(high)):
+        raise EstimationError(
+            f"lpv: the scheduling signal {name!r} is constant at {low:g}; a model that is scheduled by it cannot be "
+            "told from a linear one. Give records at several set points, or fit a linear structure (bj, ararmax)"
+        )
+    return Schedule(name=name, column=column, time_constant=time_constant, low=low, high=high)
+
+
+# --- equations --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,15 +270,15 @@ class LpvShape:
         return np.array([self.order, self.ar, self.ma, own, self.first, self.n_offset], dtype=np.int64)
 
 
-def stable_process(shape: LpvShape, theta: Array) -> bool:
+def is_stable_process(shape: LpvShape, theta: Array) -> bool:
     """Return whether the frozen process part is stable over the range of p.
 
     `theta`: (n_theta,), scaled.
     """
-    return _stable(shape, theta, range(shape.order), shape.degree)
+    return _is_stable(shape, theta, range(shape.order), shape.degree)
 
 
-def sound(shape: LpvShape, theta: Array) -> bool:
+def is_sound(shape: LpvShape, theta: Array) -> bool:
     """Return whether the frozen predictor is stable over the range of p: C, and A in the output form.
 
     That a run stays finite does not say so: what was before the record is fitted as well, and can balance a mode that
@@ -138,12 +287,12 @@ def sound(shape: LpvShape, theta: Array) -> bool:
     `theta`: (n_theta,), scaled.
     """
     first = shape.n_process + shape.ar
-    if shape.ma and not _stable(shape, theta, range(first, first + shape.ma), shape.error_degree):
+    if shape.ma and not _is_stable(shape, theta, range(first, first + shape.ma), shape.error_degree):
         return False
-    return shape.form == "equation" or stable_process(shape, theta)
+    return shape.form == "equation" or is_stable_process(shape, theta)
 
 
-def _stable(shape: LpvShape, theta: Array, coefficients: Sequence[int], degree: int) -> bool:
+def _is_stable(shape: LpvShape, theta: Array, coefficients: Sequence[int], degree: int) -> bool:
     values = basis_values(np.linspace(-1.0, 1.0, 4 * degree + 1), degree + 1, shape.basis)
     rows = np.stack([values @ theta[shape.place(k)] for k in coefficients], axis=1)
     return all(stable(np.concatenate([[1.0], row])) for row in rows)
@@ -198,3 +347,138 @@ def errors(shape: LpvShape, part: Part, theta: Array, start: Array | None = None
         part.y, part.W, part.phi, part.psi, theta, start, shape.table(), slopes, x, g, e, J
     )  # fmt: skip
     return Errors(finite=bool(finite), x=x, g=g, e=e, J=J)
+
+
+# --- what was before a record -----------------------------------------------------------------------------------------
+
+
+def settling(shape: LpvShape) -> int:
+    """Return the samples, beyond those that a prediction looks back over, from which a beginning is estimated."""
+    return _EACH * shape.n_start
+
+
+def looks_back(shape: LpvShape) -> int:
+    """Return the samples of the past that a prediction needs, those of the beginning included."""
+    return shape.lag + settling(shape)
+
+
+def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False) -> tuple[Array, Array] | None:
+    """Estimate what was before a record.
+
+    `theta`: (n_theta,), scaled; `slopes`: whether to derive it by theta as well. Returns `w`: (n_start,), scaled;
+    `slope`: (n_start, n_theta), zeros unless asked for; instead of both, where the predictor diverges.
+    """
+    k, P = shape.n_start, shape.n_theta
+    last = looks_back(shape)
+    if not k or part.y.size < last:
+        return np.zeros(k), np.zeros((k, P))
+    head = replace(part, y=part.y[:last], W=part.W[:last], phi=part.phi[:last], psi=part.psi[:last])
+    found = errors(shape, head, theta, slopes=1)
+    if not found.finite:
+        return None
+    e, J = found.e[shape.lag :], found.J[shape.lag :, P:]
+    weight = np.ones(k)
+    weight[: k - shape.ma] = _STATES
+    H = J.T @ J + np.diag(weight)
+    w = np.asarray(np.linalg.solve(H, J.T @ e), dtype=np.float64)
+    if not slopes:
+        return w, np.zeros((k, P))
+
+    def by_theta(start: Array) -> Array:
+        return errors(shape, head, theta, start, slopes=2).J[shape.lag :, :P]
+
+    at, right = by_theta(w), np.empty((k, P))
+    rest = e - J @ w
+    for i in range(k):  # J is linear in w too, so that a difference over any step is its derivative
+        right[i] = rest @ (by_theta(w + np.eye(k)[i]) - at)
+    return w, np.asarray(np.linalg.solve(H, right - J.T @ at), dtype=np.float64)
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpvSettings:
+    """Settings of an LPV fit; described in the register of structures. None: to be chosen."""
+
+    order: int
+    error_order: int
+    nb: int
+    nk: int
+    degree: int | None
+    error_degree: int
+    error_form: str
+    form: str
+    basis: str
+    schedule: str
+    exciting: str
+    criterion: str
+    time_constant: float | None
+    iterations: int
+    column: int  # which input the schedule names; -1 for the output
+    columns: tuple[int, ...]  # which inputs excite
+
+    def as_mapping(self) -> dict[str, object]:
+        """Return the settings by the names that the register has for them; those left open are missing."""
+        names = (*_RANGES, *_CHOICES, "schedule")
+        return {k: v for k in names if (v := getattr(self, k)) is not None}
+
+
+def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
+    """Check settings and complete them.
+
+    `first`: one of the records.
+    """
+    name = given.get("schedule", LEVEL)
+    s: dict[str, Any] = checked("lpv", given, _RANGES, {**_CHOICES, "schedule": (str(name),)})
+    if first.n_outputs != 1:
+        raise EstimationError(
+            f"lpv takes one output, not {', '.join(first.outputs)}; fit them one after the other, with the same "
+            "schedule. Name one"
+        )
+    name = str(name)
+    column = schedule_column(name, first)
+    if s.get("exciting") == "yes" and column < 0:
+        raise EstimationError(
+            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {name} is none. Leave it out"
+        )
+    if s.get("time_constant") and name != LEVEL:
+        raise EstimationError(
+            f"lpv: time_constant is that of schedule = level; with schedule = {name} the column is taken as it is. "
+            "Leave it out"
+        )
+    error_order, error_form = _error_model(s)
+    excites = s.get("exciting", "no") == "yes"
+    order = int(s.get("order", 2))
+    return LpvSettings(
+        order=order,
+        error_order=error_order,
+        nb=int(s.get("nb", order)),
+        nk=int(s.get("nk", 1)),
+        degree=s.get("degree"),
+        error_degree=int(s.get("error_degree", 0)),
+        error_form=error_form,
+        form=str(s.get("form", "auto")),
+        basis=str(s.get("basis", "legendre")),
+        schedule=name,
+        exciting="yes" if excites else "no",
+        criterion=str(s.get("criterion", "aicc")),
+        time_constant=s.get("time_constant") if name == LEVEL else 0.0,
+        iterations=int(s.get("iterations", 60)),
+        column=column,
+        columns=tuple(k for k in range(first.n_inputs) if k != column or excites),
+    )
+
+
+def _error_model(s: Mapping[str, Any]) -> tuple[int, str]:
+    """Order and form of the error model; any form of order 0 is white noise."""
+    form = str(s.get("error_form", "auto"))
+    order = int(s.get("error_order", 0 if form == "white" else 5))
+    if order > 0 and form == "white":
+        raise EstimationError(f"lpv: error_form = white has no coefficients, but error_order = {order}. Leave one out")
+    if order == 0 and s.get("error_degree"):
+        raise EstimationError(
+            f"lpv: error_degree = {s['error_degree']} is of the error model's coefficients, and error_order = 0 leaves "
+            "none. Leave one out"
+        )
+    return order, form

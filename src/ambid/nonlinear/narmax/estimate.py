@@ -7,7 +7,8 @@ makes them too small where a term was a close call (Leeb and Poetscher 2005).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Literal
@@ -18,18 +19,24 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import information
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
+from ambid.nonlinear.failed import failed_fit, provenance
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
-from ambid.nonlinear.narmax.choose import Draft, process_terms, sampled_fast
-from ambid.nonlinear.narmax.costs import stage_costs
-from ambid.nonlinear.narmax.noise_model import with_all_noise, with_noise_terms
-from ambid.nonlinear.narmax.pruning import pruned_by_prediction, pruned_by_simulation
-from ambid.nonlinear.narmax.rational import rational_terms
-from ambid.nonlinear.narmax.result import failed_fit, finished_fit
-from ambid.nonlinear.narmax.scaled import Scaled, scaled_records
-from ambid.nonlinear.narmax.search import Fitted, evaluated, search
-from ambid.nonlinear.narmax.settings import NarmaxSettings, narmax_settings
-from ambid.nonlinear.narmax.simulated_choice import terms_by_simulation
+from ambid.nonlinear.narmax.choice import (
+    add_all_noise,
+    add_noise_terms,
+    is_sampled_fast,
+    process_terms,
+    prune_by_prediction,
+    prune_by_simulation,
+    rational_terms,
+)
+from ambid.nonlinear.narmax.model import OUTPUTS, Draft, PolynomialNarmax, cloud_of, lagged_signals, predict
+from ambid.nonlinear.narmax.settings import NarmaxSettings, narmax_settings, stage_costs
+from ambid.nonlinear.narmax.simulated import choose_by_simulation
+from ambid.nonlinear.narmax.terms import term_name
+from ambid.nonlinear.records import Scaled, scaled_records
 
 _CLEAR = 10.0  # of the information criterion, which all candidates have to gain over those of the ratios
 _MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more take minutes
@@ -39,7 +46,7 @@ DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree 
 
 
 @dataclass(slots=True)
-class Work:
+class Fitting:
     """What a fit has come to, so that an interruption loses nothing."""
 
     draft: Draft  # the best model so far that runs
@@ -79,33 +86,21 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
         raise EstimationError("narmax: no record is given. Pass one at least")
     s = narmax_settings(settings, n_inputs=records[0].n_inputs)
     began = perf_counter()
-    scaled = scaled_records("narmax", records, lag=s.lag, levels=s.levels)
+    scaled = scaled_records("narmax", records, lag=s.lag, levels=s.levels, fewest=10)
     _check_magnitude(s, records)
-    work = Work(draft=_linear_start(s, scaled))
+    fitting = Fitting(draft=_linear_start(s, scaled))
     try:
-        _identify(s, scaled, work, tick)
+        _fit_terms(s, scaled, fitting, tick)
     except KeyboardInterrupt:
-        work.status = "stalled"
-        work.warnings.insert(0, "interrupted: the best model so far")
+        fitting.status = "stalled"
+        fitting.warnings.insert(0, "interrupted: the best model so far")
     else:
-        if work.status == "stalled":
-            work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
-    work.timing_s["all"] = perf_counter() - began
-    one = np.ones(scaled.n_outputs)
-    if not evaluated(work.draft.tables, work.draft.theta, scaled.parts, one, free=False).finite:
-        return failed_fit(records, s, seed, DIVERGED, work.timing_s)
-    return finished_fit(
-        records,
-        s,
-        scaled,
-        work.draft,
-        seed=seed,
-        status=work.status,
-        focus=work.focus,
-        curves=tuple(work.curves),
-        warnings=tuple(work.warnings),
-        timing_s=work.timing_s,
-    )
+        if fitting.status == "stalled":
+            fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+    fitting.timing_s["all"] = perf_counter() - began
+    if not np.isfinite(fitting.draft.cost(scaled.parts, free=False)):
+        return failed_fit("narmax", records, s.as_mapping(), seed, DIVERGED, fitting.timing_s)
+    return _finish(records, s, scaled, fitting, seed)
 
 
 def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
@@ -126,30 +121,30 @@ def _linear_start(s: NarmaxSettings, scaled: Scaled) -> Draft:
     return process_terms(replace(s, degree=1, ne=0, selection="frols", output="signed"), scaled.parts, None)
 
 
-def _identify(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
+def _fit_terms(s: NarmaxSettings, scaled: Scaled, fitting: Fitting, tick: Tick | None) -> None:
     if tick is not None:
         tick("start", 0.0)
     if s.selection != "auto":
-        _along(s, scaled, work, tick)
+        _run_stages(s, scaled, fitting, tick)
         return
     first = process_terms(replace(s, selection="frols"), scaled.parts, None)
-    if not sampled_fast(first) or s.kind != "polynomial" or not _few(s, scaled, first):
-        _along(replace(s, selection="frols"), scaled, work, tick)
+    if not is_sampled_fast(first) or s.kind != "polynomial" or not _few(s, scaled, first):
+        _run_stages(replace(s, selection="frols"), scaled, fitting, tick)
         return
-    _along(replace(s, selection="frols"), scaled, work, part_of(tick, 0.0, 0.2))
-    by_ratio, status, curves, focus = work.draft, work.status, len(work.curves), work.focus
+    _run_stages(replace(s, selection="frols"), scaled, fitting, part_of(tick, 0.0, 0.2))
+    by_ratio, status, curves, focus = fitting.draft, fitting.status, len(fitting.curves), fitting.focus
     weight = _weight(scaled, by_ratio, free=False)
-    _along(replace(s, selection="all"), scaled, work, part_of(tick, 0.2, 1.0))
-    gained = _value(s, scaled, by_ratio, weight) - _value(s, scaled, work.draft, weight)
-    if gained > _CLEAR and work.focus == focus:
-        work.warnings.append(
+    _run_stages(replace(s, selection="all"), scaled, fitting, part_of(tick, 0.2, 1.0))
+    gained = _value(s, scaled, by_ratio, weight) - _value(s, scaled, fitting.draft, weight)
+    if gained > _CLEAR and fitting.focus == focus:
+        fitting.warnings.append(
             "sampled so fast that the last output takes nearly all of an error reduction ratio and hides what drives "
             "the plant: terms are what is left of all candidates (selection = all), which predict better than those "
             "chosen by the ratios"
         )
         return
-    work.draft, work.status, work.focus = by_ratio, status, focus
-    del work.curves[curves:]
+    fitting.draft, fitting.status, fitting.focus = by_ratio, status, focus
+    del fitting.curves[curves:]
 
 
 def _few(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> bool:
@@ -158,163 +153,147 @@ def _few(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> bool:
     return bool(draft.n_candidates <= min(_MOST_AT_ONCE, n // 20))
 
 
-def _along(s: NarmaxSettings, scaled: Scaled, work: Work, tick: Tick | None) -> None:
+def _run_stages(s: NarmaxSettings, scaled: Scaled, fitting: Fitting, tick: Tick | None) -> None:
     """All stages, one after the other."""
-    terms, below, noise, pruning, free = portions(tick, stage_costs(s, scaled.n_outputs, scaled.parts[0][1].shape[1]))
-    with _Timed(work, "terms"):
+    terms, below, noise, pruning, free = portions(tick, stage_costs(s, scaled.y_level.size, scaled.u_level.size))
+    with _timed(fitting, "terms"):
         if s.selection == "simulation":
-            draft = terms_by_simulation(s, scaled.parts, terms, lambda x: _keep_simulated(work, x))
+            draft = choose_by_simulation(s, scaled.parts, terms, lambda x: _keep_simulated(fitting, x))
         else:
             draft = process_terms(s, scaled.parts, terms)
         if s.kind == "rational":
             draft = rational_terms(s, draft, scaled.parts, part_of(below, 0.0, 0.5))
-            draft = _searched(scaled, draft, work, part_of(below, 0.5, 1.0), free=False)
+            draft = _search(scaled, draft, fitting, part_of(below, 0.5, 1.0), free=False)
         if not (s.selection == s.focus == "simulation"):
-            draft = _refitted(s, scaled, draft)
-            _keep(work, scaled, draft)
+            draft = _refit(s, scaled, draft)
+            _keep(fitting, scaled, draft)
     if s.selection == s.focus == "simulation":
-        with _Timed(work, "simulation errors"):
-            _fit_to_simulation(scaled, draft, work, free)
+        with _timed(fitting, "simulation errors"):
+            _fit_to_simulation(scaled, draft, fitting, free)
         return
-    with _Timed(work, "noise terms"):
+    with _timed(fitting, "noise terms"):
         if s.ne:
-            draft = with_noise_terms(s, draft, scaled.parts, part_of(noise, 0.0, 0.4))
-            draft = _searched(scaled, draft, work, part_of(noise, 0.4, 1.0), free=False)
-    with _Timed(work, "pruning"):
-        draft = _pruned(s, scaled, draft, work, pruning)
-    with _Timed(work, "simulation errors"):
+            draft = add_noise_terms(s, draft, scaled.parts, part_of(noise, 0.0, 0.4))
+            draft = _search(scaled, draft, fitting, part_of(noise, 0.4, 1.0), free=False)
+    with _timed(fitting, "pruning"):
+        draft = _prune(s, scaled, draft, fitting, pruning)
+    with _timed(fitting, "simulation errors"):
         if s.focus == "simulation":
-            _fit_to_simulation(scaled, draft, work, free)
+            _fit_to_simulation(scaled, draft, fitting, free)
 
 
-class _Timed:
+@contextmanager
+def _timed(fitting: Fitting, name: str) -> Iterator[None]:
     """Add what a stage takes to the timings, also where it is interrupted."""
-
-    def __init__(self, work: Work, name: str) -> None:
-        self.work, self.name, self.began = work, name, 0.0
-
-    def __enter__(self) -> None:
-        self.began = perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self.work.timing_s[self.name] = self.work.timing_s.get(self.name, 0.0) + perf_counter() - self.began
+    began = perf_counter()
+    try:
+        yield
+    finally:
+        fitting.timing_s[name] = fitting.timing_s.get(name, 0.0) + perf_counter() - began
 
 
 def _weight(scaled: Scaled, draft: Draft, *, free: bool) -> Array:
     """One over the standard deviation of each output's error; ones where the model does not run."""
-    one = np.ones(scaled.n_outputs)
-    found = evaluated(draft.tables, draft.theta, scaled.parts, one, free=free)
-    if not found.finite:
-        return one
-    size = np.sqrt(np.mean(np.concatenate(found.errors) ** 2, axis=0))
-    out: Array = 1.0 / np.maximum(size, 1e-12)
-    return out
+    errors = np.concatenate(draft.problem(scaled.parts, free=free).errors(draft.theta))
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.sqrt(np.mean(errors**2, axis=0))
+    return 1.0 / np.maximum(size, 1e-12) if np.all(np.isfinite(size)) else np.ones(size.size)
 
 
-def _refitted(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> Draft:
+def _refit(s: NarmaxSettings, scaled: Scaled, draft: Draft) -> Draft:
     """Coefficients by one-step errors for terms that were chosen, and fitted, by the free run."""
-    if s.selection != "simulation":
-        return draft
-    one = np.ones(scaled.n_outputs)
-    return draft.with_theta(search(draft.tables, draft.theta, scaled.parts, one, free=False).theta)
+    return draft if s.selection != "simulation" else draft.with_theta(draft.search(scaled.parts, free=False).theta)
 
 
-def _keep_simulated(work: Work, draft: Draft) -> None:
-    work.draft, work.focus = draft, "simulation"
+def _keep_simulated(fitting: Fitting, draft: Draft) -> None:
+    fitting.draft, fitting.focus = draft, "simulation"
 
 
-def _keep(work: Work, scaled: Scaled, draft: Draft) -> None:
-    """Hold on to a draft if it runs."""
-    if evaluated(draft.tables, draft.theta, scaled.parts, np.ones(scaled.n_outputs), free=False).finite:
-        work.draft, work.focus = draft, "prediction"
+def _keep(fitting: Fitting, scaled: Scaled, draft: Draft) -> None:
+    """Keep a draft if it runs."""
+    if np.isfinite(draft.cost(scaled.parts, free=False)):
+        fitting.draft, fitting.focus = draft, "prediction"
 
 
-def _searched(
-    scaled: Scaled, draft: Draft, work: Work, tick: Tick | None, *, free: bool, most: int = _ITERATIONS
+def _search(
+    scaled: Scaled, draft: Draft, fitting: Fitting, tick: Tick | None, *, free: bool, most: int = _ITERATIONS
 ) -> Draft:
     """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
-    t = draft.tables
-    if not free and not t.noisy and not any(draft.denominators):
-        _keep(work, scaled, draft)
+    if not free and not draft.tables.noisy and not any(draft.denominators):
+        _keep(fitting, scaled, draft)
         return draft
     weight = _weight(scaled, draft, free=free)
-    n = sum(max(y.shape[0] - t.lag, 1) for y, _ in scaled.parts) * scaled.n_outputs
 
     def keep(theta: Array) -> None:
-        work.draft, work.focus = draft.with_theta(theta), "simulation" if free else "prediction"
+        fitting.draft, fitting.focus = draft.with_theta(theta), "simulation" if free else "prediction"
 
-    found = search(t, draft.theta, scaled.parts, weight, free=free, most=most, tick=tick, keep=keep)
-    if not found.finite:
+    found = draft.search(scaled.parts, weight=weight, free=free, most=most, tick=tick, keep=keep)
+    if not np.isfinite(found.cost):
         return draft
-    _note(work, found, n, weight, free=free)
-    keep(found.theta)
-    return draft.with_theta(found.theta)
-
-
-def _note(work: Work, found: Fitted, n: int, weight: Array, *, free: bool) -> None:
-    work.status = "converged" if found.converged else "stalled"
-    work.curves.append(
+    n = sum(max(y.shape[0] - draft.tables.lag, 1) * y.shape[1] for y, _ in scaled.parts)
+    fitting.status = "converged" if found.converged else "stalled"
+    fitting.curves.append(
         LearningCurve(
             method=f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors",
             seconds=np.array(found.seconds),
             training=np.sqrt(np.array(found.costs) / n) / float(np.sqrt(np.mean(weight**2))),
         )
     )
+    keep(found.theta)
+    return draft.with_theta(found.theta)
 
 
-def _pruned(s: NarmaxSettings, scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> Draft:
+def _prune(s: NarmaxSettings, scaled: Scaled, draft: Draft, fitting: Fitting, tick: Tick | None) -> Draft:
     if s.pruning == "none":
         return draft
     if s.pruning == "simulation":
-        one = np.ones(scaled.n_outputs)
-        fewer = pruned_by_simulation(draft, scaled.parts, one, s.criterion, part_of(tick, 0.0, 0.6))
-        return draft if fewer is draft else _searched(scaled, fewer, work, part_of(tick, 0.6, 1.0), free=False)
+        fewer = prune_by_simulation(draft, scaled.parts, s.criterion, part_of(tick, 0.0, 0.6))
+        return draft if fewer is draft else _search(scaled, fewer, fitting, part_of(tick, 0.6, 1.0), free=False)
     weight = _weight(scaled, draft, free=False)
 
     def pruned(d: Draft, share: float, *, noise: bool = True, most: int = _ITERATIONS) -> Draft:
         for k in range(_PRUNINGS):  # a search between, for what may go is judged where the rest is at its best
-            fewer = pruned_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
+            fewer = prune_by_prediction(d, scaled.parts, weight, s.criterion, noise=noise)
             same, begin = fewer.theta.size == d.theta.size, share + 0.25 * k / _PRUNINGS
-            d = _searched(scaled, fewer, work, part_of(tick, begin, begin + 0.25 / _PRUNINGS), free=False, most=most)
+            d = _search(scaled, fewer, fitting, part_of(tick, begin, begin + 0.25 / _PRUNINGS), free=False, most=most)
             if same:
                 break
         return d
 
     best = pruned(draft, 0.0)
-    ended = work.status
-    richer = with_all_noise(s, draft)
+    ended = fitting.status
+    richer = add_all_noise(s, draft)
     if richer is not draft and draft.tables.noisy:
         # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
         # these are there can the surplus process terms go one by one.
-        other = _searched(scaled, richer, work, part_of(tick, 0.25, 0.5), free=False, most=_ROUGHLY)
+        other = _search(scaled, richer, fitting, part_of(tick, 0.25, 0.5), free=False, most=_ROUGHLY)
         other = pruned(pruned(other, 0.5, noise=False, most=_ROUGHLY), 0.75)
         if _value(s, scaled, other, weight) < _value(s, scaled, best, weight):
-            best, ended = other, work.status
-    work.status = ended
-    _keep(work, scaled, best)
+            best, ended = other, fitting.status
+    fitting.status = ended
+    _keep(fitting, scaled, best)
     return best
 
 
 def _value(s: NarmaxSettings, scaled: Scaled, draft: Draft, weight: Array) -> float:
     """Information criterion of the one-step errors."""
-    found = evaluated(draft.tables, draft.theta, scaled.parts, weight, free=False)
-    n = sum(x.size for x in found.errors)
+    cost = draft.cost(scaled.parts, weight=weight, free=False)
+    n = sum(max(y.shape[0] - draft.tables.lag, 0) * y.shape[1] for y, _ in scaled.parts)
     m = max(draft.n_candidates, draft.theta.size)
-    return information(s.criterion, found.cost / n, draft.theta.size, n, m) if found.finite else np.inf
+    return information(s.criterion, cost / n, draft.theta.size, n, m) if np.isfinite(cost) else np.inf
 
 
-def _fit_to_simulation(scaled: Scaled, draft: Draft, work: Work, tick: Tick | None) -> None:
-    one = np.ones(scaled.n_outputs)
+def _fit_to_simulation(scaled: Scaled, draft: Draft, fitting: Fitting, tick: Tick | None) -> None:
     if any(f.kind == "e" for terms in draft.numerators for x in terms for f in x):
         draft = _without_noise(draft)
-    if not evaluated(draft.tables, draft.theta, scaled.parts, one, free=True).finite:
-        work.status = "stalled"
-        work.warnings.append(
+    if not np.isfinite(draft.cost(scaled.parts, free=True)):
+        fitting.status = "stalled"
+        fitting.warnings.append(
             "the free run of the chosen terms diverges, so that their coefficients are those of the one-step errors: "
             "choose terms by simulation (selection or pruning), or lower degree"
         )
         return
-    _searched(scaled, draft, work, tick, free=True)
+    _search(scaled, draft, fitting, tick, free=True)
 
 
 def _without_noise(draft: Draft) -> Draft:
@@ -326,3 +305,145 @@ def _without_noise(draft: Draft) -> Draft:
                 drop.append(k)
             k += 1
     return draft.without(drop, np.delete(draft.theta, drop))
+
+
+# --- the fit ---------------------------------------------------------------------------------------------------------
+
+
+def _finish(records: Sequence[IOData], s: NarmaxSettings, scaled: Scaled, fitting: Fitting, seed: int) -> NonlinearFit:
+    """Return the fit of a draft that runs."""
+    draft, free = fitting.draft, fitting.focus == "simulation"
+    model = _make_model(records, scaled, draft)
+    errors = np.concatenate(draft.problem(scaled.parts, free=free).errors(draft.theta))
+    freedom = max(errors.shape[0] - draft.theta.size / errors.shape[1], 1.0)
+    noise = errors.T @ errors / freedom
+    covariance, why = _covariance(scaled, draft, noise, free=free)
+    warnings = [*fitting.warnings, *why, *_caution(records, s, scaled, draft, free=free)]
+    if covariance is None:
+        warnings.append("no covariance, and so no standard deviations: the data do not determine the coefficients")
+    else:
+        covariance = covariance * model.unit[:, None] * model.unit
+    return NonlinearFit(
+        structure="narmax",
+        settings={**s.as_mapping(), "focus": fitting.focus},
+        model=model,
+        covariance=covariance,
+        covariance_from="" if covariance is None else "information",
+        n_estimated=int(draft.theta.size),
+        noise_covariance=noise * scaled.y_scale[:, None] * scaled.y_scale,
+        seed=seed,
+        status=fitting.status,
+        curves=tuple(fitting.curves),
+        warnings=tuple(warnings),
+        timing_s=dict(fitting.timing_s),
+        details=_details(draft, model, records),
+        **provenance(records),
+    )
+
+
+def _make_model(records: Sequence[IOData], scaled: Scaled, draft: Draft) -> PolynomialNarmax:
+    t = draft.tables
+    model = PolynomialNarmax(
+        dt=records[0].dt,
+        n_inputs=draft.n_inputs,
+        numerators=draft.numerators,
+        denominators=draft.denominators,
+        theta=np.ones(draft.theta.size),
+        u_level=scaled.u_level,
+        u_scale=scaled.u_scale,
+        y_level=scaled.y_level,
+        y_scale=scaled.y_scale,
+        cloud=cloud_of([lagged_signals(t, predict(t, draft.theta, y, u)[1]) for y, u in scaled.parts]),
+        output=OUTPUTS[draft.folded],
+    )
+    return model.with_theta(draft.theta * model.unit)
+
+
+def _covariance(scaled: Scaled, draft: Draft, noise: Array, *, free: bool) -> tuple[Array | None, list[str]]:
+    """Covariance of the scaled coefficients from the information matrix.
+
+    Simulation errors are coloured: there the scatter of the scores over the record takes the place of white noise
+    (Newey and West 1987).
+    """
+    problem = draft.problem(scaled.parts, weight=1.0 / np.sqrt(np.maximum(np.diag(noise), 1e-300)), free=free)
+    R = problem.triangle(draft.theta)
+    if R.shape[0] < draft.theta.size or not np.all(np.isfinite(R)):
+        return None, []
+    inverse, condition = information_inverse(R[:, :-1])
+    if inverse is None:
+        return None, [
+            f"the data do not tell the chosen terms apart (condition number {condition:.1e}). "
+            "Lower terms or degree, or excite more"
+        ]
+    P = inverse @ _scatter(problem.rows(draft.theta)) @ inverse if free else inverse
+    return (P + P.T) / 2, []
+
+
+def _scatter(rows: Sequence[Array]) -> Array:
+    """Covariance of the sum of the scores, neighbours included as far as their correlation reaches."""
+    total = np.zeros((rows[0].shape[2] - 1,) * 2)
+    for x in rows:
+        g = np.einsum("toq,to->tq", x[:, :, :-1], x[:, :, -1])
+        reach = int(np.ceil(4 * g.shape[0] ** (1 / 3)))
+        total += g.T @ g
+        for k in range(1, min(reach, g.shape[0] - 1) + 1):
+            cross = g[k:].T @ g[:-k]
+            total += (1 - k / (reach + 1)) * (cross + cross.T)
+    return total
+
+
+def _caution(records: Sequence[IOData], s: NarmaxSettings, scaled: Scaled, draft: Draft, *, free: bool) -> list[str]:
+    found = []
+    told_open = all(x.open_loop for x in records) or not draft.n_inputs
+    if free and not told_open:
+        found.append(
+            "fitted to the free run, narmax is biased where a controller was at work, and nothing says that these "
+            "records are open loop: use focus = prediction, or say --open-loop if there was no feedback"
+        )
+    elif not s.ne and not told_open:
+        found.append(
+            "without a noise model (ne = 0) narmax is biased under feedback unless the equation error is white: "
+            "raise ne, or say --open-loop if there was no feedback"
+        )
+    if not free and not np.isfinite(draft.cost(scaled.parts, free=True)):
+        found.append(
+            "the free run diverges on the records that the model was fitted to: it predicts, but does not simulate. "
+            "Choose terms by simulation (selection or pruning), or lower degree"
+        )
+    if any(draft.denominators) and _denominator_vanishes(scaled, draft):
+        found.append("a denominator comes near zero on the training data: predictions there are not to be trusted")
+    return found
+
+
+def _denominator_vanishes(scaled: Scaled, draft: Draft) -> bool:
+    t = draft.tables
+    for y, u in scaled.parts:
+        _, z = predict(t, draft.theta, y, u)
+        for o in range(t.n_outputs):
+            a = np.ones(z.shape[0] - t.lag)
+            for k in np.flatnonzero((t.place[:, 0] == o) & (t.place[:, 1] == 1)):
+                p = np.full(a.size, draft.theta[k])
+                for v in t.terms[k][t.terms[k] >= 0]:
+                    p = p * z[t.lag - t.back[v] : z.shape[0] - t.back[v], t.column[v]]
+                a = a + p
+            if np.min(a) < 0.05 * np.max(np.abs(a)):
+                return True
+    return False
+
+
+def _details(draft: Draft, model: PolynomialNarmax, records: Sequence[IOData]) -> dict[str, object]:
+    terms: dict[str, list[dict[str, object]]] = {}
+    n_y = len(draft.numerators)
+    for o, num in enumerate(draft.numerators):
+        terms[records[0].outputs[o]] = [
+            {"term": term_name(x, n_y, draft.n_inputs), "err": draft.err.get((o, x))} for x in num
+        ]
+    return {
+        "terms": terms,
+        "candidates": draft.n_candidates,
+        "passes": draft.passes,
+        "levels": {
+            **dict(zip(records[0].inputs, model.u_level.tolist(), strict=True)),
+            **dict(zip(records[0].outputs, model.y_level.tolist(), strict=True)),
+        },
+    }
