@@ -317,7 +317,7 @@ class Fitting:
     status: Literal["converged", "stalled"] = "converged"
     curves: list[LearningCurve] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    tried: list[dict[str, object]] = field(default_factory=list)  # candidates with their criterion
+    tried: list[Candidate] = field(default_factory=list)
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def parts(self, shape: LpvShape, schedule: Schedule | None = None) -> tuple[Part, ...]:
@@ -355,6 +355,11 @@ class Candidate:
         Returns the smaller the better.
         """
         return information(criterion, self.cost, self.n, self.shape.n_theta, self.starts)
+
+    def summary(self) -> dict[str, object]:
+        """Return what it is and how good, for the details of a fit."""
+        of, found = self.shape, {k: v if np.isfinite(v := self.value(k)) else None for k in ("aicc", "bic")}
+        return {"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found}
 
 
 def search_from(
@@ -408,8 +413,7 @@ def search_from(
 
 
 def _note(fitting: Fitting, x: Candidate) -> Candidate:
-    of, found = x.shape, {k: v if np.isfinite(v := x.value(k)) else None for k in ("aicc", "bic")}
-    fitting.tried.append({"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found})
+    fitting.tried.append(x)
     return x
 
 

@@ -7,6 +7,7 @@ the one-step errors -> Levenberg-Marquardt with exact derivatives. Starts come f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -20,9 +21,11 @@ from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.failed import failed_fit, provenance
 from ambid.nonlinear.fit import NonlinearFit, Settings
 from ambid.nonlinear.lpv.candidates import (
+    Candidate,
     Fitting,
     by_degree,
     by_form,
+    carry_over,
     choose_level,
     least_squares,
     other_degrees,
@@ -174,7 +177,7 @@ def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitti
             f"number {condition:.1e}). Lower degree or error_order, or give records at more set points"
         )
     else:
-        covariance = noise * inverse * model.unit[:, None] * model.unit
+        covariance = (noise * inverse + _disagreement(fitting)) * model.unit[:, None] * model.unit
     return NonlinearFit(
         structure="lpv",
         settings=dict(used),
@@ -198,7 +201,7 @@ def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitti
             },
             "condition": condition,
             "frozen": frozen_table(model, covariance, records[0].inputs),
-            "tried": list(fitting.tried),
+            "tried": [x.summary() for x in fitting.tried],
         },
         **provenance(records),
     )
@@ -274,20 +277,38 @@ def _caution(records: Sequence[IOData], fitting: Fitting) -> list[str]:
     return found + _close_calls(fitting)
 
 
-def _close_calls(fitting: Fitting) -> list[str]:
-    """Other degrees that the data hardly tell from the chosen one, everything else alike."""
+def _other_degrees(fitting: Fitting) -> list[tuple[Candidate, float]]:
+    """Candidates of other degrees, everything else alike, and by how much Akaike's criterion is worse of each."""
     of = fitting.shape
     alike = {
-        str(x["degree"]): x["aicc"]
-        for x in fitting.tried
-        if (x["form"], x["ar"], x["ma"]) == (of.form, of.ar, of.ma) and isinstance(x["aicc"], float)
+        x.shape.degree: x for x in fitting.tried if replace(x.shape, degree=of.degree) == of and np.isfinite(x.cost)
     }
-    own = alike.pop(str(of.degree), None)
-    close = [k for k, value in alike.items() if own is not None and abs(value - own) < _CLOSE]
+    own = alike.pop(of.degree, None)
+    return [] if own is None else [(x, x.value("aicc") - own.value("aicc")) for x in alike.values()]
+
+
+def _disagreement(fitting: Fitting) -> Array:
+    """Covariance of the coefficients, scaled, by which degree the model might have had (Burnham and Anderson 2002).
+
+    Each other degree counts by its Akaike weight with the square of what its coefficients differ by over the range of
+    p: unconditional variance, sec. 4.3.
+    """
+    of, theta = fitting.shape, fitting.theta
+    found = [
+        (np.exp(-max(worse, 0.0) / 2.0), carry_over(of, x.shape, x.theta) - theta)
+        for x, worse in _other_degrees(fitting)
+    ]
+    total = 1.0 + sum(w for w, _ in found)
+    out: Array = sum((w / total * np.outer(d, d) for w, d in found), np.zeros((theta.size, theta.size)))
+    return out
+
+
+def _close_calls(fitting: Fitting) -> list[str]:
+    """Other degrees that the data hardly tell from the chosen one, everything else alike."""
+    close = [str(x.shape.degree) for x, worse in _other_degrees(fitting) if abs(worse) < _CLOSE]
     if not close:
         return []
     return [
-        f"degree {of.degree} is a close call: degree {' and '.join(close)} would explain the data about as "
-        "well. The standard deviations take the degree for given and are too small by that choice. Name it if you know "
-        "it"
+        f"degree {fitting.shape.degree} is a close call: degree {' and '.join(close)} would explain the data about as "
+        "well. The standard deviations count what these differ by. Name the degree if you know it"
     ]
