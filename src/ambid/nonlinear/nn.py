@@ -8,6 +8,7 @@ that failed, and training again -> covariance.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from time import perf_counter
 from typing import Any
 
@@ -19,7 +20,7 @@ from ambid.estimation.progress import Tick, part_of, portions, silent
 from ambid.nonlinear.fit import NonlinearFit, Settings
 from ambid.nonlinear.nn_magnitude import nn_of_magnitude
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import checked
+from ambid.nonlinear.settings import choice, number, read_settings, whole
 from ambid.nonlinear.state_start import (
     LARGEST,
     NO_START,
@@ -45,34 +46,7 @@ from ambid.nonlinear.state_training import (
     train,
 )  # fmt: skip
 
-_RANGES: Mapping[str, tuple[float, float]] = {
-    "states": (1, 20),
-    "delay": (0, 1000),
-    "neurons": (0, 40),
-    "starts": (1, 20),
-    "prior": (0.01, 1e6),
-    "descent": (0, 10_000),
-    "iterations": (1, 2000),
-    "evaluations": (0, 1_000_000),
-}
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "form": ("auto", "one-axis", "free"),
-    "noise": ("auto", "output", "innovations"),
-    "output": ("signed", "magnitude"),
-    "uncertainty": ("auto", "laplace", "sandwich", "bootstrap", "none"),
-}
-_DEFAULTS: Mapping[str, object] = {
-    "form": "auto",
-    "output": "signed",
-    "neurons": 0,
-    "prior": 3.0,
-    "starts": 3,
-    "noise": "auto",
-    "descent": 10,
-    "iterations": 50,
-    "evaluations": 2000,
-    "uncertainty": "auto",
-}
+_SIGNED: Mapping[str, object] = {"neurons": 0, "prior": 3.0, "starts": 3, "evaluations": 2000}
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
 _LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
 _BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
@@ -83,6 +57,44 @@ _DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues a
 )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NnSettings:
+    """Settings of a state-space network."""
+
+    form: str = choice(
+        "one-axis (entries of thesis eq. 4.8), free, auto (one-axis where units are V, m, A); auto",
+        *("auto", "one-axis", "free"),
+    )
+    states: int | None = whole("of the form free; chosen by Bayes' criterion. one-axis has 3", 1, 20)
+    delay: int | None = whole(
+        "samples by which inputs act late; auto (0 to 20, by the errors of short trainings)", 0, 1000
+    )
+    output: str = choice(
+        "magnitude where the sensor sees no sign (free, no gain, up to four states, odd units); signed",
+        *("signed", "magnitude"),
+    )
+    neurons: int | None = whole(
+        "hidden units of G(x, u); 0; with output=magnitude chosen by how runs go on behind training", 0, 40
+    )
+    prior: float | None = number(
+        "standard deviation of G's weights before the data, scaled; 3, with output=magnitude 1", 0.01, 1e6
+    )
+    starts: int | None = whole("random starts of G; 3, with output=magnitude 20", 1, 20)
+    noise: str = choice(
+        "output, innovations (predictor gain), auto (gain where errors are not white); auto",
+        *("auto", "output", "innovations"),
+    )
+    descent: int = whole("iterations of the thesis's steepest descent, shown beside; 10", 0, 10_000, 10)
+    iterations: int = whole("of each training, at most; 50", 1, 2000, 50)
+    evaluations: int | None = whole(
+        "of a global search (one-axis) where starts fail; given, where errors are suspect too; 2000", 0, 1_000_000
+    )
+    uncertainty: str = choice(
+        "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich if not white); auto",
+        *("auto", "laplace", "sandwich", "bootstrap", "none"),
+    )
+
+
 def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9).
 
@@ -91,18 +103,19 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     there is a global search. The form ``free`` has none: its states have no fixed meaning, so that nothing bounds the
     entries; its starts come from subspace models of several horizons.
     """
-    given = checked("nn", settings, _RANGES, _CHOICES, auto=("states", "delay", "neurons"))
-    if given.get("output") == "magnitude":
+    chosen = {k: v for k, v in asdict(read_settings(NnSettings, "nn", settings)).items() if v is not None}
+    given = {k: v for k, v in chosen.items() if k in settings}
+    if chosen["output"] == "magnitude":
         return nn_of_magnitude(records, given, seed, tick)
-    s: dict[str, Any] = {**_DEFAULTS, **given}
-    whole = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))
+    s: dict[str, Any] = {**_SIGNED, **chosen}
+    data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))
     s["form"] = _choose_form(str(s["form"]), records[0])
-    fitting, reason = Fitting(data=whole), ""
+    fitting, reason = Fitting(data=data), ""
     try:
-        reason = _start(s, whole, records[0], fitting, tick)
+        reason = _start(s, data, records[0], fitting, tick)
         if not reason:
             _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
-        reason = _rescue(s, whole, records[0], fitting, seed, tick, reason, asked=bool(given.get("evaluations")))
+        reason = _rescue(s, data, records[0], fitting, seed, tick, reason, asked=bool(given.get("evaluations")))
         if fitting.state is not None:
             fitting.warnings += _suspect(s, fitting)
     except KeyboardInterrupt as stop:

@@ -24,6 +24,7 @@ class _Rule:
     high: float = 0.0
     whole: bool = False
     options: tuple[str, ...] = ()
+    name: bool = False
 
     def check(self, structure: str, name: str, value: object) -> None:
         """Refuse what it may not be."""
@@ -33,6 +34,8 @@ class _Rule:
                 raise EstimationError(
                     f"{structure}: {name} is {value!r}; it must be one of {', '.join(self.options)}.{near}"
                 )
+            return
+        if self.name:
             return
         number = isinstance(value, int if self.whole else (int, float)) and not isinstance(value, bool)
         if not number or not self.low <= value <= self.high:  # type: ignore[operator]
@@ -57,6 +60,11 @@ def choice(says: str, *options: str, default: str = "") -> Any:
     return field(default=default or options[0], metadata={"rule": _Rule(says, options=options)})
 
 
+def text(says: str, default: str) -> Any:
+    """Return a field for a name, which whoever reads it checks."""
+    return field(default=default, metadata={"rule": _Rule(says, name=True)})
+
+
 def rules(settings: type) -> dict[str, _Rule]:
     """Return the rule of each setting."""
     return {f.name: f.metadata["rule"] for f in fields(settings)}
@@ -77,26 +85,3 @@ def read_settings(settings: type[S], structure: str, given: Mapping[str, object]
         known[name].check(structure, name, value)
         taken[name] = value
     return settings(**taken)
-
-
-def checked(
-    structure: str,
-    given: Mapping[str, object],
-    ranges: Mapping[str, tuple[float, float]],
-    choices: Mapping[str, tuple[str, ...]],
-    auto: tuple[str, ...] = (),
-) -> dict[str, object]:
-    """Check settings by name; `ranges` are of whole numbers where both bounds are.
-
-    Returns what was given, less what is ``auto``.
-    """
-    known = {k: _Rule("", *r, whole=all(isinstance(x, int) for x in r)) for k, r in ranges.items()}
-    known |= {k: _Rule("", options=o) for k, o in choices.items()}
-    for name, value in given.items():
-        if name not in known:
-            raise EstimationError(
-                f"{structure}: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, list(known))}"
-            )
-        if not (name in auto and value == "auto"):
-            known[name].check(structure, name, value)
-    return {k: v for k, v in given.items() if not (k in auto and v == "auto")}

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -28,30 +28,12 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.roots import stable
 from ambid.errors import EstimationError, nearest
-from ambid.nonlinear.settings import checked
+from ambid.nonlinear.settings import choice, number, read_settings, text, whole
 
 LEVEL = "level"
 BASES = ("legendre", "hats")
 _EACH = 4  # samples for each number
 _STATES = 0.01  # variance of an innovation over that of what a state differs by
-_RANGES: Mapping[str, tuple[float, float]] = {
-    "order": (1, 10),
-    "error_order": (0, 20),
-    "nb": (0, 50),
-    "nk": (0, 1000),
-    "degree": (0, 8),
-    "error_degree": (0, 8),
-    "time_constant": (0.0, 1e9),
-    "iterations": (1, 2000),
-}
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "error_form": ("auto", "white", "ar", "ma", "arma"),
-    "form": ("auto", "equation", "output"),
-    "basis": BASES,
-    "exciting": ("no", "yes"),
-    "criterion": ("aicc", "aic", "bic"),
-}
-
 # --- schedule ---------------------------------------------------------------------------------------------------------
 
 
@@ -398,87 +380,82 @@ def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LpvSettings:
-    """Settings of an LPV fit; described in the register of structures. None: to be chosen."""
+class LpvOptions:
+    """What an LPV fit may be given. None: to be chosen."""
 
-    order: int
-    error_order: int
+    schedule: str = text(
+        "scheduling signal: an input, the output, or level (set point: output, low-passed); level", LEVEL
+    )
+    time_constant: float | None = number(
+        "of the low-pass of level, in s; chosen, at least five of the plant's own", 0.0, 1e9
+    )
+    exciting: str = choice("yes where the scheduling input acts on the output as well; no", "no", "yes")
+    order: int = whole("of the system model; 2", 1, 10, 2)
+    nb: int | None = whole("coefficients of each input; order", 0, 50)
+    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
+    degree: int | None = whole("of the coefficients in the scheduling signal; chosen, up to 3", 0, 8)
+    criterion: str = choice("what chooses the degree: aicc, aic, bic; aicc", "aicc", "aic", "bic")
+    basis: str = choice("legendre (polynomials) or hats (piecewise linear, degree pieces); legendre", *BASES)
+    form: str = choice(
+        "output (noise on the output) or equation (noise in it; unstable plants); chosen by bic",
+        *("auto", "equation", "output"),
+    )
+    error_order: int | None = whole("of the error model, 0 for white noise; 5", 0, 20)
+    error_form: str = choice("ar, ma, arma; chosen by bic", "auto", "white", "ar", "ma", "arma")
+    error_degree: int = whole("of the error model's coefficients in the scheduling signal; 0", 0, 8, 0)
+    iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpvSettings(LpvOptions):
+    """Settings of an LPV fit, completed."""
+
     nb: int
-    nk: int
-    degree: int | None
-    error_degree: int
-    error_form: str
-    form: str
-    basis: str
-    schedule: str
-    exciting: str
-    criterion: str
-    time_constant: float | None
-    iterations: int
+    error_order: int
     column: int  # which input the schedule names; -1 for the output
     columns: tuple[int, ...]  # which inputs excite
 
     def as_mapping(self) -> dict[str, object]:
         """Return the settings by the names that the register has for them; those left open are missing."""
-        names = (*_RANGES, *_CHOICES, "schedule")
-        return {k: v for k in names if (v := getattr(self, k)) is not None}
+        return {f.name: v for f in fields(LpvOptions) if (v := getattr(self, f.name)) is not None}
 
 
 def lpv_settings(given: Mapping[str, object], first: IOData) -> LpvSettings:
-    """Check settings and complete them.
-
-    `first`: one of the records.
-    """
-    name = given.get("schedule", LEVEL)
-    s: dict[str, Any] = checked("lpv", given, _RANGES, {**_CHOICES, "schedule": (str(name),)})
+    """Check settings beside one of the records, and complete them."""
+    s = read_settings(LpvOptions, "lpv", given)
     if first.n_outputs != 1:
         raise EstimationError(
             f"lpv takes one output, not {', '.join(first.outputs)}; fit them one after the other, with the same "
             "schedule. Name one"
         )
-    name = str(name)
-    column = schedule_column(name, first)
-    if s.get("exciting") == "yes" and column < 0:
+    column = schedule_column(s.schedule, first)
+    excites = s.exciting == "yes"
+    if excites and column < 0:
         raise EstimationError(
-            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {name} is none. Leave it out"
+            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {s.schedule} is none. Leave "
+            "it out"
         )
-    if s.get("time_constant") and name != LEVEL:
+    if s.time_constant and s.schedule != LEVEL:
         raise EstimationError(
-            f"lpv: time_constant is that of schedule = level; with schedule = {name} the column is taken as it is. "
-            "Leave it out"
+            f"lpv: time_constant is that of schedule = level; with schedule = {s.schedule} the column is taken as it "
+            "is. Leave it out"
         )
-    error_order, error_form = _error_model(s)
-    excites = s.get("exciting", "no") == "yes"
-    order = int(s.get("order", 2))
-    return LpvSettings(
-        order=order,
-        error_order=error_order,
-        nb=int(s.get("nb", order)),
-        nk=int(s.get("nk", 1)),
-        degree=s.get("degree"),
-        error_degree=int(s.get("error_degree", 0)),
-        error_form=error_form,
-        form=str(s.get("form", "auto")),
-        basis=str(s.get("basis", "legendre")),
-        schedule=name,
-        exciting="yes" if excites else "no",
-        criterion=str(s.get("criterion", "aicc")),
-        time_constant=s.get("time_constant") if name == LEVEL else 0.0,
-        iterations=int(s.get("iterations", 60)),
-        column=column,
-        columns=tuple(k for k in range(first.n_inputs) if k != column or excites),
-    )
-
-
-def _error_model(s: Mapping[str, Any]) -> tuple[int, str]:
-    """Order and form of the error model; any form of order 0 is white noise."""
-    form = str(s.get("error_form", "auto"))
-    order = int(s.get("error_order", 0 if form == "white" else 5))
-    if order > 0 and form == "white":
+    order = s.error_order
+    if order is None:
+        order = 0 if s.error_form == "white" else 5
+    if order > 0 and s.error_form == "white":
         raise EstimationError(f"lpv: error_form = white has no coefficients, but error_order = {order}. Leave one out")
-    if order == 0 and s.get("error_degree"):
+    if order == 0 and s.error_degree:  # any form of order 0 is white noise
         raise EstimationError(
-            f"lpv: error_degree = {s['error_degree']} is of the error model's coefficients, and error_order = 0 leaves "
+            f"lpv: error_degree = {s.error_degree} is of the error model's coefficients, and error_order = 0 leaves "
             "none. Leave one out"
         )
-    return order, form
+    completed: dict[str, Any] = {
+        **asdict(s),
+        "error_order": order,
+        "nb": s.order if s.nb is None else s.nb,
+        "time_constant": s.time_constant if s.schedule == LEVEL else 0.0,
+        "column": column,
+        "columns": tuple(k for k in range(first.n_inputs) if k != column or excites),
+    }
+    return LpvSettings(**completed)
