@@ -13,8 +13,8 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.narx import narx
 from ambid.nonlinear.nn import nn
 from ambid.nonlinear.state_training import State, disagreement
-from tests.nonlinear.networks.test_state_network import one_axis, sampled
 from tests.nonlinear.test_narx import data
+from tests.nonlinear.test_state_network import one_axis, sampled
 
 
 def coloured(n: int, seed: int, size: float, pole: float = 0.9) -> np.ndarray:

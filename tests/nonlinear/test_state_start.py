@@ -11,7 +11,7 @@ from ambid.nonlinear import nn as home
 from ambid.nonlinear import state_start
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.nn import nn
-from tests.nonlinear.networks.test_state_network import bearing, linearised, sampled
+from tests.nonlinear.test_state_network import bearing, linearised, sampled
 
 
 def errors(fit: NonlinearFit) -> dict[str, float]:
