@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ambid.cli import INTERRUPTED
+from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, orders_of
 from ambid.cli.options import FAILED_CHECK, From, Rate, RecordFile, RigFile, To, json_path
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter
@@ -28,6 +29,27 @@ _SHORTEST_S, _LONGEST_S = 1e-3, 1e9  # of --memory: below a block, and beyond an
 def command(
     record: RecordFile,
     rig: RigFile = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            metavar="NAME",
+            help="rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to"
+            " --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
+        ),
+    ] = "rpem",
+    inputs: Inputs = None,
+    output: OutputColumns = None,
+    orders: Annotated[
+        str | None,
+        typer.Option("--orders", metavar="na=2,nb=2,nk=1", help="Orders of coefficients.", show_default=False),
+    ] = None,
+    reference: References = None,
+    open_loop: OpenLoop = False,
+    step: Annotated[
+        float | None,
+        typer.Option("--step", metavar="X", help="Step of lms and nlms, for signals of size one.", show_default=False),
+    ] = None,
     start: Annotated[
         Path | None,
         typer.Option(
@@ -107,6 +129,17 @@ def command(
 
     _check(every, limit, start, start_seconds)
     remembered, flags = memory_of(memory), flags_of(flag)
+    settings: dict[str, Any] = {
+        "inputs": tuple(inputs or ()),
+        "outputs": tuple(output or ()),
+        "references": tuple(reference or ()),
+        "orders": None if orders is None else orders_of(orders),
+        "open_loop": open_loop,
+        "step": step,
+    }
+    given = {name: value for name, value in settings.items() if value}
+    if method == "rpem" and given:
+        raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or leave it out")
     with Outputs(record, rig, start) as outputs:
         path = json_path(json)
         outputs.claim(path, "--json")
@@ -125,6 +158,7 @@ def command(
             lambda: track(
                 record,
                 bench,
+                method=method,
                 start=start,
                 start_s=start_seconds,
                 every_s=every,
@@ -139,6 +173,7 @@ def command(
                 on_line=follower.on_line,
                 keep=False,
                 tick=follower.tick,
+                **given,
             )
         )
         if plot is not None and summary is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
@@ -25,6 +25,7 @@ def track(
     record: Record | str | Path,
     rig: Rig | str | Path | None = None,
     *,
+    method: str = "rpem",
     start: Estimate | str | Path | None = None,
     start_s: float | None = None,
     every_s: float = 0.01,
@@ -39,9 +40,11 @@ def track(
     on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
     keep: bool = True,
     tick: Tick | None = None,
+    **settings: Any,
 ) -> Track:
-    """Follow the physical parameters of a bench through a record.
+    """Follow the physical parameters of a bench through a record, or with another `method` what that estimates.
 
+    `method`: ``rpem``, the supervised tracker, or one of `ambid.job.track_estimator.METHODS`, which takes `settings`;
     `start`: where tracking begins; default: an identification of the first part of the record; `start_s`: length of
     that part, s; `every_s`: reporting interval, s of record; `limit`: acceptable model error, in multiples of that at
     identification; `pace`: replay as fast as possible, or as the record was taken; `flags`: what an operator sets and
@@ -58,6 +61,15 @@ def track(
         raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
     told = rig if rig is None or isinstance(rig, Rig) else load_rig(rig)
     bench_rig = told or default_rig()
+    if method != "rpem" or settings:
+        from ambid.job.track_estimator import track_estimator
+
+        if pace != "fastest" or flags:
+            raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Leave them out")
+        return track_estimator(
+            record, told, method=method, start=start, start_s=start_s, every_s=every_s, limit=limit, memory=memory,
+            from_s=from_s, to_s=to_s, rate_hz=rate_hz, on_header=on_header, on_line=on_line, keep=keep, **settings,
+        )  # fmt: skip
     source = rows_of(record, told, from_s=from_s, to_s=to_s, rate_hz=rate_hz)
     say("start")
     begin = start_of(source, bench_rig, given=start, start_s=start_s, rig_speaks=told is not None)

@@ -13,7 +13,7 @@ def block_rows(signals: Array, rows: Array, errors: Array, s: Array, c: Array, f
     `signals` (n, 4) is prefiltered, means off, scaled. `rows` (n, 21): regressors and target of the current (5 + 1) and
     of the position (3 + 1), their instruments (5, 3), three instruments to spare. `errors` (n, 2): target less what the
     coefficients at which the rows were linearised make of the regressors. `s` (21,) is the state, `c` (27,) the
-    constants of `ambid.recursive.blocks_regression.constants`; `fresh`: the first sample begins at rest.
+    constants of `ambid.recursive.blocks.Linearisation.constants`; `fresh`: the first sample begins at rest.
     """
     alpha_a, hold_a, new_a, old_a = c[0], c[1], c[2], c[3]
     alpha_b, new_b, old_b = c[4], c[5], c[6]

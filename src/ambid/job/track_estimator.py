@@ -1,0 +1,340 @@
+"""The on-line job with any recursive estimator: a record is fed to it block by block, and reported line by line.
+
+There is no supervisor: what the estimator says is published as it is. Regressions and polynomial models follow
+coefficients from named inputs to an output, the joint filters physical parameters of a bench.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData, io_data
+from ambid.blackbox.orders import Orders
+from ambid.errors import EstimationError, nearest
+from ambid.estimation.estimate import Estimate
+from ambid.job.bench_rows import rows_of
+from ambid.job.track_start import start_of
+from ambid.physics.models import model
+from ambid.record import Record, read_record
+from ambid.recursive import (
+    JointEkf,
+    JointUkf,
+    Lms,
+    Nlms,
+    RecursiveArx,
+    RecursiveEstimator,
+    RecursiveIvArx,
+    RecursiveLeastSquares,
+    RecursivePolynomial,
+)
+from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
+from ambid.rig import Rig, default_rig
+from ambid.signals.conditioning import cut
+from ambid.track.lines_file import Tally
+
+Memory = float | Literal["auto", "all"]
+
+REGRESSIONS = ("rls", "lms", "nlms", "iv")
+POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")
+JOINT = ("ekf", "ukf")
+METHODS = ("rpem", *REGRESSIONS, *POLYNOMIALS, *JOINT)
+_FIRST_S, _FIRST_SAMPLES = 0.1, 1000  # of the record, from which the sizes of the signals are taken
+_STEP, _SMALL = {"lms": 1e-3, "nlms": 0.1}, 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Run:
+    """An estimator with what it is fed, and what it is called."""
+
+    estimator: RecursiveEstimator
+    inputs: Array  # (n_samples, n_inputs)
+    outputs: Array  # (n_samples, n_outputs)
+    rate_hz: float
+    t0: float  # time of the first sample, s of record
+    scale: Array  # of the estimate, to SI
+    model: str
+    units: Mapping[str, str]
+    origin: Mapping[str, object]
+    start: Mapping[str, TrackedValue]
+    warnings: tuple[str, ...] = ()
+
+
+def track_estimator(
+    record: Record | str | Path,
+    rig: Rig | None = None,
+    *,
+    method: str,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    references: Sequence[str] = (),
+    orders: Orders | None = None,
+    open_loop: bool = False,
+    step: float | None = None,
+    start: Estimate | str | Path | None = None,
+    start_s: float | None = None,
+    memory: Memory = "auto",
+    every_s: float = 0.01,
+    limit: float = 1.5,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    on_header: Callable[[TrackHeader], None] | None = None,
+    on_line: Callable[[TrackLine], object] | None = None,
+    keep: bool = True,
+) -> Track:
+    """Follow a record with one of `METHODS` other than ``rpem``.
+
+    `inputs`, `outputs`, `references`, `orders`, `open_loop`: of a regression or polynomial model, as `fit` takes them;
+    `step`: of lms and nlms, for signals of size one; `start`, `start_s`: of a joint filter; the rest as
+    `ambid.job.track.track`.
+    """
+    if method not in METHODS:
+        raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
+    if method in JOINT:
+        _refuse(method, {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders})
+        made = _joint(method, record, rig, start, start_s, memory, (from_s, to_s), rate_hz)
+    else:
+        _refuse(method, {"--rig": rig, "--start": start, "--start-seconds": start_s})
+        whole = record if isinstance(record, Record) else read_record(record, rate_hz=rate_hz)
+        part = cut(whole, from_s, to_s) if from_s is not None or to_s is not None else whole
+        data = io_data(part, inputs, outputs, references=references, open_loop=open_loop)
+        if data.y.shape[1] != 1:
+            raise EstimationError(f"{method} follows one output; {data.y.shape[1]} are named. Name one with --output")
+        make = _regression if method in REGRESSIONS else _polynomial
+        made = make(method, data, orders, memory, step, part.start_s)
+    label = f"{method}, memory {memory if isinstance(memory, str) else f'{memory:g} s'}"
+    return _follow(made, label, every_s, limit, on_header, on_line, keep)
+
+
+def _refuse(method: str, given: Mapping[str, object]) -> None:
+    """Refuse options that the method would ignore."""
+    wrong = [name for name, value in given.items() if value is not None and value != ()]
+    if wrong:
+        raise EstimationError(f"--method {method} takes no {' and no '.join(wrong)}. Leave it out")
+
+
+def _regression(
+    method: str, data: IOData, orders: Orders | None, memory: Memory, step: float | None, t0: float
+) -> _Run:
+    """An ARX model: the signals are brought to size one and mean zero by the first of them, a constant is estimated."""
+    na, nb, nk = _arx_orders(method, data, orders)
+    first = slice(0, max(_FIRST_SAMPLES, round(_FIRST_S / data.dt)))
+    external = data.reference if method == "iv" and data.references else np.empty((data.y.shape[0], 0))
+    u, y = np.hstack([data.u, external]), data.y
+    means, sizes = zip(*((x[first].mean(axis=0), x[first].std(axis=0)) for x in (u, y)), strict=True)
+    if not all((size > 0).all() for size in sizes):
+        raise EstimationError(
+            f"{method}: a signal stands still over the first {first.stop * data.dt:.3g} s; its size is taken from"
+            " there. Begin where the signals move, with --from"
+        )
+    estimator = _arx(method, (na, nb, nk), data, None if isinstance(memory, str) else memory / data.dt, step)
+    unit = {"a": 1.0, "o": float(sizes[1][0])}
+    scale = [float(sizes[1][0] / sizes[0][_input_of(name)]) if name[0] == "b" else unit[name[0]]
+             for name in estimator.names]  # fmt: skip
+    return _Run(
+        estimator=estimator, inputs=(u - means[0]) / sizes[0], outputs=(y - means[1]) / sizes[1], rate_hz=1 / data.dt,
+        t0=t0, scale=np.array(scale), model=f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}",
+        units=_units(estimator.names, data), origin=_origin(data), start={}, warnings=_bias(method, data, estimator),
+    )  # fmt: skip
+
+
+def _arx_orders(method: str, data: IOData, orders: Orders | None) -> tuple[int, tuple[int, ...], tuple[int, ...]]:
+    """Return na, and nb and nk of each input."""
+    n, given = data.u.shape[1], dict(orders or {})
+    known = set(given) == {"na", "nb", "nk"} and all(value != "auto" for value in given.values())
+    if not known or not n:
+        raise EstimationError(
+            f"--method {method} wants --input, --output and --orders na=2,nb=2,nk=1 as numbers: on-line nothing is"
+            " chosen. Give them"
+        )
+    per_input = [x if isinstance(x, tuple) else (x,) * n for x in (given["nb"], given["nk"])]
+    if any(len(x) != n for x in per_input):
+        raise EstimationError(f"--orders: nb and nk want one number, or one for each of {n} inputs. Correct them")
+    nb, nk = (tuple(int(i) for i in x) for x in per_input)
+    return int(str(given["na"])), nb, nk
+
+
+def _arx(
+    method: str,
+    orders: tuple[int, tuple[int, ...], tuple[int, ...]],
+    data: IOData,
+    memory: float | None,
+    step: float | None,
+) -> RecursiveArx | RecursiveIvArx:
+    na, nb, nk = orders
+    if step is not None and method not in _STEP:
+        raise EstimationError(f"--method {method} takes no --step. Leave it out")
+    if memory is not None and method in _STEP:
+        raise EstimationError(f"--method {method} forgets by its --step and takes no --memory. Leave it out")
+    if method == "iv":
+        if len(nb) != 1 or not (data.references or data.open_loop):
+            raise EstimationError(
+                "--method iv wants one input, and the loop's outer excitation as its instrument. Name it with"
+                " --reference, or say --open-loop where there is no feedback"
+            )
+        instruments: Literal["reference", "auxiliary model"] = "reference" if data.references else "auxiliary model"
+        return RecursiveIvArx(
+            na, nb[0], nk[0], instruments=instruments, offset=True, open_loop=data.open_loop, memory=memory
+        )
+    size = _STEP.get(method, 0.0) if step is None else step
+
+    def make(names: tuple[str, ...]) -> RecursiveEstimator:
+        if method == "lms":
+            return Lms(names, step=size)
+        return Nlms(names, step=size, small=_SMALL) if method == "nlms" else RecursiveLeastSquares(names, memory=memory)
+
+    return RecursiveArx(na, nb, nk, offset=True, estimator=make)
+
+
+def _polynomial(
+    method: str, data: IOData, orders: Orders | None, memory: Memory, step: float | None, t0: float
+) -> _Run:
+    """Any polynomial structure; the first samples are stored and fitted off-line."""
+    if step is not None or orders is None:
+        raise EstimationError(f"--method {method} wants --orders as numbers, and takes no --step. Correct that")
+    samples = None if isinstance(memory, str) else memory / data.dt
+    if samples is not None and samples <= 1.0:
+        raise EstimationError(f"--memory {memory:g} s is no longer than a sample. Give a longer one")
+    estimator = RecursivePolynomial(
+        method, orders, dt=data.dt, n_inputs=data.u.shape[1], open_loop=data.open_loop,
+        forgetting=1.0 if samples is None else 1.0 - 1.0 / samples,
+    )  # fmt: skip
+    return _Run(
+        estimator=estimator, inputs=data.u, outputs=data.y, rate_hz=1 / data.dt, t0=t0,
+        scale=np.ones(len(estimator.names)), model=f"{method} {' '.join(f'{k}={v}' for k, v in orders.items())}",
+        units=_units(estimator.names, data), origin=_origin(data), start={}, warnings=_bias(method, data, estimator),
+    )  # fmt: skip
+
+
+def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
+    """Return what is to be mistrusted before the first sample: bias under feedback, above all."""
+    if method in ("rls", "lms", "nlms") and not data.open_loop:
+        return (
+            f"{method} is biased where a controller is at work or the noise is coloured, and nothing says that this"
+            " loop is open: use armax, or iv with --reference, or say --open-loop if there is no feedback",
+        )
+    return tuple(w for w in getattr(estimator, "warnings", ()) if "first window" not in w)
+
+
+def _joint(
+    method: str,
+    record: Record | str | Path,
+    rig: Rig | None,
+    start: Estimate | str | Path | None,
+    start_s: float | None,
+    memory: Memory,
+    part: tuple[float | None, float | None],
+    rate_hz: float | None,
+) -> _Run:
+    """Physical parameters in one filter with the plant's states; with a memory they walk as much as they are unsure."""
+    source = rows_of(record, rig, from_s=part[0], to_s=part[1], rate_hz=rate_hz)
+    begin = start_of(source, rig or default_rig(), given=start, start_s=start_s, rig_speaks=rig is not None)
+    estimate, rate, of = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
+    free = estimate.covariance_names
+    sd = dict(zip(free, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
+    rates = {} if isinstance(memory, str) else {name: sd[name] / np.sqrt(memory) for name in free}
+    made = (JointEkf if method == "ekf" else JointUkf).from_estimate(estimate, rate, rates=rates)
+    known = {p.name: p.unit for p in of.parameters}
+    offsets = {f"{name}_offset": "N" if name == "force" else "V" for name in of.disturbances}
+    bench, first = source.record, begin.first
+    return _Run(
+        estimator=made, rate_hz=rate, t0=source.t0 + first / rate, scale=np.ones(len(made.names)), model=of.name,
+        inputs=np.column_stack([bench[x] for x in of.inputs])[first:],
+        outputs=np.column_stack([bench[x] for x in of.outputs])[first:],
+        units={k: known.get(k) or offsets[k] for k in made.names},
+        origin={**source.origin, "samples": bench.n_samples - first},
+        start={k: TrackedValue(value=estimate.values[k], sd=sd[k]) for k in free}, warnings=begin.warnings,
+    )  # fmt: skip
+
+
+def _follow(
+    run: _Run,
+    method: str,
+    every_s: float,
+    limit: float,
+    on_header: Callable[[TrackHeader], None] | None,
+    on_line: Callable[[TrackLine], object] | None,
+    keep: bool,
+) -> Track:
+    """Feed the estimator with one reporting interval after the other."""
+    every = max(1, round(every_s * run.rate_hz))
+    header = TrackHeader(
+        rate_hz=run.rate_hz, limit=limit, method=method, model=run.model, units=run.units,
+        every_s=every / run.rate_hz, start=run.start, record=run.origin, warnings=run.warnings,
+    )  # fmt: skip
+    tally, lines, begun = Tally(header), [], time.perf_counter()
+    if on_header is not None:
+        on_header(header)
+    for first in range(0, run.outputs.shape[0], every):
+        line = _line(run, slice(first, first + every))
+        tally.add(line)
+        if keep:
+            lines.append(line)
+        if on_line is not None:
+            on_line(line)
+    summary = replace(tally.summary(computing_s=time.perf_counter() - begun), samples=run.estimator.n_used)
+    return Track(header=header, lines=tuple(lines), summary=summary)
+
+
+def _line(run: _Run, part: slice) -> TrackLine:
+    """Take in one interval and say what the estimator makes of it."""
+    estimator, before = run.estimator, run.estimator.n_rejected
+    errors = estimator.update(run.inputs[part], run.outputs[part])
+    t = run.t0 + min(part.stop, run.outputs.shape[0]) / run.rate_hz
+    sd = np.sqrt(np.diag(estimator.covariance)) * run.scale
+    used = np.isfinite(errors).any()
+    known = getattr(estimator, "started", True)
+    events: tuple[Event, ...] = ()
+    rejected = estimator.n_rejected - before
+    if rejected:
+        why = f"{rejected} samples not used: not finite, beyond all noise, or without the past that the model needs"
+        events = (Event(kind="rejected", t=t, why=why, samples=rejected),)
+    return TrackLine(
+        t=t,
+        parameters={
+            name: TrackedValue(
+                value=float(value) if known else np.nan, sd=float(s) if known else np.nan, stale=not used
+            )
+            for name, value, s in zip(estimator.names, estimator.estimate * run.scale, sd, strict=True)
+        },
+        error=_error(estimator, errors),
+        state="tracking" if used else "frozen",
+        events=events,
+    )
+
+
+def _error(estimator: RecursiveEstimator, errors: Array) -> float:
+    """Return the rms of the errors over what the estimator expects of them, NaN where it predicted nothing."""
+    if isinstance(estimator, JointEkf | JointUkf):
+        return estimator.error
+    inner: Any = getattr(estimator, "_estimator", estimator)
+    noise, squares = float(inner.noise_variance), errors[np.isfinite(errors)] ** 2
+    return float(np.sqrt(squares.mean() / noise)) if squares.size and noise > 0.0 else float("nan")
+
+
+def _input_of(name: str) -> int:
+    """Return the input that a coefficient ``b1`` or ``b1.0`` belongs to."""
+    return int(name.partition(".")[2] or 0)
+
+
+def _units(names: Sequence[str], data: IOData) -> dict[str, str]:
+    """Return the units of coefficients: those of B lead from an input to the output, a constant has the output's."""
+    out = data.units[data.outputs[0]]
+    units = {}
+    for name in names:
+        if name[0] == "b":
+            units[name] = f"{out}/{data.units[data.inputs[_input_of(name)]]}"
+        else:
+            units[name] = out if name == "offset" else ""
+    return units
+
+
+def _origin(data: IOData) -> dict[str, object]:
+    return {name: data.record[name] for name in ("file", "sha256", "samples")}
