@@ -15,8 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, io_data
-from ambid.blackbox.orders import Orders
+from ambid.blackbox.data import IOData, Orders, io_data
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
 from ambid.job.bench_rows import rows_of

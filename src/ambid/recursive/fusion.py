@@ -24,7 +24,7 @@ from ambid.recursive.estimator import as_block, check_channels
 from ambid.recursive.fusion_sensor import FusedSensor, reason, sensor_table
 from ambid.recursive.kalman import LinearState, constant_velocity, linear_state
 from ambid.recursive.lines import Event
-from ambid.recursive.square_root import covariance_of, root_of
+from ambid.recursive.square_root import covariance_of, factors_of, root_of
 
 _TESTS = 4.0  # cumulative sums of each sensor
 _LOSS = 0.2  # part of the gain whose loss is looked for
@@ -292,7 +292,7 @@ class SensorFusion:
         EstimationError
             If there is no such sensor, or `offset_sd` is negative.
         """
-        from ambid.recursive.fusion_kernels import put_back
+        from ambid.recursive.fusion_watch_kernels import back
 
         if name not in self.names or not (offset_sd is None or 0.0 <= offset_sd < np.inf):
             raise EstimationError(
@@ -300,8 +300,10 @@ class SensorFusion:
                 "offset_sd is at least 0. Mend the call"
             )
         i = self.names.index(name)
-        variance = ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
-        put_back(i, self._memory, self._watch, self._clock, variance, np.empty(self._memory.shape[1]), self._notes)
+        P = self.covariance
+        P[self._first + i, self._first + i] += ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
+        self._memory[:-1] = factors_of(P)
+        back(i, self._watch, self._clock, self._notes)
         self._events.append(
             Event(
                 kind="restored",

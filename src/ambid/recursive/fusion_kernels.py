@@ -38,22 +38,6 @@ def _absorb(memory: Array, f: Array, b: Array, e: float, r: float) -> None:
 
 
 @compiled(fastmath={"contract"})
-def _widen(memory: Array, q: float, state: int, a: Array) -> None:
-    """Add the variance q to one state."""
-    if q > 0.0:
-        a[: state + 1] = 0.0
-        a[state] = 1.0
-        widen(memory, a[: state + 1], q)
-
-
-@compiled(fastmath={"contract"})
-def _motion(motion: Array, n: int, n_u: int) -> tuple[Array, Array, Array]:
-    """Return A, B and G of the motion."""
-    at, to = n * n, n * (n + n_u)
-    return motion[:at].reshape(n, n), motion[at:to].reshape(n, n_u), motion[to:].reshape(n, n)
-
-
-@compiled(fastmath={"contract"})
 def _advance(
     memory: Array, A: Array, B: Array, G: Array, walk: Array, stride: int, now: int, u: Array, k: int, column: int,
     W: Array, w: Array,
@@ -74,14 +58,10 @@ def _advance(
     propagate(memory[:last], A, np.empty((n, 0)), G, W, w)
     if now % stride == 0:
         for i in range(last - n):
-            _widen(memory, walk[i], n + i, w)
-
-
-@compiled
-def keep(kept: Array, memory: Array, also: bool) -> None:
-    """Keep the filter as it is; what was kept becomes the older one, unless `also` that is to be the present one."""
-    kept[0] = memory if also else kept[1]
-    kept[1] = memory
+            if walk[i] > 0.0:
+                w[: n + i] = 0.0
+                w[n + i] = 1.0
+                widen(memory, w[: n + i + 1], walk[i])
 
 
 @compiled
@@ -157,7 +137,8 @@ def fuse_scan(
     Returns how many samples of the block are done.
     """
     m, n, stride = sensors.shape[0], int(settings[watching.STATES]), int(settings[watching.STRIDE])
-    A, B, G = _motion(motion, n, u.shape[1])
+    at, to = n * n, n * (n + u.shape[1])
+    A, B, G = motion[:at].reshape(n, n), motion[at:to].reshape(n, u.shape[1]), motion[to:].reshape(n, n)
     z, r, used, e, t, per = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m)
     f, S, W = np.empty((m + 2, memory.shape[1])), np.empty((m, m)), np.empty((m, m))
     M, b, first = np.empty((n, 2 * n)), np.empty(max(2 * n, memory.shape[1])), start - start
@@ -166,7 +147,8 @@ def fuse_scan(
         now = clock[NOW]
         fresh = clock[watching.FRESH] > 0.0
         if fresh or int(now) % int(settings[watching.SPAN]) == 0:
-            keep(kept, memory, fresh)
+            kept[0] = memory if fresh else kept[1]
+            kept[1] = memory
             clock[OLD] = now if fresh else clock[NEW]
             clock[NEW], clock[watching.FRESH] = now, 0.0
         watching.read(y, k, sensors, watch, z, r, used)
@@ -226,10 +208,3 @@ def fuse_scan(
         if clock[watching.NOTES] > 0.0:
             return k + 1
     return int(y.shape[0])
-
-
-@compiled
-def put_back(i: int, memory: Array, watch: Array, clock: Array, variance: float, b: Array, notes: Array) -> None:
-    """Put sensor i to work again, its offset opened by `variance`."""
-    _widen(memory, variance, memory.shape[1] - watch.shape[0] + i, b)
-    watching.back(i, watch, clock, notes)

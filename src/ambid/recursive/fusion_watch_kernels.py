@@ -49,11 +49,9 @@ def note(notes: Array, clock: Array, code: int, i: int, onset: float, a: float, 
 @compiled
 def quiet(watch: Array, clock: Array) -> None:
     """Begin the tests of all sensors anew."""
+    watch[:, UP : EVIDENCE + 1] = 0.0
+    watch[:, UP_0 : LOSS_0 + 1] = clock[NOW]
     for i in range(watch.shape[0]):
-        for k in range(UP, EVIDENCE + 1):
-            watch[i, k] = 0.0
-        for k in range(UP_0, LOSS_0 + 1):
-            watch[i, k] = clock[NOW]
         watch[i, SUM_T] = watch[i, SUM_ABS] = watch[i, JUMPS] = watch[i, SUM_TT] = 0.0
     clock[COMMON] = 0.0
 
@@ -201,41 +199,21 @@ def sums(watch: Array, i: int, t: float, per: float, x: float, part: float, now:
 
 
 @compiled
-def alarmed(watch: Array, i: int) -> float:
-    """Highest of the sums that raise an alarm."""
-    return float(max(max(watch[i, UP], watch[i, DOWN]), max(watch[i, LOUD], watch[i, LOSS])))
+def standing(watch: Array, i: int) -> tuple[float, float, int, float]:
+    """Return the highest sum of sensor i that raises an alarm, the highest of all, what it looks like and its onset.
 
-
-@compiled
-def forget(watch: Array, i: int) -> None:
-    """Begin the proof of agreement of sensor i anew."""
-    for k in range(COUNT, XX + 1):
-        watch[i, k] = 0.0
-
-
-@compiled
-def score(watch: Array, i: int) -> float:
-    """Return the highest of all sums of a sensor."""
-    return float(max(alarmed(watch, i), watch[i, EVIDENCE]))
-
-
-@compiled
-def kind(watch: Array, i: int) -> int:
-    """Say what an alarm looks like: of the sums that are near the highest, the one that says most."""
-    step = max(watch[i, UP], watch[i, DOWN])
-    if watch[i, LOSS] >= max(step, watch[i, LOUD]):
-        return GAIN
-    return STEP if step >= watch[i, LOUD] or abs(watch[i, SUM_T]) > 0.9 * watch[i, SUM_ABS] else NOISY
-
-
-@compiled
-def onset(watch: Array, i: int) -> float:
-    """Return when the highest of the sums began."""
+    It looks like what says most of the sums that are near the highest.
+    """
     first, high = watch[i, UP_0], watch[i, UP]
     for k in range(1, 4):
         if watch[i, UP + k] > high:
             first, high = watch[i, UP_0 + k], watch[i, UP + k]
-    return float(first)
+    step, code = max(watch[i, UP], watch[i, DOWN]), NOISY
+    if watch[i, LOSS] >= max(step, watch[i, LOUD]):
+        code = GAIN
+    elif step >= watch[i, LOUD] or abs(watch[i, SUM_T]) > 0.9 * watch[i, SUM_ABS]:
+        code = STEP
+    return high, max(high, watch[i, EVIDENCE]), code, first
 
 
 @compiled
@@ -245,7 +223,7 @@ def exclude(i: int, settings: Array, watch: Array, clock: Array, onset: float) -
     again = watch[i, NEED] > 0.0 and now - watch[i, SINCE] < 10.0 * watch[i, NEED]
     watch[i, NEED] = min(2.0 * watch[i, NEED], 64.0 * settings[RESTORE_N]) if again else settings[RESTORE_N]
     watch[i, OUT], watch[i, SINCE], watch[i, ONSET], watch[i, DOUBT] = 1.0, now, onset, 0.0
-    forget(watch, i)
+    watch[i, COUNT : XX + 1] = 0.0
     quiet(watch, clock)
 
 
@@ -259,8 +237,7 @@ def back(i: int, watch: Array, clock: Array, notes: Array) -> None:
     for j in range(watch.shape[0]):
         working += watch[j, OUT] == 0.0
     if working > 2:
-        for j in range(watch.shape[0]):
-            watch[j, DOUBT] = 0.0
+        watch[:, DOUBT] = 0.0
         clock[DISPUTED] = 0.0
     clock[FRESH] = 1.0
 
@@ -278,7 +255,7 @@ def self_test(sensors: Array, settings: Array, watch: Array, clock: Array, notes
         elif sensors[i, STUCK] > 0.0 and watch[i, SAME] >= sensors[i, STUCK]:
             code, onset = STUCK_AT, now - watch[i, SAME]
         if code > 0 and watch[i, OUT] > 0.0:
-            forget(watch, i)
+            watch[i, COUNT : XX + 1] = 0.0  # the proof begins anew
         elif code > 0:
             exclude(i, settings, watch, clock, onset)
             note(notes, clock, code, i, onset, watch[i, LAST], 0.0)
@@ -293,7 +270,7 @@ def self_test(sensors: Array, settings: Array, watch: Array, clock: Array, notes
 def agree(watch: Array, i: int, res: float, s: float, r: float, x: float, other: float, working: int) -> bool:
     """Say whether an excluded sensor has agreed with the others long enough: level, noise and gain."""
     if not res * res <= 36.0 * s:
-        forget(watch, i)
+        watch[i, COUNT : XX + 1] = 0.0  # the proof begins anew
         return False
     watch[i, COUNT] += 1.0
     watch[i, R] += res
@@ -311,28 +288,27 @@ def agree(watch: Array, i: int, res: float, s: float, r: float, x: float, other:
     calm = watch[i, RR] - n * mean * mean <= noise * (n + 4.0 * sqrt(2.0 * n))
     along = abs(watch[i, RX] - mean * watch[i, X])
     gain = along <= 0.05 * spread_x + 3.0 * sqrt(noise * spread_x)
-    forget(watch, i)
+    watch[i, COUNT : XX + 1] = 0.0  # the proof begins anew
     return bool(level and calm and gain)
 
 
 @compiled
 def judge(settings: Array, watch: Array, clock: Array, notes: Array, tested: int, apart: bool, x: float) -> int:
     """Return the sensor that is at fault and exclude it; -1 if there is none, OPENED if one is but not known which."""
-    m, worst, high, now = watch.shape[0], int(NOBODY), settings[HEIGHT], clock[NOW]
+    m, worst, most, high, now = watch.shape[0], int(NOBODY), 0.0, settings[HEIGHT], clock[NOW]
     for i in range(m):
-        alarm = watch[i, OUT] == 0.0 and alarmed(watch, i) > high
-        if alarm and (worst < 0 or score(watch, i) > score(watch, worst)):
-            worst = i
+        alarm, points, _, _ = standing(watch, i)
+        if watch[i, OUT] == 0.0 and alarm > high and (worst < 0 or points > most):
+            worst, most = i, points
     if worst < 0:
         return -1
-    most, second = score(watch, worst), 0.0
+    second = 0.0
     for i in range(m):
         if i != worst and watch[i, OUT] == 0.0:
-            second = max(second, score(watch, i))
+            second = max(second, standing(watch, i)[1])
     moved = tested < 2 or (not apart and clock[COMMON] > most - MARGIN)
-    start = onset(watch, worst)
+    _, _, what, start = standing(watch, worst)
     # Of two sensors the motion model can only name one that jumps: a slow difference draws the filter after it first.
-    what = kind(watch, worst)
     shown = apart or watch[worst, JUMPS] > JUMPING * watch[worst, SUM_TT]
     if clock[DISPUTED] == 0.0 and not moved and shown and second < most - (MARGIN if apart else 2.0 * MARGIN):
         note(notes, clock, what, worst, start, watch[worst, MEAN_R], x)
@@ -347,7 +323,7 @@ def judge(settings: Array, watch: Array, clock: Array, notes: Array, tested: int
     if opened:
         clock[DISPUTED], clock[AGREED] = 1.0, 0.0
         for i in range(m):  # those that could have done it
-            if watch[i, OUT] == 0.0 and score(watch, i) >= most - 3.0 * MARGIN:
+            if watch[i, OUT] == 0.0 and standing(watch, i)[1] >= most - 3.0 * MARGIN:
                 watch[i, DOUBT] = 1.0
                 watch[i, BETWEEN] = watch[i, SQUARE_R]
     quiet(watch, clock)
@@ -370,8 +346,7 @@ def doubt(z: Array, r: Array, x: float, settings: Array, watch: Array, clock: Ar
             agreed = agreed and watch[i, BETWEEN] < 2.0 * r[i]
     clock[AGREED] = clock[AGREED] + 1.0 if agreed else 0.0
     if clock[AGREED] >= settings[RESTORE_N]:
-        for i in range(watch.shape[0]):
-            watch[i, DOUBT] = 0.0
+        watch[:, DOUBT] = 0.0
         clock[DISPUTED] = 0.0
         note(notes, clock, AGREEMENT, 0, clock[NOW], settings[RESTORE_N], 0.0)
     return extra
