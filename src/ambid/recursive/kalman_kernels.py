@@ -147,27 +147,31 @@ def state_scan(
         tally[2] += m - seen
         tally[3] += seen
         if predicted:
-            out[k] = x
+            for i in range(n):
+                out[k, i] = x[i]
         steady = settled and seen == m
         tally[4] += _correct(innovations[k], C, R, F, x, rest, f, steady)
         if not predicted:
-            out[k] = x
+            for i in range(n):
+                out[k, i] = x[i]
         for i in range(n):
             f[i] = 0.0
             for j in range(n):
                 f[i] += A[i, j] * x[j]
             for j in range(n_u):
                 f[i] += B[i, j] * u[k, j]
-        x[:] = f
+        for i in range(n):
+            x[i] = f[i]
         if not steady:
             propagate(F, A, J, G, W, w)
             settled = seen == m
             for j in range(n):
                 settled = settled and abs(F[j, j] - before[j, j]) <= 2.0 * _SAME * F[j, j]
+                before[j, j] = F[j, j]
                 for i in range(j):
                     change = F[j, i] - before[j, i]
                     settled = settled and F[j, j] * change * change <= _SAME * _SAME * variance(F, i)
-            before[:] = F
+                    before[j, i] = F[j, i]
         k += 1
     tally[0] = 1.0 if settled else 0.0
 
@@ -185,7 +189,8 @@ def _correct(e: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: A
         own = rest[row]
         h, gain = own[m : m + n], own[m + n : m + 2 * n]
         if not steady:
-            h[:] = C[i]
+            for c in range(n):
+                h[c] = C[i, c]
             before, left = 0, R[i, i]
             for j in range(i):
                 if isfinite(e[j]):
