@@ -53,11 +53,7 @@ _ENOUGH = 0.5  # gain of a candidate's criterion by an iteration below which it 
 
 
 def information(criterion: str, cost: float, n: int, k: int, starts: int = 0) -> float:
-    """Return an information criterion.
-
-    `cost`: sum of squared one-step errors; `n`, `k`: samples and estimated parameters. Returns the smaller the better;
-    infinite where there are no more samples than numbers, which fits anything.
-    """
+    """Return an information criterion of `k` numbers from `n` samples, infinite where these fit anything."""
     if not np.isfinite(cost) or cost < 0 or n <= k + starts + 1:
         return math.inf
     each = math.log(n) if criterion == "bic" else 2.0
@@ -75,11 +71,9 @@ def error_orders(form: str, order: int) -> tuple[tuple[int, int], ...]:
 
 
 def time_constants(slowest: float, shortest: int, dt: float) -> list[float]:
-    """Return low-passes of the set point to try: slower than the plant, so that it stands still beside its
-    movements.
+    """Return low-passes of the set point to try, in s: so slow that it stands still beside the plant's movements.
 
-    `slowest`: largest time constant of the linear model, in samples; `shortest`: samples of the shortest record.
-    Returns s; one at least.
+    `slowest`, the largest time constant of the linear model, and `shortest`, of the records, are in samples.
     """
     top = max(_MOST * shortest, _LEAST)
     low = min(max(_SLOWER * slowest, _LEAST), top)
@@ -87,19 +81,13 @@ def time_constants(slowest: float, shortest: int, dt: float) -> list[float]:
 
 
 def slowest_that_does(grid: Sequence[float], values: Sequence[float]) -> float:
-    """Return the slowest set point that explains the data about as well as the best.
-
-    `values`: criterion of each. Returns s.
-    """
+    """Return the slowest set point that explains the data about as well as the best, by the criterion of each."""
     least = min(values)
     return max(x for x, value in zip(grid, values, strict=True) if not value > least + _CLEAR)
 
 
 def slowest_mode(a: Array) -> float:
-    """Return the largest time constant of a polynomial, stable or not.
-
-    `a`: (order + 1,), of q^0, q^-1, . Returns samples.
-    """
+    """Return the largest time constant, in samples, of a polynomial in q^-1, stable or not."""
     z = roots_of(a)
     size = np.abs(np.log(np.where(z == 0, 1e-6, z)))
     return float(1.0 / max(float(size.min()), 1e-6))
@@ -128,10 +116,7 @@ class LpvProblem:
         return max(float(self.n_errors - self.shape.n_theta - len(self.parts) * self.shape.n_start), 1.0)
 
     def cost(self, theta: Array) -> float:
-        """Return the sum of squared weighted innovations.
-
-        `theta`: (n_theta,). Returns infinite where the predictor is unstable.
-        """
+        """Return the sum of squared weighted innovations; infinite where the predictor is unstable."""
         total = 0.0
         if not is_sound(self.shape, theta):
             return np.inf
@@ -143,10 +128,7 @@ class LpvProblem:
         return total * self.weight**2
 
     def triangle(self, theta: Array) -> Array:
-        """Return the triangle of [J | e], weighted, without what the starts explain.
-
-        `theta`: (n_theta,). Returns (n_theta + 1, n_theta + 1), naN where the predictor diverges.
-        """
+        """Return the triangle of [J | e] without what the starts explain; NaN where the predictor diverges."""
         P, k, rows = self.shape.n_theta, self.shape.n_start, list[Array]()
         for part in self.parts:
             start, e = self._solve(part, theta)
@@ -179,10 +161,9 @@ class LpvProblem:
 
 
 def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> tuple[Array, float]:
-    """Fit A y = B u + c + e, all coefficients functions of p.
+    """Fit A y = B u + c + e, all coefficients functions of p, by equations from sample `first` on.
 
-    `parts`: made for it; `first`: equations count from this sample on. Returns `theta`: (n_theta,), scaled, the error
-    model is left at zero; `cost`: sum of squared errors.
+    Returns all parameters, those of the error model zero, and the sum of squared errors.
     """
     n = shape.n_process_theta
     found, cost = _solve([_process_rows(shape, p, p.y, first) for p in parts], [p.y[first:] for p in parts])
@@ -201,9 +182,8 @@ def from_earlier(
 ) -> tuple[Array, float] | None:
     """Fit all coefficients with errors and innovations of an earlier model in place of the true ones.
 
-    `parts`: made for it; `first`: equations count from this sample on; `theta`: (n_theta of old,), scaled; `earlier`:
-    records made for the earlier model, where its functions of p are others. Returns `theta`: (n_theta,), scaled;
-    `cost`: sum of squared errors of this regression; instead of both, where the earlier model diverges.
+    `earlier` are the records made for that model, where its functions of p are others. Returns parameters and the sum
+    of squared errors of this regression; None where the earlier model diverges.
     """
     rows, targets = [], []
     for part, before in zip(parts, earlier or parts, strict=True):
@@ -223,9 +203,7 @@ def from_earlier(
 def by_long_regression(shape: LpvShape, parts: Sequence[Part], first: int) -> Array:
     """Fit an equation with moving-average errors: innovations by a long regression, then one with their lags.
 
-    `shape`: of the equation form, with ma alone; `parts`: made for it; `first`: equations count from this sample on.
-    Returns (n_theta,), scaled, zeros of C outside the unit circle are reflect where C does not depend on p (Hannan
-    and Rissanen 1982).
+    Zeros of C outside the unit circle are reflected where C does not depend on p (Hannan and Rissanen 1982).
     """
     n, inputs = sum(p.y.size for p in parts), len(shape.columns)
     spare = min(p.y.size for p in parts) - first - shape.ma
@@ -257,8 +235,7 @@ def by_long_regression(shape: LpvShape, parts: Sequence[Part], first: int) -> Ar
 def carry_over(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
     """Carry a model over to one with other functions of p, or with another error model.
 
-    `old`: of the same basis; `theta`: (n_theta of old,). Returns (n_theta,), coefficients as near as can be over the
-    range of p; zeros where the old model has none.
+    Coefficients are as near as can be over the range of p; zeros where the old model has none.
     """
     grid = np.linspace(-1.0, 1.0, 33)
 
@@ -321,10 +298,7 @@ class Fitting:
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def parts(self, shape: LpvShape, schedule: Schedule | None = None) -> tuple[Part, ...]:
-        """Return the records, ready for a shape.
-
-        `schedule`: another one than that of the fit.
-        """
+        """Return the records, ready for a shape, with the schedule of the fit or another."""
         of = schedule or self.schedule
         return tuple(
             part_of(shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
@@ -332,10 +306,7 @@ class Fitting:
         )
 
     def problem(self, shape: LpvShape, weight: float = 1.0) -> LpvProblem:
-        """Return what is searched in for a shape.
-
-        `weight`: one over the standard deviation of the errors.
-        """
+        """Return what is searched in for a shape; `weight` is one over the standard deviation of the errors."""
         return LpvProblem(shape=shape, parts=self.parts(shape), first=self.first, weight=weight)
 
 
@@ -365,11 +336,7 @@ class Candidate:
 def search_from(
     fitting: Fitting, shape: LpvShape, theta: Array, most: int, tick: Tick | None, stage: str, *, last: bool = False
 ) -> Candidate:
-    """Search from a start.
-
-    `theta`: (n_theta,), scaled; `most`: iterations; `tick`: of this part; `stage`: for it. Returns with infinite cost
-    where the predictor is unstable at the start.
-    """
+    """Search from a start; the cost is infinite where the predictor is unstable there."""
     problem = fitting.problem(shape)
     cost = problem.cost(theta)
     if not np.isfinite(cost):
@@ -418,12 +385,10 @@ def _note(fitting: Fitting, x: Candidate) -> Candidate:
 
 
 def choose_level(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> float:
-    """Choose the low-pass of the set point.
+    """Choose the low-pass of the set point, in s.
 
     A linear model with moving-average errors says how slow the plant is; pseudo-linear regressions with its errors
     compare what coefficients that follow each set point explain.
-
-    `tick`: of this part. Returns s.
     """
     white = replace(fitting.shape, degree=0, error_degree=0, ar=0, ma=0)
     shape = replace(white, ma=s.error_order)
@@ -447,10 +412,7 @@ def choose_level(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> float:
 
 
 def by_degree(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> Candidate:
-    """Fit the equation form with an autoregressive error model, degree by degree.
-
-    `fitting`: keeps the best; `tick`: of this part. Returns the best.
-    """
+    """Fit the equation form with an autoregressive error model, degree by degree; return the best."""
     degrees = _DEGREES if s.degree is None else (s.degree,)
     best = None
     for degree, own in zip(degrees, portions(tick, [1.0 + d for d in degrees]), strict=True):
@@ -467,10 +429,8 @@ def by_degree(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> Candidate:
 
 
 def other_degrees(s: LpvSettings, fitting: Fitting, best: Candidate, tick: Tick | None) -> Candidate:
-    """Choose the degree once more, now that form and error model are known: a wrong error model may have decided on
+    """Choose the degree once more, now that form and error model are known, of which a wrong one may have decided on
     it.
-
-    `fitting`: keeps the best; `best`: so far; `tick`: of this part. Returns the best.
     """
     degrees = [d for d in _DEGREES if d != best.shape.degree]
     if s.degree is not None or not np.isfinite(best.cost):
@@ -513,10 +473,7 @@ def wanted_shapes(s: LpvSettings, base: LpvShape) -> list[LpvShape]:
 
 
 def by_form(s: LpvSettings, fitting: Fitting, best: Candidate, tick: Tick | None) -> Candidate:
-    """Fit the forms and error models that are asked for.
-
-    `fitting`: keeps the best; `best`: what the degree was chosen with; `tick`: of this part. Returns the best.
-    """
+    """Fit the forms and error models that are asked for, with the degree of the best so far; return the best."""
     shortest = min(x.n_samples for x in fitting.records)
     wanted = [x for x in wanted_shapes(s, best.shape) if looks_back(x) + _FEWEST <= shortest]
     steps = [  # on the way to both, each alone: from there the search does not end in a poor optimum

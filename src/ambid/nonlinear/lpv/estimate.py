@@ -50,11 +50,9 @@ _CLOSE = 2.0  # difference of Akaike's criterion that says nothing (Burnham and 
 def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Identify a linear model whose coefficients follow a scheduling signal, with an error model (thesis sec. 1.6).
 
-    Consistent under feedback as long as the error model holds the true one. Standard deviations take degree, form and
-    set point for given: chosen on a few hundred samples, 95 % intervals hold the truth about 92 times in 100.
-
-    `records`: of one bench, one output; `settings`: described in the register of structures; `seed`: taken for the
-    contract's sake: nothing here is random; `tick`: called with the stage; may raise KeyboardInterrupt.
+    Consistent under feedback as long as the error model holds the true one. Standard deviations take form and
+    set point for given: chosen on a few hundred samples, 95 % intervals hold the truth about 92 times in 100. Nothing
+    here is random: `seed` is there for the contract's sake.
     """
     if not records:
         raise EstimationError("lpv: no record is given. Pass one at least")
@@ -160,10 +158,7 @@ def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
 
 
 def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitting, *, seed: int) -> NonlinearFit:
-    """Return the fit of a model that runs.
-
-    `used`: settings.
-    """
+    """Return the fit of a model that runs; `used` are the settings."""
     problem, theta = fitting.problem(fitting.shape), fitting.theta
     noise = problem.cost(theta) / problem.freedom
     R = problem.triangle(theta)
@@ -229,11 +224,10 @@ def _make_model(records: Sequence[IOData], fitting: Fitting) -> LpvModel:
 
 
 def frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:
-    """Return poles and gains over the range of the scheduling signal.
+    """Return poles and gains over the range of the scheduling signal, by value of p.
 
-    `covariance`: (n_theta, n_theta), SI, or None; `inputs`: names of all inputs. Returns by value of p: ``p``,
-    ``poles_rad_s`` (real and imaginary part, and their standard deviations) and ``dc_gain`` by input (value, standard
-    deviation); None where there is no number.
+    ``poles_rad_s`` has real and imaginary part and their standard deviations, ``dc_gain`` value and standard deviation
+    by input; None where there is no number.
     """
     out = []
     for p in np.linspace(model.schedule.low, model.schedule.high, _POINTS):

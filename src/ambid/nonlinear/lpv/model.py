@@ -63,10 +63,7 @@ class Frozen:
         return bool(np.all(self.poles.real < 0))
 
     def response(self, frequency: Array) -> Complex:
-        """Return the frequency response from each exciting input.
-
-        `frequency`: (n,), Hz. Returns (n, n_exciting), complex, SI.
-        """
+        """Return the frequency response from each exciting input at frequencies in Hz, (n, n_exciting), SI."""
         w = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) * self.dt)
         below = np.polynomial.polynomial.polyval(w, self.a)
         above = np.stack([w**self.nk * np.polynomial.polynomial.polyval(w, row) for row in self.b], axis=-1)
@@ -77,7 +74,7 @@ class Frozen:
 def frozen(p: float, dt: float, nk: int, a: Array, b: Array, c: Array, d: Array, P: Array | None) -> Frozen:
     """Return poles, gains and standard deviations of a model that stands still.
 
-    `a`: (order,); `b`: (n_exciting, nb); `P`: (n, n), or None, covariance of a, b (row by row), d, c.
+    `P` is the covariance of a (order,), b (n_exciting, nb) row by row, d, c.
     """
     na, nb, m = a.size, b.shape[1], b.shape[0]
     whole = np.concatenate([[1.0], a])
@@ -175,17 +172,13 @@ class LpvModel:
         return out
 
     def with_theta(self, theta: Array) -> Self:
-        """Return the same model with other parameters.
-
-        `theta`: (n_theta,), SI.
-        """
+        """Return the same model with other parameters."""
         return replace(self, theta=theta)
 
     def at(self, p: float, covariance: Array | None = None) -> Frozen:
-        """Return the linear model at one value of the scheduling signal.
+        """Return the linear model at one value of p, with standard deviations by the fit's `covariance`.
 
-        `p`: outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs;
-        `covariance`: (n_theta, n_theta), SI, of `theta`; that of the fit.
+        Outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs.
         """
         of, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
         n = len(of.coefficients)
@@ -267,10 +260,7 @@ class LpvModel:
         return out
 
     def scheduling(self, u: Array, y: Array) -> Array:
-        """Return the scheduling signal, scaled: -1 to 1 in training.
-
-        `u`: (n_samples, n_inputs), SI; `y`: (n_samples, 1), SI. Returns (n_samples,).
-        """
+        """Return the scheduling signal of a record in SI, scaled: -1 to 1 in training."""
         p = self.schedule.signal(np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64), self.dt)
         return self.schedule.scaled(p)
 
@@ -292,10 +282,7 @@ class LpvModel:
 
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Self:
-        """Read it back.
-
-        `found`: that `as_json` made.
-        """
+        """Read it back from what `as_json` made."""
         try:
             return cls(**_read(found))
         except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -322,11 +309,7 @@ def _read(found: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def regressors(shape: LpvShape, y: Array, u: Array, s: Array) -> Array:
-    """Return what predictions depend on: past outputs, inputs, scheduling signal.
-
-    `y`: (n_samples,), scaled; `u`: (n_samples, n_inputs), scaled; `s`: (n_samples,), scaled. Returns (n_samples - lag,
-    order + n_exciting nb + 1).
-    """
+    """Return what predictions depend on, from sample `lag` on: past outputs, inputs, scheduling signal; all scaled."""
     n, lag = y.size, shape.lag
     if n <= lag:
         return np.empty((0, shape.n_process))

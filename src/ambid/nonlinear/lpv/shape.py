@@ -68,26 +68,16 @@ class Schedule:
         return 1.0 if self.time_constant <= 0 else -math.expm1(-dt / self.time_constant)
 
     def signal(self, u: Array, y: Array, dt: float) -> Array:
-        """Return the scheduling signal.
-
-        `u`: (n_samples, n_inputs), SI; `y`: (n_samples, 1), SI. Returns (n_samples,), SI.
-        """
+        """Return the scheduling signal, (n_samples,), of inputs and outputs; all in SI."""
         return scheduling_signal(u, y, self.column, self.share(dt))
 
     def scaled(self, p: Array | float) -> Array:
-        """Return p as the functions of it take it, -1 to 1 in training.
-
-        `p`: (n_samples,), or float, SI.
-        """
+        """Return p as the functions of it take it, -1 to 1 in training."""
         return np.asarray((np.asarray(p, dtype=np.float64) - self.middle) / self.half)
 
 
 def scheduling_signal(u: Array, y: Array, column: int, share: float) -> Array:
-    """Return a column of the inputs, or the low-passed output.
-
-    `u`: (n_samples, n_inputs), SI; `y`: (n_samples, 1), SI; `column`: -1 for the output; `share`: weight of the newest
-    output in the low-pass. Returns (n_samples,), SI.
-    """
+    """Return a column of the inputs, or, for -1, the output low-passed with `share`, the newest value's weight."""
     from ambid.nonlinear.lpv._kernels import set_points
 
     if column >= 0:
@@ -98,10 +88,7 @@ def scheduling_signal(u: Array, y: Array, column: int, share: float) -> Array:
 
 
 def basis_values(s: Array, n: int, basis: str) -> Array:
-    """Return the functions of the scaled scheduling signal.
-
-    `s`: (n_samples,); `n`: how many: degree + 1. Returns (n_samples, n).
-    """
+    """Return `n` functions (degree + 1) of the scaled scheduling signal, (n_samples, n)."""
     from ambid.nonlinear.lpv._kernels import basis_rows
 
     out = np.empty((s.size, n))
@@ -110,11 +97,7 @@ def basis_values(s: Array, n: int, basis: str) -> Array:
 
 
 def schedule_column(name: str, first: IOData) -> int:
-    """Return which input a schedule names.
-
-    `name`: ``level``, an input, or the output; `first`: one of the records. Returns -1 where the scheduling signal is
-    made of the output.
-    """
+    """Return which input a schedule names; -1 where the scheduling signal is made of the output."""
     columns = (*first.inputs, *first.outputs)
     if name == LEVEL:
         if LEVEL in columns:
@@ -132,10 +115,7 @@ def schedule_column(name: str, first: IOData) -> int:
 
 
 def schedule_over(records: Sequence[IOData], name: str, column: int, time_constant: float) -> Schedule:
-    """Return a schedule with the range that it has in the records.
-
-    `column`: as `schedule_column` says.
-    """
+    """Return a schedule with the range that it has in the records."""
     of = Schedule(name=name, column=column, time_constant=time_constant, low=0.0, high=0.0)
     whole = np.concatenate([of.signal(x.u, x.y, x.dt)[1:] for x in records])
     low, high = float(whole.min()), float(whole.max())
@@ -220,20 +200,14 @@ class LpvShape:
         return tuple(found)
 
     def place(self, coefficient: int) -> slice:
-        """Return where the parameters of a coefficient stand in theta.
-
-        `coefficient`: number in `coefficients`.
-        """
+        """Return where the parameters of a coefficient stand in theta, by its number in `coefficients`."""
         K, Q, n, last = self.degree + 1, self.error_degree + 1, self.n_process, self.n_process_theta
         if coefficient < n:
             return slice(coefficient * K, min((coefficient + 1) * K, last))
         return slice(last + (coefficient - n) * Q, last + (coefficient - n + 1) * Q)
 
     def lagged_inputs(self, u: Array) -> Array:
-        """Return the inputs that each sample depends on, and a column of ones.
-
-        `u`: (n_samples, n_inputs), scaled. Returns zeros before the record.
-        """
+        """Return the scaled inputs that each sample depends on, zeros before the record, and a column of ones."""
         n = u.shape[0]
         out = np.zeros((n, len(self.columns) * self.nb + 1))
         out[:, -1] = 1.0
@@ -253,10 +227,7 @@ class LpvShape:
 
 
 def is_stable_process(shape: LpvShape, theta: Array) -> bool:
-    """Return whether the frozen process part is stable over the range of p.
-
-    `theta`: (n_theta,), scaled.
-    """
+    """Return whether the frozen process part is stable over the range of p."""
     return _is_stable(shape, theta, range(shape.order), shape.degree)
 
 
@@ -265,8 +236,6 @@ def is_sound(shape: LpvShape, theta: Array) -> bool:
 
     That a run stays finite does not say so: what was before the record is fitted as well, and can balance a mode that
     grows.
-
-    `theta`: (n_theta,), scaled.
     """
     first = shape.n_process + shape.ar
     if shape.ma and not _is_stable(shape, theta, range(first, first + shape.ma), shape.error_degree):
@@ -291,10 +260,7 @@ class Part:
 
 
 def part_of(shape: LpvShape, y: Array, u: Array, s: Array) -> Part:
-    """Prepare a record.
-
-    `y`: (n_samples,), scaled; `u`: (n_samples, n_inputs), scaled; `s`: (n_samples,), scaled.
-    """
+    """Prepare a scaled record."""
     phi = basis_values(s, shape.degree + 1, shape.basis)
     same = shape.error_degree == shape.degree
     psi = phi if same else basis_values(s, shape.error_degree + 1, shape.basis)
@@ -314,10 +280,9 @@ class Errors:
 
 
 def errors(shape: LpvShape, part: Part, theta: Array, start: Array | None = None, *, slopes: int = 0) -> Errors:
-    """Run a record through the predictor.
+    """Run a record through the predictor, from `start`, what was before it (zeros if left out).
 
-    `theta`: (n_theta,), scaled; `start`: (n_start,), what was before the record; zeros if left out; `slopes`:
-    derivatives: none, those by `start` alone, all.
+    `slopes`: derivatives: 0 for none, 1 for those by `start` alone, 2 for all.
     """
     from ambid.nonlinear.lpv._kernels import run
 
@@ -345,10 +310,9 @@ def looks_back(shape: LpvShape) -> int:
 
 
 def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False) -> tuple[Array, Array] | None:
-    """Estimate what was before a record.
+    """Estimate what was before a record, and its derivative by theta (zeros unless asked for).
 
-    `theta`: (n_theta,), scaled; `slopes`: whether to derive it by theta as well. Returns `w`: (n_start,), scaled;
-    `slope`: (n_start, n_theta), zeros unless asked for; instead of both, where the predictor diverges.
+    None where the predictor diverges.
     """
     k, P = shape.n_start, shape.n_theta
     last = looks_back(shape)

@@ -157,10 +157,7 @@ def rational_terms(s: NarmaxSettings, polynomial: Draft, parts: Parts, tick: Tic
 
 
 def add_noise_terms(s: NarmaxSettings, draft: Draft, parts: Parts, tick: Tick | None) -> Draft:
-    """Add terms with innovations by extended least squares, until coefficients stand still.
-
-    `draft`: of process terms.
-    """
+    """Add terms with innovations to process terms by extended least squares, until coefficients stand still."""
     n_y, n_u = parts[0][0].shape[1], draft.n_inputs
     extra = noise_terms(n_y, n_u, ny=s.ny, nu=s.nu, nk=s.nk, ne=s.ne, degree=s.noise_degree)
     y, u = [p[0] for p in parts], [p[1] for p in parts]
@@ -281,8 +278,7 @@ def innovations(draft: Draft, parts: Parts) -> list[Array] | None:
 def prune_by_prediction(draft: Draft, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Draft:
     """Leave out terms as long as the information criterion of the one-step errors falls.
 
-    `weight`: (n_outputs,), one over the standard deviation of each output's one-step error; `noise`: whether terms with
-    innovations may go.
+    `noise`: whether terms with innovations may go.
     """
     n = _samples(draft, parts)
     m = max(draft.n_candidates, draft.theta.size)

@@ -55,10 +55,7 @@ class Tables:
 def tables(
     numerators: Sequence[Sequence[Term]], denominators: Sequence[Sequence[Term]], n_inputs: int, *, folded: int = 0
 ) -> Tables:
-    """Return the tables of a model; coefficients stand output by output, numerator before denominator.
-
-    `numerators`, `denominators`: by output; `folded`: as in `Tables`.
-    """
+    """Return the tables of a model; coefficients stand output by output, numerator before denominator."""
     n_y = len(numerators)
     rows: list[tuple[int, int, Term]] = []
     for o in range(n_y):
@@ -86,11 +83,7 @@ def tables(
 
 
 def signals(t: Tables, y: Array, u: Array) -> Array:
-    """Return the array of all signals, innovations zero.
-
-    `y`: (n_given, n_outputs), with fewer samples than `u`, the rest is zero; `u`: (n_samples, n_inputs). Returns
-    (n_samples, 2 n_outputs + n_inputs).
-    """
+    """Return the array of all signals, (n_samples, 2 n_outputs + n_inputs), innovations and outputs not given zero."""
     n = u.shape[0]
     z = np.zeros((n, 2 * t.n_outputs + t.n_inputs))
     given = y[:n]
@@ -100,11 +93,9 @@ def signals(t: Tables, y: Array, u: Array) -> Array:
 
 
 def predict(t: Tables, theta: Array, y: Array, u: Array, *, free: bool = False) -> tuple[Array, Array]:
-    """Return predictions or a free run, and all signals behind them.
+    """Return predictions or a `free` run on own outputs, and all signals behind them.
 
-    `theta`: (n_terms,); `y`: (n_samples, n_outputs), scaled; `u`: (n_samples, n_inputs), scaled; `free`: run on the
-    model's own outputs from sample `lag` on. Returns `predictions`: (n_samples, n_outputs), naN before `lag`, and from
-    where the recursion diverges on; `signals`: (n_samples, 2 n_outputs + n_inputs).
+    Predictions are NaN before `lag`, and from where the recursion diverges on.
     """
     from ambid.nonlinear.narmax._kernels import run
 
@@ -130,11 +121,7 @@ def _first_sign(t: Tables, theta: Array, u: Array) -> float:
 
 
 def derive(t: Tables, theta: Array, z: Array, *, free: bool = False) -> Array:
-    """Return the exact derivative of `predict` by theta.
-
-    `theta`: (n_terms,); `z`: (n_samples, 2 n_outputs + n_inputs), the signals that `predict` returned. Returns
-    (n_samples, n_outputs, n_terms).
-    """
+    """Return the exact derivative of `predict` by theta, (n_samples, n_outputs, n_terms); `z` are its signals."""
     from ambid.nonlinear.narmax._kernels import slopes
 
     out = np.empty((z.shape[0], t.n_outputs, theta.size))
@@ -404,11 +391,7 @@ def _read(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def lagged_signals(t: Tables, z: Array) -> Array:
-    """Return the lagged inputs and outputs that a model looks at, from sample `lag` on.
-
-    `z`: (n_samples, 2 n_outputs + n_inputs), scaled, the signals that `predict` returns. Returns (n_samples
-    - lag, n_factors), innovations are left out.
-    """
+    """Return the lagged inputs and outputs that a model looks at, from sample `lag` on, of the signals of `predict`."""
     n = z.shape[0]
     seen = [k for k in range(t.column.size) if t.column[k] < t.n_outputs + t.n_inputs]
     if n <= t.lag or not seen:
@@ -417,11 +400,7 @@ def lagged_signals(t: Tables, z: Array) -> Array:
 
 
 def cloud_of(parts: list[Array]) -> Cloud:
-    """Return where the training samples lie.
-
-    `parts`: (n_rows, n_factors), `lagged_signals` of each record. Returns directions in which nothing moved count as
-    very narrow.
-    """
+    """Return where the lagged signals of all records lie; directions in which nothing moved count as very narrow."""
     x = np.concatenate(parts)
     mean = x.mean(axis=0) if x.size else np.zeros(x.shape[1])
     if not x.size:

@@ -88,11 +88,9 @@ def candidates(
     lag: int,
     weight: tuple[Array, ...] | None = None,
 ) -> Candidates:
-    """Return the candidates over several records.
+    """Return the candidates over several records, rows from sample `lag` of each on.
 
-    `y`, `u`: (n_samples, n_channels), by record; `e`: (n_samples, n_outputs), or None, innovations; may be left out
-    where no term holds one; `lag`: first sample of every record that becomes a row; `weight`: (n_rows of the record,),
-    what the values of each row are multiplied with.
+    Innovations `e` may be left out where no term holds one; `weight` multiplies the values of each row.
     """
     factors = sorted({f for t in terms for f in t})
     parts = []
@@ -322,6 +320,6 @@ class _Gram:
         self.passes += 1
 
     def _tell(self, part: float) -> None:
-        """Say what share is over: the first pass is half of the work or more, each further one half of the rest."""
+        """Report the share that is over: the first pass is half of all or more, each further one half of the rest."""
         if self.tick is not None:
             self.tick(1.0 - 0.5**self.passes * (1.0 - 0.5 * part))

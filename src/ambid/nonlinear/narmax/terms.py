@@ -29,10 +29,7 @@ Term = tuple[Factor, ...]
 
 
 def lagged(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int) -> tuple[Factor, ...]:
-    """Return all lagged signals that terms are made of.
-
-    `ny`, `nu`, `ne`: largest lags of outputs, inputs, innovations; 0 for none of them.
-    """
+    """Return all lagged signals that terms are made of, up to the largest lags of each kind."""
     out = [Factor("y", c, lag) for c in range(n_outputs) for lag in range(1, ny + 1)]
     out += [Factor("u", c, lag) for c in range(n_inputs) for lag in range(nk, nk + nu)]
     out += [Factor("e", c, lag) for c in range(n_outputs) for lag in range(1, ne + 1)]
@@ -40,10 +37,7 @@ def lagged(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int)
 
 
 def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True, odd: bool = False) -> tuple[Term, ...]:
-    """Return all products of the factors up to a degree, by degree: the candidates of a polynomial (thesis eq. 3.4).
-
-    `degree`: of the polynomial; `constant`: whether the constant is one of them.
-    """
+    """Return all products of the factors up to a degree, by degree: the candidates of a polynomial (thesis eq. 3.4)."""
     out: list[Term] = [()] if constant and not odd else []
     for d in range(1, degree + 1, 2 if odd else 1):
         for term in combinations_with_replacement(factors, d):
@@ -57,11 +51,7 @@ def products(factors: tuple[Factor, ...], degree: int, *, constant: bool = True,
 
 
 def noise_terms(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int, degree: int) -> tuple[Term, ...]:
-    """Return the candidates that hold at least one innovation.
-
-    `ny`, `nu`, `nk`, `ne`: as in `lagged`; `degree`: of the noise model; above 1 innovations are multiplied with all
-    signals.
-    """
+    """Return the candidates that hold at least one innovation; above degree 1 these are multiplied with all signals."""
     if not ne:
         return ()
     if degree == 1:
@@ -71,10 +61,7 @@ def noise_terms(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne:
 
 
 def term_name(term: Term, n_outputs: int, n_inputs: int) -> str:
-    """Return how a term is written, such as ``y(t-1)^2*u(t-3)``.
-
-    `n_outputs`, `n_inputs`: with several, a signal carries its number, from 1.
-    """
+    """Return how a term is written, such as ``y(t-1)^2*u(t-3)``; several channels carry numbers, from 1."""
     if not term:
         return "1"
     parts = []
