@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.linear import information_inverse
+from ambid.estimation.linear import information_inverse, least_squares
 from ambid.estimation.progress import Tick, part_of
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped, sandwich
@@ -263,7 +263,7 @@ def misfit(state: State, data: Scaled) -> Misfit:
     Z, E = np.concatenate(rows), np.concatenate(targets)
     if not np.all(np.isfinite(E)):
         return Misfit(share=1.0, p=0.0)
-    left = E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]
+    left = E - Z @ least_squares(Z, E)
     n, p, k = *E.shape, Z.shape[1]
     tiny = 1e-14 * np.eye(p)
     gained = float(np.linalg.slogdet(E.T @ E / n + tiny)[1] - np.linalg.slogdet(left.T @ left / n + tiny)[1])
