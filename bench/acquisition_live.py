@@ -15,8 +15,8 @@ from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
 from ambid.estimation.estimate import Estimate
-from ambid.job.acquire import acquire
-from ambid.job.physical import identify
+from ambid.job import identify
+from ambid.job.acquisition import acquire
 from ambid.job.track_live import track_live
 from ambid.recursive.lines import TrackLine
 from ambid.rig import load_rig

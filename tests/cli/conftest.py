@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 
 from ambid.cli import run
-from ambid.cli.demo_record import demo_csv, demo_file, demo_simulation
+from ambid.cli.demo import demo_csv, demo_file, demo_simulation
 
 ROWS = 3000
 

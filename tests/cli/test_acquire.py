@@ -296,7 +296,7 @@ def test_a_full_disk_is_told_at_once_and_ends_with_2(acquire, monkeypatch):
                 self._writer._fail(DeviceError("the disk is full. Make room"))
             return super().append(block)
 
-    monkeypatch.setattr("ambid.job.acquire.Recorder", Full)
+    monkeypatch.setattr("ambid.job.acquisition.Recorder", Full)
     done = acquire("--seconds", "30")
     assert done.code == 2
     told = [line for line in done.err.splitlines() if "the disk is full" in line]
@@ -352,8 +352,8 @@ def test_a_signal_while_an_amplitude_is_looked_for_records_nothing(acquire, monk
 def estimate(tmp_path_factory):
     from ambid.acquire.program import program
     from ambid.acquire.session import Course
-    from ambid.job.acquire import acquire
-    from ambid.job.physical import identify
+    from ambid.job import identify
+    from ambid.job.acquisition import acquire
 
     folder, rig = tmp_path_factory.mktemp("start"), prototype()
     wave = program("multisine", amplitude_v=1.4, band=(2.0, 66.0), rate_hz=2000.0, seconds=4.0)

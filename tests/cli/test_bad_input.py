@@ -10,7 +10,7 @@ import re
 import numpy as np
 import pytest
 
-from ambid.cli.demo_record import PRESET
+from ambid.cli.demo import PRESET
 from ambid.physics.presets import preset
 
 TRUTH = preset(PRESET).parameters

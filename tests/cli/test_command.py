@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from ambid.cli import models
+from ambid.cli import info
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
@@ -106,7 +106,7 @@ def broken():
 
 
 def test_a_defect_is_one_line_and_exit_code_1(ambid, monkeypatch):
-    monkeypatch.setattr(models.command, "__code__", broken.__code__)
+    monkeypatch.setattr(info.models, "__code__", broken.__code__)
     found = ambid("models")
     assert found.code == 1
     assert (

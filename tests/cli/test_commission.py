@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from ambid.acquire.device import DeviceInfo
-from ambid.job.commission import FILES
+from ambid.job.commissioning import FILES
 from tests.firmware.conftest import avr_gcc, bench_program, firmware_elf, native_cc
 from tests.job.benches import COIL, PROTOTYPE_FILE, Spoiled, prototype
 

@@ -4,7 +4,7 @@ import gzip
 
 import numpy as np
 
-from ambid.cli.demo_record import PRESET, demo_csv, demo_file, demo_simulation
+from ambid.cli.demo import PRESET, demo_csv, demo_file, demo_simulation
 from ambid.physics.presets import preset
 from ambid.rig import load_rig, read_bench
 

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from ambid.cli import fit_nonlinear
+from ambid.cli import fit as verb
+from ambid.cli.options import settings_of
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
 WORDS = ("--input", "u", "--output", "y", "--open-loop")
@@ -106,7 +107,7 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
 
         yield tick
 
-    monkeypatch.setattr(fit_nonlinear, "progress", pressed)
+    monkeypatch.setattr(verb, "progress", pressed)
     out = at / "fit.json"
     found = ambid("fit", "r0.csv", "--structure", "narx", *WORDS, "--json", out)
     assert found.code == 130
@@ -151,7 +152,7 @@ def test_models_list_every_structure_with_its_settings(ambid) -> None:
 
 
 def test_settings_as_they_are_written() -> None:
-    read = fit_nonlinear.settings_of
+    read = settings_of
     assert read("auto") == {}
     assert read("ny=2, nu=2/3,prior=0.5,criterion=bic,neurons=auto,x=1e-3") == {
         "ny": 2, "nu": (2, 3), "prior": 0.5, "criterion": "bic", "x": 1e-3,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ambid.cli import identify_nonlinear
+from ambid.cli import identify
 from ambid.record import write_record
 from tests.bearing.magnet.estimates import ball, by_hand, seen
 
@@ -146,7 +146,7 @@ def _interrupting(title):
 
 
 def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
-    monkeypatch.setattr(identify_nonlinear, "progress", _interrupting)
+    monkeypatch.setattr(identify, "progress", _interrupting)
     out = at / "ball.json"
     found = ambid("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--to", "0.7", "--json", out)
     assert found.code == 130
@@ -181,7 +181,7 @@ def test_a_second_ctrl_c_writes_nothing_even_if_the_search_took_it_for_the_first
             except KeyboardInterrupt:
                 pass  # as a search does, which then goes on with its best
 
-    monkeypatch.setattr("ambid.job.nonlinear_bearing.identify_taken", takes_all)
+    monkeypatch.setattr("ambid.job.identification.identify_taken", takes_all)
     found = ambid("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--json", at / "ball.json")
     assert found.code == 130, found.out + found.err
     assert found.err == "ambid: interrupted; nothing was written\n"

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from ambid.cli.time_left import TimeLeft, in_words
+from ambid.cli.terminal import TimeLeft, in_words
 
 
 def course(shares, *, step=0.1, end=None):

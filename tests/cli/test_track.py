@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import pytest
 
-from ambid.cli.keys import Keys
+from ambid.cli.live import Keys
 from ambid.errors import AmbidError
 from ambid.recursive.lines import Event
 from ambid.track.lines_file import read_track
@@ -44,7 +44,7 @@ def job(monkeypatch, whole):
             seen["flags back"] += on_line(line) or []
         return replace(track, lines=())
 
-    monkeypatch.setattr(importlib.import_module("ambid.job.track"), "track", stand_in)
+    monkeypatch.setattr(importlib.import_module("ambid.job.tracking"), "track", stand_in)
     return seen
 
 
@@ -75,9 +75,9 @@ def test_options_reach_the_job(bench, ambid, job):
 
 
 REFUSED = {
-    "memory": (["--memory", "long"], "--memory long is neither auto nor all"),
-    "no memory": (["--memory", "0"], "--memory 0 is neither"),
-    "interval": (["--every", "0"], "--every is 0; it must be a positive"),
+    "memory": (["--memory", "long"], "--memory is 'long'; it must be 'auto', 'all' or a positive number"),
+    "no memory": (["--memory", "0"], "--memory is 0.0; it must be"),
+    "interval": (["--every", "0"], "--every is 0.0; it must be a positive"),
     "limit": (["--limit", "nan"], "--limit is nan; it must be a positive"),
     "unknown flag": (["--flag", "3:holt"], "flag 'holt' is unknown; known: track, hold, accept, revert Did you mean"),
     "no time": (["--flag", "hold"], "--flag hold is not of the form T:FLAG"),
@@ -165,7 +165,7 @@ def test_ctrl_c_before_the_first_line_leaves_nothing(bench, ambid, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         tick("identify")
 
-    monkeypatch.setattr(importlib.import_module("ambid.job.track"), "track", stand_in)
+    monkeypatch.setattr(importlib.import_module("ambid.job.tracking"), "track", stand_in)
     before = sorted(p.name for p in bench.iterdir())
     found = ambid("track", "record.csv", "--json", "track.jsonl")
     assert (found.code, found.out, found.err) == (130, "", "ambid: interrupted; nothing was written\n")
@@ -239,7 +239,7 @@ import fcntl, importlib, sys, termios, time
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 sys.path.insert(0, {str(ROOT)!r})
 from tests.track.tracks import track_of
-job = importlib.import_module("ambid.job.track")
+job = importlib.import_module("ambid.job.tracking")
 def stand_in(record, rig, *, on_header, on_line, **settings):
     track = track_of(seconds=600.0, every_s=1.0, names=("R",))
     on_header(track.header)

@@ -60,7 +60,7 @@ def test_the_readme_shows_what_the_demo_prints():
     """Numbers may differ in the last digit from machine to machine, by far less than their standard deviations."""
     from importlib.resources import as_file
 
-    from ambid.cli.demo_record import demo_file
+    from ambid.cli.demo import demo_file
     from ambid.job import identify
 
     with as_file(demo_file("demo.csv.gz")) as record, as_file(demo_file("demo.toml")) as rig:

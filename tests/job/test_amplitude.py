@@ -8,8 +8,7 @@ import pytest
 
 from ambid.acquire.session import RunReport
 from ambid.errors import DeviceError
-from ambid.job.amplitude import Trial, find_amplitude, fitting_amplitude
-from ambid.job.look import Room
+from ambid.job.look import Room, Trial, find_amplitude, fitting_amplitude
 from ambid.rig import rig_from_text
 from tests.job.benches import COIL, THESIS, Spoiled, prototype
 

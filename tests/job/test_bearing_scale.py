@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.job.identification import identify_nonlinear
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.simulate import simulate

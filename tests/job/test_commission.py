@@ -11,10 +11,11 @@ import pytest
 from ambid.acquire.device import SelfTest
 from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, EstimationError
-from ambid.job import commission as room
-from ambid.job.commission import FILES, STEPS, Declined, Wishes, check_folder, commission
-from ambid.job.commission.result import record as judged_record
-from ambid.job.commission.result import tracking
+from ambid.job import commissioning as room
+from ambid.job import commissioning_steps as judge
+from ambid.job.commissioning import FILES, Declined, check_folder, commission
+from ambid.job.commissioning_steps import STEPS, Wishes, tracking
+from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
 from ambid.rig import load_rig
 from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
@@ -99,7 +100,7 @@ def test_what_a_controller_measured_in_itself_is_said_in_words():
         self_test=lambda: SelfTest(failed=(), numbers={**measured, "heat": 3.0}),
         info=SimpleNamespace(kind="serial", port="/dev/ttyACM0", identity={"major": 1, "uid": 7}),
     )
-    step = room.bench.self_test(device)
+    step = judge.self_test(device)
     assert step.findings == ("serial device at /dev/ttyACM0: major 1", f"{words}, heat 3")
     assert step.numbers["supply_mv"] == 5006.0
 
@@ -199,8 +200,8 @@ def test_current_with_the_output_off_stops_it_at_rest(tmp_path):
 def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
     device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 40))
     with device:
-        look = room.guide.looking(device, prototype(), lambda: False)
-        step = room.bench.rest(look, room.guide.Room.of(prototype()), SHORT)
+        look = room.looking(device, prototype(), lambda: False)
+        step = judge.rest(look, room.Room.of(prototype()), SHORT)
     assert step.passed
     assert "with the output off" in step.cautions[0]
 
@@ -317,7 +318,7 @@ def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise EstimationError("the record says nothing. Take another")
 
-    monkeypatch.setattr("ambid.job.commission.guide.identify", refuse)
+    monkeypatch.setattr("ambid.job.commissioning.identify", refuse)
     done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "the record says nothing. Take another")
     assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
@@ -405,7 +406,7 @@ def test_an_interruption_while_numbers_are_worked_out(tmp_path):
 def test_a_disk_that_failed_is_the_reason(finished):
     from ambid.acquire.quality import Quality
     from ambid.errors import DeviceError
-    from ambid.job.acquire import Acquired
+    from ambid.job.acquisition import Acquired
 
     info = SimulatedDevice(prototype()).info
     done = Acquired(

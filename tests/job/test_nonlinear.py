@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import fit_nonlinear
-from ambid.job.estimates import read_estimate
+from ambid.job.results import read_estimate
 from ambid.nonlinear.fit_file import nonlinear_fit_text
 from ambid.record import read_record
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.job.bearing_records import Reading, taken_record
-from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.job.bearing_records import Reading, take_record
+from ambid.job.identification import identify_nonlinear
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.parameters import Parameter
@@ -130,33 +130,32 @@ def test_what_is_asked_wrongly_is_refused(balls, rig):
 
 def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, rig):
     x, u = balls[0]["position"], balls[0]["voltage"]
-    free = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.max()) + 1e-3))), Reading())
+    free = take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.max()) + 1e-3))), Reading())
     assert free.warnings == ()
     assert free.record.knock is None
-    taken = taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(np.quantile(x, 0.5))))), Reading())
+    taken = take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(np.quantile(x, 0.5))))), Reading())
     assert "counts as unknown" in taken.warnings[0]
     assert "lies on a stop" in taken.warnings[1]
     assert np.count_nonzero(taken.record.cut) == taken.record.u.size - taken.record.kept.shape[0] > 0
     with pytest.raises(EstimationError, match="nowhere free for 100 samples"):
-        taken_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.min())))), Reading())
+        take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.min())))), Reading())
     high = float(np.quantile(u, 0.9))
-    taken = taken_record(balls[0], replace(rig, limits=Limits(voltage=(0.0, high))), Reading())
+    taken = take_record(balls[0], replace(rig, limits=Limits(voltage=(0.0, high))), Reading())
     assert taken.record.u.max() == high
     assert taken.record.u.size == u.size  # none thrown away
     assert "the limit was taken" in taken.warnings[0]
 
 
 def test_one_signal_in_two_channels_is_refused_and_a_held_rotor_that_moves_is_told(balls, rig):
-    from ambid.job.bearing_checks import checked_together
-    from ambid.job.bearing_records import Reading, bearing_rig, taken_record
+    from ambid.job.bearing_records import Reading, bearing_rig, check_together, take_record
 
     bench = bearing_rig(rig)
-    free = taken_record(balls[0], bench, Reading())
+    free = take_record(balls[0], bench, Reading())
     twice = replace(free.record, y=np.column_stack([1e-4 * free.record.y[:, 1] + 0.01, free.record.y[:, 1]]))
     with pytest.raises(EstimationError, match="position and current are one signal but for scale and offset"):
-        checked_together([replace(free, record=twice)], None)
-    rocking = taken_record(balls[1], bench, Reading(), held=True)
-    (moving, told) = checked_together([free, rocking], None)
+        check_together([replace(free, record=twice)], None)
+    rocking = take_record(balls[1], bench, Reading(), held=True)
+    (moving, told) = check_together([free, rocking], None)
     assert not moving.warnings
     assert "said to be held, but its position scatters by" in told.warnings[-1]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.job.identification import identify_nonlinear
 from ambid.physics.presets import preset
 from ambid.rig import preset_text, rig_from_text
 from ambid.simulate import simulate_rig

@@ -10,8 +10,7 @@ import pytest
 
 from ambid.errors import AmbidError
 from ambid.estimation.estimate_file import estimate_to_json
-from ambid.job.physical import identify
-from ambid.job.track import track
+from ambid.job import identify, track
 from ambid.physics.presets import preset
 from ambid.record import Record, write_record
 from ambid.rig import default_rig

@@ -9,7 +9,7 @@ import pytest
 
 from ambid.cli import run
 from ambid.errors import EstimationError
-from ambid.job.track import track
+from ambid.job import track
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track

@@ -9,8 +9,8 @@ import pytest
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError, DeviceError
-from ambid.job.acquire import acquire
-from ambid.job.physical import identify
+from ambid.job import identify
+from ambid.job.acquisition import acquire
 from ambid.job.track_live import track_live
 from ambid.record import read_record
 from ambid.rig import rig_from_text
@@ -228,7 +228,7 @@ def test_a_line_that_is_lost_is_raised(start, tmp_path):
 
 
 def test_a_record_made_meanwhile_is_whole(start, tmp_path):
-    from ambid.job.acquire import recording
+    from ambid.job.acquisition import recording
 
     with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
         track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)

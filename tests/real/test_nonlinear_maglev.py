@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.cli import run
-from ambid.job.estimates import read_estimate
-from ambid.job.nonlinear_bearing import identify_nonlinear
+from ambid.job.identification import identify_nonlinear
+from ambid.job.results import read_estimate
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from tests.measured import ABSENT, MAGLEV

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ambid.job import identify
-from ambid.job.bench_rows import rows_of
+from ambid.job.track_start import rows_of
 from ambid.rig import load_rig
 from ambid.track.evidence import Samples
 from ambid.track.rpem import PhysicalRpem

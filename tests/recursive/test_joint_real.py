@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.job.physical import identify, load
+from ambid.job import identify, load
 from ambid.recursive.joint import JointEkf, JointUkf
 from ambid.recursive.joint_start import rates_of
 from ambid.rig import load_rig

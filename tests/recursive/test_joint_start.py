@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.recursive.joint import JointEkf, JointUkf, start_from
 from ambid.signals import multisine

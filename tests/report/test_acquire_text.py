@@ -8,7 +8,7 @@ import pytest
 from ambid.acquire.device import Counters, DeviceInfo
 from ambid.acquire.quality import ColumnQuality, QualityReport
 from ambid.acquire.session import RunReport
-from ambid.job.commission import STEPS
+from ambid.job.commissioning_steps import STEPS
 from ambid.report.device_text import acquired_text, next_text, progress_line, step_text
 
 COLUMN = ColumnQuality(

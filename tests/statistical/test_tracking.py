@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate import scenario_blocks, simulate_preset

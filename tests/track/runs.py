@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from ambid.estimation.estimate import Estimate
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.record import Record
 from ambid.recursive.lines import Event, TrackLine

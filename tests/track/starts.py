@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from ambid.estimation.estimate import Estimate
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model
 from ambid.physics.presets import preset

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig

@@ -19,7 +19,6 @@ from ambid.cli import (
     identify,
     info,
     init,
-    models,
     recover,
     simulate,
     track,
@@ -47,8 +46,8 @@ app.command("recover", short_help="the record of a recording that was cut off")(
 app.command("init", short_help="a first rig file, guessed from a record")(init.command)
 app.command("simulate", short_help="a record from the physics")(simulate.command)
 app.command("validate", short_help="the checks of an estimate on another record")(validate.command)
-app.command("info", short_help="what a record holds")(info.command)
-app.command("models", short_help="models, parameters, units, excitations, presets")(models.command)
+app.command("info", short_help="what a record holds")(info.info)
+app.command("models", short_help="models, parameters, units, excitations, presets")(info.models)
 
 
 @app.callback(invoke_without_command=True)

@@ -12,53 +12,44 @@ import typer
 from ambid.cli import INTERRUPTED
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
 from ambid.cli.interrupts import Stop, signals
-from ambid.cli.options import FAILED_CHECK, band_of, check_positive
-from ambid.cli.terminal import painter
-from ambid.cli.watch import watching
+from ambid.cli.options import FAILED_CHECK, band_of, check_positive, option, switch
+from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.acquire.device import Device
-    from ambid.job.acquire import Progress
-    from ambid.job.commission import Step, StepName
+    from ambid.job.acquisition import Progress
+    from ambid.job.commissioning_steps import Step, StepName
 
 
 def command(
     port: Port,
     rig: RigOfDevice,
-    folder: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="FOLDER", help="Where records, estimate and report go.", show_default=False
-        ),
-    ],
-    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the record in s.")] = 20.0,
+    folder: Annotated[Path, option("--output -o", "FOLDER", "Where records, estimate and report go.")],
+    seconds: Annotated[float, option("--seconds", "S", "Length of the record in s.", True)] = 20.0,
     track_seconds: Annotated[
-        float, typer.Option("--track-seconds", metavar="S", help="Length of live tracking in the end, in s.")
+        float, option("--track-seconds", "S", "Length of live tracking in the end, in s.", True)
     ] = 5.0,
     amplitude: Annotated[
-        float | None,
-        typer.Option(
-            "--amplitude", metavar="V", help="Peak of the excitation in V.", show_default="found by trials, small first"
-        ),
+        float | None, option("--amplitude", "V", "Peak of the excitation in V.", "found by trials, small first")
     ] = None,
     band: BandHz = None,
     widest: Annotated[
-        float, typer.Option("--widest", metavar="X", help="Largest half width of a 95 % interval that is good enough.")
+        float, option("--widest", "X", "Largest half width of a 95 % interval that is good enough.", True)
     ] = 0.10,
     bench: BenchName = None,
     pace: Pace = "fastest",
     seed: Seed = 0,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before the controller switches its output on.")
-    ] = False,
+    yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
     """Commission a bench: self-test, rest, levitate, excite, record, identify, validate, report, then track.
 
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
     """
-    from ambid.job.commission import STEPS, Wishes, check_folder, commission
+    from ambid.job import commission
+    from ambid.job.commissioning import check_folder
+    from ambid.job.commissioning_steps import STEPS, Wishes
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ambid.cli.options import preset_of
+from ambid.cli.options import option, preset_of, switch
 
 if TYPE_CHECKING:
     from ambid.acquire.device import Device, Mode
@@ -19,39 +19,31 @@ if TYPE_CHECKING:
 
 _SAME_RATE = 1e-3  # a rate from a time column is rounded
 
-Port = Annotated[
-    str,
-    typer.Option(
-        "--port", metavar="PORT", help="Serial port, or: emulated, simulated, replay:FILE.", show_default=False
-    ),
-]
-RigOfDevice = Annotated[
-    Path,
-    typer.Option("--rig", metavar="RIG", help="Rig file (TOML): calibrations, [loop], [daq].", show_default=False),
-]
+Port = Annotated[str, option("--port", "PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
+RigOfDevice = Annotated[Path, option("--rig", "RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
 BandHz = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--band",
-        metavar="LO:HI",
-        help="Band of the excitation in Hz.",
-        show_default="of a multisine to levitate, where the rotor moves; else what the controller can play",
+        "LO:HI",
+        "Band of the excitation in Hz.",
+        "of a multisine to levitate, where the rotor moves; else what the controller can play",
     ),
 ]
 BenchName = Annotated[
     str | None,
-    typer.Option(
+    option(
         "--bench",
-        metavar="PRESET|RIG",
-        help="Plant behind an emulated or simulated controller.",
-        show_default="daq.bench of the rig, or its own values",
+        "PRESET|RIG",
+        "Plant behind an emulated or simulated controller.",
+        "daq.bench of the rig, or its own values",
     ),
 ]
 Pace = Annotated[
     Literal["fastest", "real-time"],
-    typer.Option("--pace", help="Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
+    switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
 ]
-Seed = Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and simulated noise.", min=0)]
+Seed = Annotated[int, option("--seed", "N", "Seed of excitation and simulated noise.", True, min=0)]
 
 
 def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:

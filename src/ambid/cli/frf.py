@@ -7,19 +7,26 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, orders_of
 from ambid.cli.options import (
     FAILED_CHECK,
+    FIGURE_ENDINGS,
     From,
     Gaps,
+    Inputs,
     JsonFile,
+    OpenLoop,
+    OutputColumns,
     Rate,
     RecordFile,
+    References,
     RigFile,
     Strict,
     To,
     band_of,
     json_path,
+    option,
+    orders_of,
+    switch,
 )
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
@@ -27,8 +34,6 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.blackbox.data import Orders
-
-FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 
 
 def command(
@@ -39,55 +44,36 @@ def command(
     open_loop: OpenLoop = False,
     method: Annotated[
         Literal["auto", "periodic", "random", "local"],
-        typer.Option(
-            "--method", help="How to measure: averages over periods, averaged spectra, local polynomials, or what fits."
-        ),
+        switch("--method", "How to measure: averages over periods, averaged spectra, local polynomials, or what fits."),
     ] = "auto",
-    band: Annotated[
-        str | None,
-        typer.Option("--band", metavar="LO:HI", help="Lines that are used, in Hz.", show_default="all"),
-    ] = None,
+    band: Annotated[str | None, option("--band", "LO:HI", "Lines that are used, in Hz.", "all")] = None,
     hold: Annotated[
         Literal["zoh", "band-limited"],
-        typer.Option("--hold", help="What the input does between samples: held, or without power above half the rate."),
+        switch("--hold", "What the input does between samples: held, or without power above half the rate."),
     ] = "zoh",
     orders: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--orders",
-            metavar="nf=2,nb=1",
-            help="Fit transfer functions by maximum likelihood: degree of the denominator, numerator coefficients.",
-            show_default=False,
+            "nf=2,nb=1",
+            "Fit transfer functions by maximum likelihood: degree of the denominator, numerator coefficients.",
         ),
     ] = None,
     state_space: Annotated[
-        str | None,
-        typer.Option(
-            "--state-space",
-            metavar="n=3|auto",
-            help="Fit a state space by subspace with the Laguerre operator.",
-            show_default=False,
-        ),
+        str | None, option("--state-space", "n=3|auto", "Fit a state space by subspace with the Laguerre operator.")
     ] = None,
     feedthrough: Annotated[
-        bool, typer.Option("--feedthrough", help="With --state-space: a direct path from input to output (D).")
+        bool, switch("--feedthrough", "With --state-space: a direct path from input to output (D).")
     ] = False,
     domain: Annotated[
         Literal["s", "z"] | None,
-        typer.Option(
-            "--domain",
-            help="Of that model: continuous or discrete time.",
-            show_default="z for --orders of a held input, else s",
+        option(
+            "--domain", None, "Of that model: continuous or discrete time.", "z for --orders of a held input, else s"
         ),
     ] = None,
     delay: Annotated[
         str | None,
-        typer.Option(
-            "--delay",
-            metavar="S|auto",
-            help="Delay of the inputs in s, for the models.",
-            show_default="0; with --rig as the rig says",
-        ),
+        option("--delay", "S|auto", "Delay of the inputs in s, for the models.", "0; with --rig as the rig says"),
     ] = None,
     rig: RigFile = None,
     from_s: From = None,
@@ -95,10 +81,7 @@ def command(
     rate: Rate = None,
     gaps: Gaps = None,
     json: JsonFile = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option("--plot", metavar="FILE.png", help="Draw response, levels and models.", show_default=False),
-    ] = None,
+    plot: Annotated[Path | None, option("--plot", "FILE.png", "Draw response, levels and models.")] = None,
     strict: Strict = False,
 ) -> None:
     """Measure a frequency response with its noise and distortion, and fit models to it.
@@ -116,26 +99,10 @@ def command(
         between, wanted, n, late = band_of(band), _orders(orders), _order(state_space), _delay(delay)
         with progress("measure") as tick:
             found = frf(
-                record,
-                inputs=inputs or (),
-                outputs=output or (),
-                references=reference or (),
-                open_loop=open_loop,
-                method=method,
-                hold=hold,
-                band=between,
-                orders=wanted,
-                state_space=n,
-                feedthrough=feedthrough,
-                domain=domain,
-                delay=late,
-                rig=rig,
-                from_s=from_s,
-                to_s=to_s,
-                rate_hz=rate,
-                gaps=gaps,
-                tick=tick,
-            )
+                record, inputs=inputs or (), outputs=output or (), references=reference or (), open_loop=open_loop,
+                method=method, hold=hold, band=between, orders=wanted, state_space=n, feedthrough=feedthrough,
+                domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
+            )  # fmt: skip
             if plot is not None:
                 from ambid.report.drawing import save
                 from ambid.report.fit_figures import frf_figure
@@ -143,13 +110,9 @@ def command(
                 tick("draw")
                 page = frf_figure(found)
                 outputs.stage(plot, lambda path: save(page, path))
-        path = json_path(json)
-        if path is not None:
-            outputs.stage_text(path, measured_text(found))
-        elif json == "-":
-            typer.echo(measured_text(found), nl=False)
-    if json != "-":
-        typer.echo(frf_text(found, paint=painter()))
+        written = measured_text(found)
+        outputs.stage_json(json, written)
+    typer.echo(written if json == "-" else frf_text(found, paint=painter()), nl=json != "-")
     if strict and not found.passed:
         raise typer.Exit(FAILED_CHECK)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ambid.cli.options import Gaps, Rate
+from ambid.cli.options import Gaps, Rate, argument, option, switch
 from ambid.cli.output import Outputs
 from ambid.errors import AmbidError, nearest
 
@@ -15,25 +15,19 @@ _WIRED = ("prototype",)  # presets with a controller, whose rig is among the pac
 
 
 def command(
-    record: Annotated[
-        Path | None, typer.Argument(metavar="RECORD", help="Record: .csv, .csv.gz, .h5 or .mat.", show_default=False)
-    ] = None,
-    rig: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="RIG", help="Rig file to write.", show_default="standard output"),
-    ] = None,
+    record: Annotated[Path | None, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")] = None,
+    rig: Annotated[Path | None, option("--output -o", "RIG", "Rig file to write.", "standard output")] = None,
     preset: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--preset",
-            metavar="NAME",
-            help="Instead of a record: the rig of a bench that 'ambid models' lists; prototype has a controller.",
-            show_default=False,
+            "NAME",
+            "Instead of a record: the rig of a bench that 'ambid models' lists; prototype has a controller.",
         ),
     ] = None,
     rate: Rate = None,
     gaps: Gaps = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over a rig file that exists.")] = False,
+    force: Annotated[bool, switch("--force", "Write over a rig file that exists.")] = False,
 ) -> None:
     """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
     if (record is None) == (preset is None):

@@ -83,6 +83,11 @@ class Outputs:
         """
         self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
+    def stage_json(self, json: str | None, text: str) -> None:
+        """Write the file that ``--json`` names, if it names one."""
+        if json not in (None, "-"):
+            self.stage_text(Path(str(json)), text)
+
     def __enter__(self) -> Outputs:
         return self
 

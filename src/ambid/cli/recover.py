@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli.options import FAILED_CHECK
+from ambid.cli.options import FAILED_CHECK, argument, option, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
@@ -17,21 +17,15 @@ if TYPE_CHECKING:
 
 
 def command(
-    journals: Annotated[
-        list[Path],
-        typer.Argument(metavar="JOURNAL", help="What is left of a recording: NAME.journal.", show_default=False),
-    ],
+    journals: Annotated[list[Path], argument("JOURNAL", "What is left of a recording: NAME.journal.")],
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FILE", help="Record to write: .h5, .hdf5, .csv or .csv.gz.", show_default="NAME"
-        ),
+        Path | None, option("--output -o", "FILE", "Record to write: .h5, .hdf5, .csv or .csv.gz.", "NAME")
     ] = None,
     delete: Annotated[
-        bool, typer.Option("--delete", help="Remove the journal once its record is written and nothing was damaged.")
+        bool, switch("--delete", "Remove the journal once its record is written and nothing was damaged.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write over a record that exists.")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="End with exit code 3 if something was damaged.")] = False,
+    force: Annotated[bool, switch("--force", "Write over a record that exists.")] = False,
+    strict: Annotated[bool, switch("--strict", "End with exit code 3 if something was damaged.")] = False,
 ) -> None:
     """Make the record of a recording that was killed or whose power was cut, from the journal that it left.
 

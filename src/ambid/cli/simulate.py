@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.cli.options import band_of, preset_of
+from ambid.cli.options import argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
-from ambid.cli.scenario import Course, simulate_course, truth_words, warn
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
@@ -29,93 +28,49 @@ _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
 def command(
-    rig: Annotated[
-        str,
-        typer.Argument(
-            metavar="RIG|PRESET", help="Rig file, or a bench that 'ambid models' lists.", show_default=False
-        ),
-    ],
-    record: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="FILE", help="Record to write: .csv, .csv.gz or .h5.", show_default=False
-        ),
-    ],
-    duration: Annotated[
-        float | None,
-        typer.Option("--duration", metavar="S", help="Length in s.", show_default="1, or the scenario's"),
-    ] = None,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", metavar="HZ", help="Sampling rate in Hz.", show_default="the preset's, or the rig's"),
-    ] = None,
+    rig: Annotated[str, argument("RIG|PRESET", "Rig file, or a bench that 'ambid models' lists.")],
+    record: Annotated[Path, option("--output -o", "FILE", "Record to write: .csv, .csv.gz or .h5.")],
+    duration: Annotated[float | None, option("--duration", "S", "Length in s.", "1, or the scenario's")] = None,
+    rate: Annotated[float | None, option("--rate", "HZ", "Sampling rate in Hz.", "the preset's, or the rig's")] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--scenario",
-            metavar="NAME",
-            help="A course of known truth, as 'ambid models' lists them: the record has columns true_... beside it.",
-            show_default="nothing changes",
+            "NAME",
+            "A course of known truth, as 'ambid models' lists them: the record has columns true_... beside it.",
+            "nothing changes",
         ),
     ] = None,
-    at: Annotated[
-        float | None,
-        typer.Option("--at", metavar="S", help="When the scenario begins, in s.", show_default="the scenario's"),
-    ] = None,
+    at: Annotated[float | None, option("--at", "S", "When the scenario begins, in s.", "the scenario's")] = None,
     size: Annotated[
-        float | None,
-        typer.Option(
-            "--size", metavar="X", help="How much the scenario changes, e.g. -0.15.", show_default="the scenario's"
-        ),
+        float | None, option("--size", "X", "How much the scenario changes, e.g. -0.15.", "the scenario's")
     ] = None,
     excitation: Annotated[
-        str | None,
-        typer.Option(
-            "--excitation", metavar="NAME", help="Excitation, as 'ambid models' lists them.", show_default="multisine"
-        ),
+        str | None, option("--excitation", "NAME", "Excitation, as 'ambid models' lists them.", "multisine")
     ] = None,
     amplitude: Annotated[
-        float | None,
-        typer.Option(
-            "--amplitude",
-            metavar="A",
-            help="Peak in V (rms for gaussian).",
-            show_default="what half of the limits allows",
-        ),
+        float | None, option("--amplitude", "A", "Peak in V (rms for gaussian).", "what half of the limits allows")
     ] = None,
     band: Annotated[
-        str | None,
-        typer.Option(
-            "--band",
-            metavar="LO:HI",
-            help="Band of the excitation in Hz.",
-            show_default="one period to a fifth of the rate",
-        ),
+        str | None, option("--band", "LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
     ] = None,
     periods: Annotated[
-        int, typer.Option("--periods", metavar="N", help="How often the excitation repeats, for 'ambid frf'.", min=1)
+        int, option("--periods", "N", "How often the excitation repeats, for 'ambid frf'.", True, min=1)
     ] = 1,
     log_excitation: Annotated[
-        bool,
-        typer.Option("--log-excitation", help="A column 'excitation' too: the reference that 'ambid frf' wants."),
+        bool, switch("--log-excitation", "A column 'excitation' too: the reference that 'ambid frf' wants.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of excitation and noise.", min=0)] = 0,
+    seed: Annotated[int, option("--seed", "N", "Seed of excitation and noise.", True, min=0)] = 0,
     loop: Annotated[
         Literal["open", "closed"] | None,
-        typer.Option("--loop", help="With or without the controller.", show_default="as the bench usually works"),
+        option("--loop", None, "With or without the controller.", "as the bench usually works"),
     ] = None,
     nonlinear: Annotated[
-        bool,
-        typer.Option("--nonlinear", help="The nonlinear magnet, of a rig its [magnet], instead of its linearisation."),
+        bool, switch("--nonlinear", "The nonlinear magnet, of a rig its [magnet], instead of its linearisation.")
     ] = False,
     position: Annotated[
         float | None,
-        typer.Option(
-            "--position",
-            metavar="M",
-            help="With --nonlinear: where the loop holds the rotor, in m.",
-            show_default="the operating point's",
-        ),
+        option("--position", "M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
     ] = None,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records.
@@ -160,9 +115,9 @@ def command(
 
 
 def _refuse(of: str, given: Mapping[str, object]) -> None:
-    for option, value in given.items():
+    for name, value in given.items():
         if value is not None:
-            raise AmbidError(f"{of} has no {option}. Leave {option} out")
+            raise AmbidError(f"{of} has no {name}. Leave {name} out")
 
 
 def _of_preset(
@@ -240,3 +195,101 @@ def _comments(rig: str, excitation: str, size: float, band: str | None, seed: in
         f"simulated by ambid {version('ambid')}: {Path(rig).name}, {excitation} of {size:.6g} V{between}, seed {seed}"
     )
     return made, f"truth: {truth_words(done)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What the user says of a scenario; None for what the scenario or the bench says."""
+
+    name: str  # of the scenario
+    duration_s: float | None  # as `ambid.simulate.simulate_scenario`
+    rate_hz: float | None
+    amplitude: float | None
+    at_s: float | None
+    size: float | None
+    seed: int  # of excitation, noise and losses
+    closed: bool | None  # closed or open loop
+    log_excitation: bool  # a column ``excitation`` too
+
+
+def simulate_course(course: Course, preset: Preset | None, rig: str, record: Path) -> None:
+    """Simulate, write the record and say what is in it.
+
+    `course`: the scenario; `preset`: the bench; None: the rig file; `rig`: the bench in the user's words; `record`:
+    file to write; a scenario that loses samples is written as CSV.
+    """
+    from ambid.record import write_record
+    from ambid.rig import load_rig
+    from ambid.simulate import damage, scenario, simulate_scenario
+
+    what = scenario(course.name)
+    with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
+        outputs.claim(record, "-o", (".csv", ".csv.gz") if what.dropped else (".csv", ".csv.gz", ".h5", ".hdf5"))
+        done = simulate_scenario(
+            what, preset or load_rig(Path(rig)), duration_s=course.duration_s, rate_hz=course.rate_hz, seed=course.seed,
+            amplitude=course.amplitude, at_s=course.at_s, size=course.size, closed=course.closed,
+            log_excitation=course.log_excitation,
+        )  # fmt: skip
+        told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
+        lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")
+        comments = () if record.suffix in (".h5", ".hdf5") else (_made(rig, told), *lines)
+        lost = 0
+
+        def write(path: Path) -> None:
+            nonlocal lost
+            if not what.dropped:
+                write_record(done.record, path, comments=comments)
+                return
+            first = round(told["from_s"] * done.record.rate_hz)
+            share = told["size"]
+            found = damage(done.record, path, share=share, seed=course.seed, first=first, comments=comments)
+            lost = sum(x.stop - x.first for x in found)
+
+        outputs.stage(record, write)
+    warn(done)
+    n, rate = done.record.n_samples, done.record.rate_hz
+    short = f", {lost} of them lost or without a value" if lost else ""
+    typer.echo(
+        f"{record}: {n} samples at {rate:g} Hz{short}, excitation of {told['amplitude']:.4g} V, seed {course.seed}"
+    )
+    for line in lines:
+        typer.echo(line)
+
+
+def warn(done: Simulation) -> None:
+    """Say on standard error what went wrong in a simulation.
+
+    `done`: with its warnings.
+    """
+    for warning in done.warnings:
+        typer.echo(f"ambid: warning: {warning}", err=True)
+
+
+def truth_words(done: Simulation) -> str:
+    """Return the parameters of a simulation in words.
+
+    `done`: with its truth. Returns names and values on one line.
+    """
+    return ", ".join(f"{name} {value:.6g}" for name, value in done.truth.items()) + " (SI; delay in samples)"
+
+
+def _words(done: Simulation, told: Mapping[str, Any]) -> str:
+    """Say what varies, from where to where, and from when."""
+    from ambid.simulate import truth_columns
+
+    moved = []
+    for name, c in truth_columns(done.record).items():
+        first, last, unit = float(c.values[0]), float(c.values[-1]), "" if c.unit == "1" else f" {c.unit}"
+        moved.append(f"{name} {first:.6g}{unit}" if first == last else f"{name} {first:.6g} to {last:.6g}{unit}")
+    begins = f", from {told['from_s']:g} s" if "from_s" in told else ""
+    return (", ".join(moved) or "no parameter changes") + begins
+
+
+def _made(rig: str, told: Mapping[str, Any]) -> str:
+    from importlib.metadata import version
+
+    size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""
+    return (
+        f"simulated by ambid {version('ambid')}: {Path(rig).name}, scenario {told['name']}{size}, excitation of"
+        f" {told['amplitude']:.6g} V, seed {told['seed']}"
+    )

@@ -11,8 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ambid.cli import INTERRUPTED
-from ambid.cli.blackbox_options import Inputs, OpenLoop, OutputColumns, References, orders_of
-from ambid.cli.options import FAILED_CHECK, From, Rate, RecordFile, RigFile, To, json_path
+from ambid.cli.options import (
+    FAILED_CHECK,
+    FIGURE_ENDINGS,
+    From,
+    Inputs,
+    OpenLoop,
+    OutputColumns,
+    Rate,
+    RecordFile,
+    References,
+    RigFile,
+    To,
+    TrackFile,
+    json_path,
+    option,
+    orders_of,
+    switch,
+)
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter
 from ambid.errors import AmbidError, nearest
@@ -21,9 +37,9 @@ if TYPE_CHECKING:
     from ambid.cli.live import Flag, Follower
     from ambid.recursive.lines import TrackHeader, TrackSummary
 
-FIGURE_ENDINGS = (".png", ".svg", ".pdf")
-_FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
-_SHORTEST_S, _LONGEST_S = 1e-3, 1e9  # of --memory: below a block, and beyond any record
+_NAMES = {
+    "every_s": "--every", "limit": "--limit", "memory": "--memory", "start": "--start", "start_s": "--start-seconds"
+}  # fmt: skip
 
 
 def command(
@@ -31,91 +47,60 @@ def command(
     rig: RigFile = None,
     method: Annotated[
         str,
-        typer.Option(
+        option(
             "--method",
-            metavar="NAME",
-            help="rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to"
-            " --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
+            "NAME",
+            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
+            True,
         ),
     ] = "rpem",
     inputs: Inputs = None,
     output: OutputColumns = None,
-    orders: Annotated[
-        str | None,
-        typer.Option("--orders", metavar="na=2,nb=2,nk=1", help="Orders of coefficients.", show_default=False),
-    ] = None,
+    orders: Annotated[str | None, option("--orders", "na=2,nb=2,nk=1", "Orders of coefficients.")] = None,
     reference: References = None,
     open_loop: OpenLoop = False,
-    step: Annotated[
-        float | None,
-        typer.Option("--step", metavar="X", help="Step of lms and nlms, for signals of size one.", show_default=False),
-    ] = None,
+    step: Annotated[float | None, option("--step", "X", "Step of lms and nlms, for signals of size one.")] = None,
     start: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--start",
-            metavar="ESTIMATE.json",
-            help="Begin with this estimate; by default one is identified from the beginning of the record.",
-            show_default=False,
+            "ESTIMATE.json",
+            "Begin with this estimate; by default one is identified from the beginning of the record.",
         ),
     ] = None,
     start_seconds: Annotated[
-        float | None,
-        typer.Option(
-            "--start-seconds", metavar="S", help="Identify the start from that much of the record.", show_default=False
-        ),
+        float | None, option("--start-seconds", "S", "Identify the start from that much of the record.")
     ] = None,
-    every: Annotated[float, typer.Option("--every", metavar="S", help="Reporting interval, s of record.")] = 0.01,
-    limit: Annotated[
-        float, typer.Option("--limit", metavar="X", help="Acceptable model error; 1 is that at identification.")
-    ] = 1.5,
+    every: Annotated[float, option("--every", "S", "Reporting interval, s of record.", True)] = 0.01,
+    limit: Annotated[float, option("--limit", "X", "Acceptable model error; 1 is that at identification.", True)] = 1.5,
     memory: Annotated[
         str,
-        typer.Option(
+        option(
             "--memory",
-            metavar="auto|all|S",
-            help="How long data count: found from the data, for ever, or a time constant in s.",
+            "auto|all|S",
+            "How long data count: found from the data, for ever, or a time constant in s.",
+            True,
         ),
     ] = "auto",
     pace: Annotated[
-        Literal["fastest", "real-time"], typer.Option("--pace", help="Replay as fast as possible, or as it was taken.")
+        Literal["fastest", "real-time"], switch("--pace", "Replay as fast as possible, or as it was taken.")
     ] = "fastest",
     flag: Annotated[
         list[str] | None,
-        typer.Option(
-            "--flag",
-            metavar="T:hold",
-            help="Set a flag at a time of the record: track, hold, accept or revert; repeat.",
-            show_default=False,
-        ),
+        option("--flag", "T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeat."),
     ] = None,
     from_s: From = None,
     to_s: To = None,
     rate: Rate = None,
-    json: Annotated[
-        str | None,
-        typer.Option(
-            "--json",
-            metavar="FILE",
-            help="Write the track as lines of JSON while it comes; - for standard output.",
-            show_default=False,
-        ),
-    ] = None,
+    json: TrackFile = None,
     plot: Annotated[
         Path | None,
-        typer.Option(
-            "--plot",
-            metavar="FILE.png",
-            help="Draw the tracks, beside the truth where the record has columns true_NAME.",
-            show_default=False,
-        ),
+        option("--plot", "FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--no-live", "--quiet", help="No live view, also on a terminal.")] = False,
+    quiet: Annotated[bool, switch("--no-live --quiet", "No live view, also on a terminal.")] = False,
     strict: Annotated[
         bool,
-        typer.Option(
-            "--strict", help="End with exit code 3 if a change stays unanswered, or the end is frozen or off the limit."
-        ),
+        switch("--strict", "End with exit code 3 if a change stays unanswered, or the end is frozen or off the limit."),
     ] = False,
 ) -> None:
     """Follow the physical parameters of a bench through a record, as the tracker does beside a running machine.
@@ -123,12 +108,15 @@ def command(
     On a terminal a live view shows parameters, error, state and decisions; h, t, a and r set flags, q ends.
     """
     from ambid.cli.live import Follower
-    from ambid.job.track import track
+    from ambid.job.tracking import check_settings, track
     from ambid.rig import load_rig
     from ambid.track.lines_file import TrackWriter
 
-    _check(every, limit, start, start_seconds)
     remembered, flags = memory_of(memory), flags_of(flag)
+    check_settings(
+        record, start=start, start_s=start_seconds, every_s=every, limit=limit, memory=remembered, pace=pace,
+        flags=flags, rate_hz=rate, names=_NAMES,
+    )  # fmt: skip
     settings: dict[str, Any] = {
         "inputs": tuple(inputs or ()),
         "outputs": tuple(output or ()),
@@ -186,16 +174,6 @@ def command(
     finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict, flags=flags)
 
 
-def _check(every: float, limit: float, start: Path | None, start_seconds: float | None) -> None:
-    for option, x in (("--every", every), ("--limit", limit), ("--start-seconds", start_seconds)):
-        if x is not None and not (math.isfinite(x) and x > 0):
-            raise AmbidError(f"{option} is {x:g}; it must be a positive number. Correct it")
-    if start is not None and start_seconds is not None:
-        raise AmbidError(
-            "--start-seconds is for a start identified from the record; --start gives one. Leave one of them out"
-        )
-
-
 def _check_interval(every: float, rate_hz: float) -> None:
     """Refuse an interval that holds no sample, now that the rate is known."""
     if every * rate_hz < 1.0 - 1e-9:
@@ -205,24 +183,12 @@ def _check_interval(every: float, rate_hz: float) -> None:
         )
 
 
-def memory_of(text: str) -> float | Literal["auto", "all"]:
-    """Read ``--memory``."""
-    if text == "auto":
-        return "auto"
-    if text == "all":
-        return "all"
+def memory_of(text: str) -> Any:
+    """Read ``--memory``: a time in s, or a word, which is judged later."""
     try:
-        seconds = float(text)
+        return float(text)
     except ValueError:
-        seconds = math.nan
-    if not (math.isfinite(seconds) and seconds > 0):
-        raise AmbidError(f"--memory {text} is neither auto nor all nor a positive number of seconds. Correct it")
-    if not _SHORTEST_S <= seconds <= _LONGEST_S:
-        raise AmbidError(
-            f"--memory {text} is out of range: {_SHORTEST_S:g} to {_LONGEST_S:g} s. Give 'all' where nothing is to be"
-            " forgotten"
-        )
-    return seconds
+        return text
 
 
 def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
@@ -230,13 +196,15 @@ def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
 
     `texts`: each a time in s, a colon and a flag. Returns in the order of their times.
     """
+    from ambid.job.tracking import FLAGS
+
     found: list[tuple[float, Flag]] = []
     for text in texts or []:
         time, colon, name = text.partition(":")
-        flag = next((f for f in _FLAGS if f == name), None)
+        flag = next((f for f in FLAGS if f == name), None)
         if colon and flag is None:
             raise AmbidError(
-                f"--flag {text}: flag {name!r} is unknown; known: {', '.join(_FLAGS)}{nearest(name, _FLAGS)}"
+                f"--flag {text}: flag {name!r} is unknown; known: {', '.join(FLAGS)}{nearest(name, FLAGS)}"
             )
         try:
             t = float(time)

@@ -1,12 +1,29 @@
-"""The jobs: `identify` (one record and one rig → physical parameters), `fit` (one record → a black-box model),
-`fit_nonlinear` (records → a nonlinear model) and `frf` (one record → a frequency response and what is fitted to it).
+"""The jobs: what the commands do, as functions; command line, benchmarks and tests call these, so what is tested runs.
 
-Command line, benchmarks and tests call these functions, so that what is tested is what runs.
+One record, or several, and what is known of the bench go in; one result that was judged comes out.
 """
 
-from ambid.job.blackbox import compare, fit, physics, read_data
-from ambid.job.frequency import frf
-from ambid.job.nonlinear import fit_nonlinear
-from ambid.job.physical import identify, judged, load, signals_of
+from __future__ import annotations
 
-__all__ = ["compare", "fit", "fit_nonlinear", "frf", "identify", "judged", "load", "physics", "read_data", "signals_of"]
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.job.acquisition import acquire as acquire
+    from ambid.job.commissioning import commission as commission
+    from ambid.job.data import load as load
+    from ambid.job.data import read_data as read_data
+    from ambid.job.data import signals_of as signals_of
+    from ambid.job.fits import compare as compare
+    from ambid.job.fits import fit as fit
+    from ambid.job.fits import fit_nonlinear as fit_nonlinear
+    from ambid.job.fits import physics as physics
+    from ambid.job.identification import identify as identify
+    from ambid.job.identification import identify_nonlinear as identify_nonlinear
+    from ambid.job.identification import judged as judged
+    from ambid.job.response import frf as frf
+    from ambid.job.results import read_estimate as read_estimate
+    from ambid.job.tracking import track as track
+
+__getattr__, __dir__, __all__ = exports(__name__)

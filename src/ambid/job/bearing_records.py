@@ -1,17 +1,21 @@
-"""Records of a nonlinear bearing as its predictor sees them, through a rig that says what is known of the magnet."""
+"""Records of a nonlinear bearing as its predictor sees them, through a rig that says what is known of the magnet.
+
+What they must not be: the same data twice, one channel twice, the stage off, a held rotor that moves.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ambid.errors import EstimationError, nearest
+from ambid.job.data import Reading, known_rig, load, origin
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.record import Record
-from ambid.rig import Rig, RigMagnet, default_rig, load_rig
+from ambid.rig import Rig, RigMagnet
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet.problem import BearingRecord
@@ -20,7 +24,10 @@ Magnet = MagnetLaw | Literal["auto", "single", "pair"]
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
+_LEAST = 100  # samples
 _REVERSED = 0.2  # largest current backwards over that forwards from which two magnets are taken
+_SAME = 1e-9  # part of a channel's spread that another one leaves over, at or below which both are the same signal
+_ROCKS = 0.25  # spread of a held position over that of the moving ones from which it is told
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,17 +39,6 @@ class TakenRecord:
     remembered: Mapping[str, object]
     warnings: tuple[str, ...]  # what was changed in it
     start_s: float  # time of its first sample in s
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """How files are read."""
-
-    # part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones
-    from_s: float | None = None
-    to_s: float | None = None
-    rate_hz: float | None = None  # for files without time
-    gaps: str | None = None  # ``"error"``, ``"interpolate"`` or ``"cut"``
 
 
 def bearing_rig(
@@ -62,7 +58,7 @@ def bearing_rig(
     """
     from ambid.bearing.magnet.problem import UNITS
 
-    bench = default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
+    bench = known_rig(rig)
     if bench.model != "one-axis":
         raise EstimationError(
             f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
@@ -102,7 +98,7 @@ def bearing_rig(
     )
 
 
-def known_numbers(rig: Rig) -> dict[str, Parameter]:
+def numbers_of(rig: Rig) -> dict[str, Parameter]:
     """Return what a rig knows of the numbers of a nonlinear bearing.
 
     `rig`: with a `magnet`. Returns its m, R and c, and those of the magnet.
@@ -134,7 +130,7 @@ def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[Ma
     return laws, known.rise is None and known.asymmetric is None
 
 
-def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
+def take_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
     """Read a record as the predictor sees it.
 
     `rig`: with a `magnet`; `held`: the rotor is held at rest: all of the record is taken.
@@ -143,22 +139,23 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
 
     from ambid.bearing.magnet.contact import touching
     from ambid.bearing.magnet.problem import BearingRecord
-    from ambid.job.physical import load
 
     if held:
         rig, how = (
             replace(rig, record=replace(rig.record, from_s=None, to_s=None)),
             replace(how, from_s=None, to_s=None),
         )
-    bench = load(record, rig, from_s=how.from_s, to_s=how.to_s, rate_hz=how.rate_hz, gaps=how.gaps)
+    bench = load(record, rig, **asdict(how))
     u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
-    told, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
+    warnings, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
     if rig.limits is not None:
         low, high = rig.limits.voltage
         beyond = int(np.count_nonzero((u < low) | (u > high)))
         if beyond:
             u = np.clip(u, low, high)
-            told.append(f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken")
+            warnings.append(
+                f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
+            )
     y = np.column_stack([bench["position"], bench["current"]])
     taken = BearingRecord(
         name=name,
@@ -172,24 +169,18 @@ def taken_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: b
     _check_moves(taken)
     if rig.limits is not None:
         taken = touching(taken, rig.limits.position)
-        told += _stops_told(taken)
-    remembered = {
-        "samples": bench.n_samples, "rate_hz": bench.rate_hz, "sha256": bench.provenance.get("sha256"),
-        "file": bench.provenance.get("file"), "held": held, "history": [str(step) for step in bench.history],
-    }  # fmt: skip
-    return TakenRecord(record=taken, remembered=remembered, warnings=tuple(told), start_s=bench.start_s)
+        warnings += _stops(taken)
+    found = {**origin(bench), "held": held}
+    return TakenRecord(record=taken, remembered=found, warnings=tuple(warnings), start_s=bench.start_s)
 
 
-_LEAST = 100  # samples
-
-
-def _stops_told(record: BearingRecord) -> list[str]:
+def _stops(record: BearingRecord) -> list[str]:
     """Say where the rotor touched its stops and where it lay on them; refuse where too little is left."""
     import numpy as np
 
-    told = list[str]()
+    found = list[str]()
     if record.knock is not None and record.knock.any():
-        told.append(
+        found.append(
             f"{record.name}: the rotor is at a stop (loop.limits.position) for {np.count_nonzero(record.knock)} "
             "samples; the force there counts as unknown"
         )
@@ -200,11 +191,11 @@ def _stops_told(record: BearingRecord) -> list[str]:
                 f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.0%} of the record, and is "
                 f"nowhere free for {_LEAST} samples. Correct the limits, or record with the rotor levitated"
             )
-        told.append(
+        found.append(
             f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.1%} of the record; that was cut "
             f"out, and {left} samples in {len(record.parts)} stretches remain"
         )
-    return told
+    return found
 
 
 def _check_moves(record: BearingRecord) -> None:
@@ -223,3 +214,69 @@ def _check_moves(record: BearingRecord) -> None:
                 f"{record.name}: channel {role!r} is constant over the whole record; nothing can be estimated from it. "
                 "Check column and units, or leave it out"
             )
+
+
+def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
+    """Check what shows only in values or between records.
+
+    `taken`: to identify from; `second`: to judge on. Returns `taken`, with a warning where a held rotor moves.
+    """
+    for j, one in enumerate(taken):
+        _refuse_senseless(one.record)
+        for other in taken[:j]:
+            if _overlap(one, other):
+                raise EstimationError(
+                    f"{other.record.name} and {one.record.name} hold the same samples; they would count twice. "
+                    "Leave one out"
+                )
+    for one in taken:
+        if second is not None and _overlap(one, second):
+            raise EstimationError(
+                f"{second.record.name}, to judge on, holds samples that the estimate is fitted to; errors there say "
+                "nothing about others. Give another record, or leave --validate out"
+            )
+    moving = max((float(t.record.y[:, 0].std()) for t in taken if not t.record.held), default=0.0)
+    return tuple(_warn_moving(t, moving) for t in taken)
+
+
+def _refuse_senseless(record: BearingRecord) -> None:
+    import numpy as np
+
+    if np.all(record.loose > 0.0):
+        raise EstimationError(
+            f"{record.name}: every voltage is at or below off_below, where the stage is off; none would be known. "
+            "Correct --off-below or magnet.off_below (in V)"
+        )
+    channels = {"voltage": record.u, "position": record.y[:, 0], "current": record.y[:, 1]}
+    if record.held:
+        del channels["position"]
+    names = list(channels)
+    unit = {name: (x - x.mean()) / x.std() for name, x in channels.items()}
+    for j, one in enumerate(names):
+        for other in names[:j]:
+            a, b = unit[one], unit[other]
+            if np.std(a - np.sign(a @ b) * b) <= _SAME:
+                raise EstimationError(
+                    f"{record.name}: {other} and {one} are one signal but for scale and offset; nothing can be told "
+                    f"from that. Correct channels.{other}.column or channels.{one}.column"
+                )
+
+
+def _overlap(a: TakenRecord, b: TakenRecord) -> bool:
+    """Whether both come from one file and one stretch of its time."""
+    if a.remembered["sha256"] is None or a.remembered["sha256"] != b.remembered["sha256"]:
+        return False
+    ends = [t.start_s + t.record.u.size / t.record.rate_hz for t in (a, b)]
+    half = 0.5 / a.record.rate_hz
+    return max(a.start_s, b.start_s) + half < min(ends)
+
+
+def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
+    rocks = float(one.record.y[:, 0].std())
+    if not one.record.held or rocks <= _ROCKS * moving:
+        return one
+    said = (
+        f"{one.record.name}: the rotor is said to be held, but its position scatters by {1e6 * rocks:.3g} um, "
+        f"{rocks / moving:.0%} of what it does where it moves; R and L are biased if that is motion"
+    )
+    return replace(one, warnings=(*one.warnings, said))

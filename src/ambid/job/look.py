@@ -1,4 +1,8 @@
-"""Short looks at a bench: a course is run and kept in memory, seen through the rig, with the room that it may use."""
+"""Short looks at a bench, kept in memory and seen through the rig, and the size of an excitation found by them.
+
+An excitation may use a part of the way from rest to the trips of position and current, and most of the voltage. The
+first trial is so small that a bench which is hard to hold stands it; one that was too large is followed by a smaller.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +15,23 @@ import numpy as np
 
 from ambid.acquire.causes import fault_words
 from ambid.acquire.default_daq import with_default_daq
-from ambid.acquire.device import Device
+from ambid.acquire.device import Device, Mode
+from ambid.acquire.program import program
 from ambid.acquire.scales import scale_of
 from ambid.acquire.session import Course, RunReport, run
 from ambid.acquire.view import BenchView
 from ambid.arrays import Array
+from ambid.errors import DeviceError
 from ambid.physics.models import model
 from ambid.rig import Rig
 from ambid.track.blocks import Frame
+
+_FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
+_TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
+_ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
+_AIM = 0.9  # of that part
+_VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
+_NEAR = 0.85  # of the way to a trip: no room left
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,3 +137,146 @@ def ended(report: RunReport, what: str) -> tuple[str, ...]:
     if not report.complete:
         return (f"{what} ended after {report.samples} of {report.wanted} samples",)
     return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """What a trial plays."""
+
+    name: str  # excitation, as `ambid.acquire.program` knows it
+    band: tuple[float, float] | None  # in Hz
+    mode: Mode  # of the device
+    settle_s: float  # time after the start, and length of the trial, s
+    seconds: float
+    seed: int  # of the excitation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Size:
+    """What trials found."""
+
+    amplitude_v: float  # peak of the excitation, V
+    used: float  # part of the room that it used, 0 to 1 and beyond
+    findings: tuple[str, ...]  # what each trial showed; why the size is not good
+    reasons: tuple[str, ...] = ()
+
+
+def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
+    """Return the band in which a levitated rotor moves: an excitation above it tells of the coil alone.
+
+    `rate_hz`: of the device, Hz. Returns from a thousandth of the rate to a thirtieth, Hz.
+    """
+    return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
+
+
+def find_amplitude(
+    look: Look,
+    room: Room,
+    trial: Trial,
+    resting: Mapping[str, float],
+    *,
+    rate_hz: float,
+    use: float,
+    given: float | None = None,
+) -> Size:
+    """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
+
+    `look`: see `ambid.job.look.looking`; `room`: limits; `trial`: what is played; `resting`: position in m and current
+    in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
+    reasons where it tripped, or used too much. It may use less than its part where trials have run out.
+    """
+    low, high = room.voltage
+    if given is None and not math.isfinite(high - low):
+        why = "the rig has no loop.limits.voltage to choose an amplitude from: give one"
+        return Size(amplitude_v=math.nan, used=math.nan, findings=(), reasons=(why,))
+    size = _FIRST * (high - low) / 2.0 if given is None else given
+    tried: list[tuple[float, float]] = []  # size, and what it used
+    findings: list[str] = []
+    while True:
+        wave = program(
+            trial.name, amplitude_v=size, band=trial.band, rate_hz=rate_hz, seconds=trial.seconds, seed=trial.seed
+        )
+        report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=wave))
+        reasons = ended(report, f"excitation of {size:.3g} V")
+        if reasons:
+            return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
+        worst, used = _used(seen, room, resting, use)
+        tried.append((size, used))
+        findings.append(f"{size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}")
+        larger_or_smaller = _next_size(tried, use) if given is None else None
+        if larger_or_smaller is None:
+            break
+        size = larger_or_smaller
+    return Size(
+        amplitude_v=size, used=used, findings=tuple(findings),
+        reasons=_too_much(tried, worst, _TOO_MUCH * use if given is None else _NEAR),
+    )  # fmt: skip
+
+
+def fitting_amplitude(
+    device: Device, rig: Rig, trial: Trial, *, use: float = 0.3, stopped: Callable[[], bool] = lambda: False
+) -> float:
+    """Find an amplitude for a device that has not run yet.
+
+    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `use`: part of the room; `stopped`: as
+    `session.run`. Returns peak in V.
+    """
+    look, room = looking(device, rig, stopped), Room.of(rig)
+    report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
+    reasons = ended(report, "the look before the excitation")
+    if not reasons:
+        resting = {role: float(seen[role].mean()) for role in room.trips}
+        found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=use)
+        if not found.reasons:
+            return found.amplitude_v
+        reasons = found.reasons
+    raise DeviceError(f"{device.info.port}: no amplitude was found: {'; '.join(reasons)}. Give --amplitude")
+
+
+def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
+    """Return the size to try next; None where the last one is good, or another would not be better."""
+    size, used = tried[-1]
+    good = _ENOUGH * use <= used <= _TOO_MUCH * use
+    if good or len(tried) == _TRIALS or (used > use and _at_the_floor(tried)):
+        return None
+    wanted = size * (_GROWTH if used <= 0.0 else min(max(_AIM * use / used, 1.0 / _GROWTH), _GROWTH))
+    # Where more is used than in proportion, the good size lies between two that were tried.
+    below = max((s for s, part in tried if part <= use), default=0.0)
+    above = min((s for s, part in tried if part > use), default=math.inf)
+    return wanted if below < wanted < above else math.sqrt(below * above)
+
+
+def _at_the_floor(tried: list[tuple[float, float]]) -> bool:
+    """Whether a smaller size used hardly less: by less than half of what is in proportion."""
+    if len(tried) < 2 or tried[-1][0] >= tried[-2][0]:
+        return False
+    (larger, before), (smaller, now) = tried[-2:]
+    return now / before > (1.0 + smaller / larger) / 2.0
+
+
+def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tuple[str, ...]:
+    """Say that the last trial used more of the room than `most`; nothing where it did not."""
+    size, used = tried[-1]
+    if used <= most:
+        return ()
+    said = f"an excitation of {size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}, {100.0 * most:.0f} % are"
+    if _at_the_floor(tried):
+        return (
+            f"{said} allowed, and a larger one used hardly more: the bench moves by itself; see to noise and gains",
+        )
+    return (f"{said} allowed: give a smaller one",)
+
+
+def _used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
+    """Return which quantity uses most of its room, and how much of it."""
+    shares = {role: room.used(role, seen[role], resting[role]) for role in room.trips}
+    low, high = room.voltage
+    if math.isfinite(high - low):
+        volts = seen["voltage"]
+        rest = min(max(float(volts.mean()), low), high)  # an excitation has no mean; what holds the rotor may have one
+        up, down = float(volts.max()) - rest, rest - float(volts.min())
+        reach = max(up / (high - rest) if high > rest else 1.0, down / (rest - low) if rest > low else 1.0)
+        # A voltage that is used as far as it may be counts like a position at the part that is wished.
+        shares["voltage"] = reach * use / _VOLTAGE
+    worst = max(shares, key=lambda role: shares[role])
+    return worst, shares[worst]

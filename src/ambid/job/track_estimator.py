@@ -18,8 +18,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, io_data
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
-from ambid.job.bench_rows import rows_of
-from ambid.job.track_start import start_of
+from ambid.job.track_start import rows_of, start_of
 from ambid.physics.models import model
 from ambid.record import Record, read_record
 from ambid.recursive import (
@@ -92,7 +91,7 @@ def track_estimator(
 
     `inputs`, `outputs`, `references`, `orders`, `open_loop`: of a regression or polynomial model, as `fit` takes them;
     `step`: of lms and nlms, for signals of size one; `start`, `start_s`: of a joint filter; the rest as
-    `ambid.job.track.track`.
+    `ambid.job.track`.
     """
     if method not in METHODS:
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")

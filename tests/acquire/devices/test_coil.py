@@ -9,7 +9,7 @@ from ambid.acquire.board import LAG_S
 from ambid.acquire.device import Program
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.devices.simulated import SimulatedDevice
-from ambid.job.physical import identify
+from ambid.job import identify
 from ambid.rig import rig_from_text
 
 COIL = """schema = "ambid.rig/1"

@@ -140,7 +140,7 @@ class Recording:
         self._quality = Quality(device.info, course.program)
         self._on_progress, self._on_event = on_progress, on_event
         self._every, self._wanted = max(1, round(every_s * rate_hz)), round(course.seconds * rate_hz)
-        self._samples = self._told = 0
+        self._samples = self._shown = 0
 
     @property
     def failed(self) -> DeviceError | None:
@@ -155,8 +155,8 @@ class Recording:
         self._recorder.append(frame.block)
         self._quality.add(frame)
         self._samples += len(frame.block.values)
-        if self._on_progress is not None and self._samples - self._told >= self._every:
-            self._told = self._samples
+        if self._on_progress is not None and self._samples - self._shown >= self._every:
+            self._shown = self._samples
             self._on_progress(
                 Progress(
                     samples=self._samples,

@@ -7,7 +7,9 @@ to there stays in the folder.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,17 +18,19 @@ from ambid.acquire.program import program
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
-from ambid.job._progress import Tick, silent
-from ambid.job.acquire import Acquired, Progress, acquire
-from ambid.job.commission import bench, result
-from ambid.job.commission.folder import check_folder, whole_file, write_text
-from ambid.job.commission.step import EXCITATION, STEPS, Step, StepName, Wishes
+from ambid.estimation.progress import Tick, silent
+from ambid.job import commissioning_steps as judge
+from ambid.job.acquisition import Acquired, Progress, acquire
+from ambid.job.commissioning_steps import EXCITATION, STEPS, Step, StepName, Wishes
+from ambid.job.data import load
+from ambid.job.identification import evidence_of, identify, report_of
 from ambid.job.look import Room, looking
-from ambid.job.physical import identify, load, signals_of
 from ambid.job.track_live import track_live
-from ambid.physics.models import model
 from ambid.rig import Rig, rig_text
 from ambid.track.lines_file import TrackWriter
+
+FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl", "commission.json")
+"""What a commissioning leaves in its folder."""
 
 SCHEMA = "ambid.commission/1"
 _LIMIT = 1.5  # acceptable model error of tracking
@@ -71,7 +75,7 @@ def commission(
     """Bring a bench from a controller that answers to physical parameters that are tracked.
 
     `rig`: the bench, with ``[loop]`` and ``[daq]``; `wishes`: what is to be reached; `on_begin`, `on_step`: told of a
-    step before it begins, and of what it found; `on_progress`, `on_event`: as `ambid.job.acquire.acquire`; `confirm`:
+    step before it begins, and of what it found; `on_progress`, `on_event`: as `ambid.job.acquire`; `confirm`:
     asked before the rotor is lifted; False ends it; `tick`: sign of life while computing. Returns also where a step was
     not good enough, or could not be done: the error is then the step's reason.
     """
@@ -164,12 +168,12 @@ class _Guide:
         def amplitude() -> float:
             return found["excite"].numbers["amplitude_v"]
 
-        yield "self-test", lambda: bench.self_test(device)
-        yield "rest", lambda: bench.rest(look, room, wishes)
+        yield "self-test", lambda: judge.self_test(device)
+        yield "rest", lambda: judge.rest(look, room, wishes)
         if not confirm("levitate"):
             raise Declined("levitation was not agreed to; the output stayed off. Begin again when the bench is clear")
-        yield "levitate", lambda: keep(bench.levitate(look, room, wishes))
-        yield "excite", lambda: keep(bench.excite(look, room, wishes, device.info.rate_hz, found["levitate"]))
+        yield "levitate", lambda: keep(judge.levitate(look, room, wishes))
+        yield "excite", lambda: keep(judge.excite(look, room, wishes, device.info.rate_hz, found["levitate"]))
         yield "record", lambda: self._record(amplitude())
         yield "identify", self._identify
         yield "validate", self._validate
@@ -179,10 +183,10 @@ class _Guide:
     def _record(self, amplitude_v: float) -> Step:
         """Take the record, and a second one with another excitation."""
         wishes = self.wishes
-        first = result.record("record", self._acquire("record.h5", amplitude_v, wishes.record_s, 0))
+        first = judge.record("record", self._acquire("record.h5", amplitude_v, wishes.record_s, 0))
         if not first.passed:
             return first
-        second = result.record("second record", self._acquire("second.h5", 0.8 * amplitude_v, wishes.second_s, 1))
+        second = judge.record("second record", self._acquire("second.h5", 0.8 * amplitude_v, wishes.second_s, 1))
         return replace(
             second, findings=(*first.findings, *second.findings), cautions=(*first.cautions, *second.cautions)
         )
@@ -203,7 +207,7 @@ class _Guide:
 
     def _validate(self) -> Step:
         assert self.estimate is not None
-        return result.validation(self.estimate)
+        return judge.validation(self.estimate)
 
     def _tick(self, stage: str, done: float | None = None, /) -> None:
         """Take a sign of life from what is worked out, and end it if that is wished."""
@@ -216,22 +220,13 @@ class _Guide:
             self._place / "record.h5", self._rig, validate=self._place / "second.h5", tick=self._tick
         )
         write_text(self._place / "estimate.json", self.estimate.dumps())
-        return result.identification(self.estimate, self.wishes)
+        return judge.identification(self.estimate, self.wishes)
 
     def _report(self) -> Step:
-        from datetime import UTC, datetime
-
-        from ambid.report.figures import Evidence
-        from ambid.report.page import report_html
-        from ambid.validate.second_record import replay
-
         assert self.estimate is not None
         self._tick("report")
-        used = load(self._place / "record.h5", self._rig)
-        run = replay(self.estimate, signals_of(used, model(self.estimate.model)))
-        evidence = Evidence(estimate=self.estimate, run=run, start_s=used.start_s)
-        made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        write_text(self._place / "report.html", report_html(evidence, made=made))
+        evidence = evidence_of(self.estimate, load(self._place / "record.h5", self._rig))
+        write_text(self._place / "report.html", report_of(evidence))
         return Step(name="report", findings=(f"{self._place / 'report.html'}",))
 
     def _track(self, amplitude_v: float) -> Step:
@@ -247,7 +242,7 @@ class _Guide:
                 writer.line(line)
             if done.track.summary is not None:
                 writer.summary(done.track.summary)
-        return result.tracking(done, _LIMIT)
+        return judge.tracking(done, _LIMIT)
 
 
 def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
@@ -262,3 +257,41 @@ def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
         },
         indent=1,
     )
+
+
+def check_folder(folder: str | Path) -> None:
+    """Refuse a folder that holds an earlier commissioning."""
+    place = Path(folder)
+    if not place.is_dir():
+        raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
+    if not os.access(place, os.W_OK):
+        raise AmbidError(f"folder {place} may not be written. Choose another folder")
+    there = [name for name in FILES if (place / name).exists()]
+    there += sorted(path.name for path in place.glob("*.journal"))
+    if there:
+        raise AmbidError(f"{place} holds {', '.join(there)} of an earlier commissioning. Take an empty folder")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all.
+
+    `path`: written over if it exists; `text`: in UTF-8.
+    """
+    with whole_file(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Let a file be written under another name, and put it in place whole.
+
+    `path`: where it goes. Returns where it is to be written.
+    """
+    beside = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    except OSError as failure:
+        raise AmbidError(f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk") from None
+    finally:
+        beside.unlink(missing_ok=True)

@@ -5,7 +5,6 @@ Read -> cut -> measure -> fit -> Measured. With a rig, columns are its roles and
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +18,11 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
-from ambid.job._progress import Tick, silent
-from ambid.job.bench_data import bench_data
-from ambid.job.blackbox import read_data
+from ambid.estimation.progress import Tick, silent
+from ambid.job.data import Channels, Clock, known_rig
 from ambid.physics.models import model
 from ambid.record import Record
-from ambid.rig import Rig, load_rig
+from ambid.rig import Rig
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
 
@@ -104,35 +102,35 @@ def frf(
     EstimationError
         If the response cannot be measured, or a model not be fitted to it.
     """
-    say = tick or silent
-    _agree(orders, state_space, feedthrough, domain, delay, rig)
-    laps, last = dict[str, float](), time.perf_counter()
-    rig = load_rig(rig) if isinstance(rig, str | Path) else rig
-    part = (from_s, to_s)
-    if rig is None:
-        if not inputs:
-            raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
-        data = read_data(
-            record, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
-        )
-    else:
-        data = bench_data(
-            record, rig, inputs, outputs, references, open_loop=open_loop, part=part, rate_hz=rate_hz, gaps=gaps
-        )
-    laps["read"], last = time.perf_counter() - last, time.perf_counter()
+    say, clock = tick or silent, Clock()
+    _check(orders, state_space, feedthrough, domain, delay, rig)
+    bench = None if rig is None else known_rig(rig)
+    if bench is None and not inputs:
+        raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
+    channels = Channels(
+        inputs=inputs,
+        outputs=outputs,
+        references=references,
+        open_loop=open_loop,
+        rate_hz=rate_hz,
+        gaps=gaps,
+        rig=bench,
+    )
+    data = channels.read(record, (from_s, to_s))
+    clock.lap("read")
     say("measure")
-    response = _measured(data, method, hold, band)
-    laps["measure"], last = time.perf_counter() - last, time.perf_counter()
+    response = _measure(data, method, hold, band)
+    clock.lap("measure")
     found: BlackBoxFit | None = None
     estimate: FrequencyEstimate | None = None
     if orders is not None or state_space is not None:
         say("fit")
-        found = _fitted(response, data, orders, state_space, feedthrough, domain, 0.0 if delay is None else delay)
-        laps["fit"], last = time.perf_counter() - last, time.perf_counter()
-    if rig is not None:
+        found = _fit_model(response, data, orders, state_space, feedthrough, domain, 0.0 if delay is None else delay)
+        clock.lap("fit")
+    if bench is not None:
         say("identify")
-        estimate = _physical(response, rig, delay)
-        laps["identify"] = time.perf_counter() - last
+        estimate = _identify(response, bench, delay)
+        clock.lap("identify")
     return Measured(
         response=response,
         references=data.references,
@@ -140,17 +138,12 @@ def frf(
         fit=found,
         estimate=estimate,
         record=data.record,
-        timing_s=laps,
+        timing_s=clock.laps,
     )
 
 
-def _agree(
-    orders: object,
-    state_space: int | str | None,
-    feedthrough: bool,
-    domain: str | None,
-    delay: Delay | None,
-    rig: object,
+def _check(
+    orders: object, state_space: object, feedthrough: bool, domain: str | None, delay: Delay | None, rig: object
 ) -> None:
     """Refuse what contradicts itself before the record is read."""
     if orders is not None and state_space is not None:
@@ -173,17 +166,15 @@ def _agree(
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
 
 
-def _measured(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
+def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
     """Measure the response by the wanted method, in the wanted band."""
     from ambid.estimation.threads import one_thread
 
     r = data.reference if data.references else None
     if method == "auto":
         method = "periodic" if repeats(data.u if r is None else r) else "local"
-    options: dict[str, object] = {}
-    if method == "periodic":
-        options["drop_periods"] = "auto"
-    elif method == "local" and band is not None:
+    options: dict[str, object] = {"drop_periods": "auto"} if method == "periodic" else {}
+    if method == "local" and band is not None:
         options["band"] = band
     with one_thread():
         found = frequency_response(
@@ -202,7 +193,7 @@ def _measured(data: IOData, method: Method, hold: Hold, band: tuple[float, float
     return found if band is None else found.between(*band)
 
 
-def _fitted(
+def _fit_model(
     response: FrequencyResponse,
     data: IOData,
     orders: Orders | None,
@@ -229,7 +220,7 @@ def _fitted(
     )
 
 
-def _physical(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
+def _identify(response: FrequencyResponse, rig: Rig, delay: Delay | None) -> FrequencyEstimate:
     """Estimate the rig's parameters; a delay in s is so many samples."""
     from ambid.bearing.frequency import greybox_frf
 

@@ -1,0 +1,352 @@
+"""The steps of a guided commissioning: looks at the bench itself, and judgements of what came of it.
+
+Each has findings and, where it is not good enough, the reasons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+
+from ambid.acquire.device import Device
+from ambid.acquire.session import Course
+from ambid.arrays import Array
+from ambid.estimation.estimate import Estimate
+from ambid.job.acquisition import Acquired
+from ambid.job.look import Look, Room, Trial, ended, find_amplitude, moving_band
+from ambid.job.track_live import LiveTrack
+from ambid.report.numbers import quantity, sized
+
+StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"]
+
+STEPS: tuple[StepName, ...] = (
+    "self-test",
+    "rest",
+    "levitate",
+    "excite",
+    "record",
+    "identify",
+    "validate",
+    "report",
+    "track",
+)
+"""In their order."""
+
+EXCITATION = "multisine"
+"""What is played."""
+
+_PERIODS = 4.0  # of the lowest line in a trial
+
+_NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+
+_SD_AT_REST = 0.02  # of the trips' width: noise of a sensor with the output off
+_ZERO, _NEAR_ZERO = 0.10, 0.03  # of the trips' width: current that is shown with the output off
+_WANDER = 0.25  # of the trips' width: how far the rotor may stray without excitation
+_NEAR = 0.85  # of the voltage: no room left
+_UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
+_SATURATED = 1e-3  # of the samples at the end of a converter's range
+_RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree")
+"""Checks that a model which explains the record only in part fails: the standard deviations then allow for it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One step, done."""
+
+    name: StepName  # one of `STEPS`
+    findings: tuple[str, ...] = ()  # what was measured, one line each
+    reasons: tuple[str, ...] = ()  # why it is not good enough, and what to do, one line each; empty: it is
+    cautions: tuple[str, ...] = ()  # what a reader should know although the step is good enough
+    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
+
+    @property
+    def passed(self) -> bool:
+        """Whether commissioning may go on."""
+        return not self.reasons
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as a JSON object.
+
+        Returns ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``; what is not known is None.
+        """
+        return {
+            "name": self.name,
+            "passed": self.passed,
+            "findings": list(self.findings),
+            "reasons": list(self.reasons),
+            "cautions": list(self.cautions),
+            "numbers": {name: x if math.isfinite(x) else None for name, x in self.numbers.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wishes:
+    """What a commissioning is to reach, and how long it may take for it."""
+
+    # length of the record, of the one for validation, of levitation without excitation, of the look at rest, of each
+    # trial of the amplitude, and of tracking, s
+    record_s: float = 20.0
+    second_s: float = 8.0
+    hover_s: float = 2.0
+    rest_s: float = 0.5
+    trial_s: float = 2.0
+    track_s: float = 5.0
+    settle_s: float = 1.0  # time that lift-off is given, s
+    amplitude_v: float | None = None  # peak of the excitation, V; None: found by trials
+    band_hz: tuple[float, float] | None = None  # of the excitation; None: a thousandth to a thirtieth of the rate
+    use: float = 0.3  # part of the way to the trips that the excitation may use
+    # largest half width of a 95 % interval, relative to the value, of a parameter that counts as found
+    widest: float = 0.10
+    seed: int = 0  # of the excitation
+
+    def band(self, rate_hz: float) -> tuple[float, float]:
+        """Return the band of the excitation in Hz.
+
+        `rate_hz`: of the device, Hz. Returns as wished, or from the rate.
+        """
+        return self.band_hz or moving_band(rate_hz)
+
+    def longest_trial_s(self, rate_hz: float) -> float:
+        """Return the length of a trial in s: as wished, or longer where the band is slow.
+
+        `rate_hz`: of the device, Hz. Returns four periods of the lowest line at least.
+        """
+        low = self.band(rate_hz)[0]
+        return max(self.trial_s, _PERIODS / low * (1 + 1e-9)) if low > 0.0 else self.trial_s
+
+
+def self_test(device: Device) -> Step:
+    """Let the device look at itself.
+
+    `device`: opened, idle. Returns passed if nothing failed.
+    """
+    found = device.self_test()
+    who = ", ".join(f"{k} {v}" for k, v in device.info.identity.items() if k in ("protocol", "major", "minor", "board"))
+    return Step(
+        name="self-test",
+        findings=(
+            f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else ""),
+            _measured(found.numbers),
+        ),
+        reasons=found.failed,
+        numbers=found.numbers,
+    )
+
+
+def rest(look: Look, room: Room, wishes: Wishes) -> Step:
+    """Look at the sensors with the output off.
+
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
+    or a current is shown that cannot be.
+    """
+    report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
+    reasons = list(ended(report, "the look at rest"))
+    cautions: list[str] = []
+    shown = {role: _mean_sd(x) for role, x in seen.items() if role in ("position", "current") and x.size}
+    for role, (mean, sd) in shown.items():
+        unit = _UNITS[role]
+        low, high = room.trips[role]
+        width = high - low
+        if math.isfinite(width) and sd > _SD_AT_REST * width:
+            reasons.append(
+                f"the {role} sensor's noise is {sized(sd, unit)} rms with the output off, {100 * sd / width:.0f} %"
+                " of the way between the trips: look at wiring, ground and the filter at the input"
+            )
+        if sd == 0.0:
+            cautions.append(f"{role} does not move by one count: a quiet sensor, or none")
+        if role == "current" and math.isfinite(width) and abs(mean) > _NEAR_ZERO * width:
+            (reasons if abs(mean) > _ZERO * width else cautions).append(
+                f"{sized(mean, unit)} are shown with the output off, {100 * abs(mean) / width:.0f} % of the way between"
+                " the trips: correct the offset of channels.current, or see that the power stage does switch off"
+            )
+    findings = tuple(
+        f"{role} at rest {sized(mean, _UNITS[role])}, noise {sized(sd, _UNITS[role])} rms"
+        for role, (mean, sd) in shown.items()
+    )
+    return Step(
+        name="rest", findings=findings, reasons=tuple(reasons), cautions=tuple(cautions), numbers=_numbers(shown)
+    )
+
+
+def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
+    """Lift the rotor and let it hover without excitation.
+
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
+    tripped, the rotor strays, or no room is left.
+    """
+    report, seen = look(Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s))
+    reasons = list(ended(report, "levitation"))
+    if not seen["position"].size:
+        return Step(name="levitate", reasons=tuple(reasons) or ("no sample came after lift-off",))
+    shown = {role: _mean_sd(seen[role]) for role in _UNITS}
+    for role, (_, sd) in shown.items():
+        if role != "voltage" and sd == 0.0:
+            reasons.append(
+                f"{role} does not move by one count while the rotor hovers: no sensor there? Look at its cable and"
+                " supply"
+            )
+    low, high = room.trips["position"]
+    stray = float(np.ptp(seen["position"]))
+    if math.isfinite(high - low) and stray > _WANDER * (high - low):
+        reasons.append(
+            f"the rotor strays by {sized(stray, 'm')} without excitation, {100 * stray / (high - low):.0f} % of the way"
+            " between the trips: the loop is badly damped or the sensor disturbed; change the gains of [loop]"
+        )
+    v_low, v_high = room.voltage
+    centre, half = (v_low + v_high) / 2, (v_high - v_low) / 2
+    if math.isfinite(half) and abs(shown["voltage"][0] - centre) > _NEAR * half:
+        reasons.append(
+            f"hovering takes {shown['voltage'][0]:.3g} V of {v_low:g} to {v_high:g} V: nothing is left to excite"
+            " with; change bias, set point or supply"
+        )
+    findings = tuple(
+        f"{role} {sized(mean, _UNITS[role])}, {sized(sd, _UNITS[role])} rms" for role, (mean, sd) in shown.items()
+    )
+    return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown))
+
+
+def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
+    """Find the largest excitation that keeps to its part of the room.
+
+    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
+    itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
+    `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
+    """
+    resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
+    trial = Trial(
+        name=EXCITATION, band=wishes.band(rate_hz), mode="levitate", settle_s=wishes.settle_s,
+        seconds=wishes.longest_trial_s(rate_hz), seed=wishes.seed,
+    )  # fmt: skip
+    found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
+    numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
+    return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers)
+
+
+def _measured(numbers: Mapping[str, float]) -> str:
+    """Say what a self-test measured, in words and units; what is not known here stands at the end as it is named."""
+    left = dict(numbers)
+    told = []
+    if "supply_mv" in left:
+        told.append(f"supply {left.pop('supply_mv') / 1e3:.4g} V")
+    if "free_bytes" in left:
+        told.append(f"{left.pop('free_bytes'):g} bytes of memory never used")
+    counts = [f"{role} {left.pop(role):.4g}" for role in ("position", "current") if role in left]
+    told += [" and ".join(counts) + " counts"] if counts else []
+    return ", ".join(told + [f"{name} {value:g}" for name, value in left.items()])
+
+
+def _mean_sd(values: Array) -> tuple[float, float]:
+    return float(values.mean()), float(values.std())
+
+
+def _numbers(shown: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    return {f"{role}_{what}": x for role, pair in shown.items() for what, x in zip(("mean", "sd"), pair, strict=True)}
+
+
+def record(name: str, done: Acquired) -> Step:
+    """Judge a record as it was taken.
+
+    `name`: what it is for; `done`: from `acquire`. Returns not passed where samples were lost or not stored, or a
+    sensor saturates or stands still. Little signal over noise is a caution: whether it is enough is decided by the
+    intervals of what is identified.
+    """
+    reasons = list(ended(done.run, f"the {name}"))
+    if done.not_stored:
+        reasons += [f"{done.not_stored} samples of the {name} are not stored: {done.troubles[0]}"]
+    findings = [
+        f"{name}: {done.run.samples} samples at {done.info.rate_hz:g} Hz, {done.run.lost} lost,"
+        f" {done.counters.damaged} frames damaged"
+    ]
+    reasons += [
+        f"{column.name} is at the end of its range in {100 * column.saturated:.1f} % of the {name}'s samples"
+        for column in done.quality.columns
+        if column.role in ("position", "current") and column.saturated > _SATURATED
+    ]
+    reasons += [
+        f"{column.name} does not move by one count in the {name}: no sensor there? Look at its cable and supply"
+        for column in done.quality.columns
+        if column.role in ("position", "current") and column.sd == 0.0
+    ]
+    cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
+    return Step(name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions))
+
+
+def identification(estimate: Estimate, wishes: Wishes) -> Step:
+    """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
+
+    `estimate`: of the record; `wishes`: how wide an interval may be. Returns tests of residuals that fail are cautions,
+    because the standard deviations allow for them; all else stops.
+    """
+    findings: list[str] = []
+    reasons: list[str] = []
+    cautions: list[str] = []
+    numbers: dict[str, float] = {}
+    if estimate.status != "converged":
+        reasons.append(f"the search ended {estimate.status}: look at columns, signs and calibrations")
+    for p in estimate.parameters:
+        if p.role == "fixed":
+            continue
+        half = (p.ci95[1] - p.ci95[0]) / 2.0
+        wide = half / abs(p.value) if p.value else math.inf
+        findings.append(f"{p.name} = {quantity(p.value, p.sd, p.unit).text} (95 % interval ± {100 * wide:.2g} %)")
+        numbers |= {p.name: p.value, f"{p.name}_sd": p.sd}
+        if not p.identifiable:
+            reasons.append(f"{p.name} is not identifiable from this record: excite more, or fix what is known")
+        elif wide > wishes.widest:
+            reasons.append(
+                f"{p.name} is known to ± {100 * wide:.2g} % only, {100 * wishes.widest:g} % is wanted: record longer,"
+                " or excite more"
+            )
+    for name, check in estimate.checks.items():
+        if not check.passed:
+            (cautions if name in _RESIDUAL else reasons).append(f"{name}: {check.detail}")
+    return Step(
+        name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
+    )
+
+
+def validation(estimate: Estimate) -> Step:
+    """Judge how an estimate does on the second record.
+
+    `estimate`: with `validation`. Returns not passed where the second record is predicted worse than the first allows.
+    """
+    checks: Mapping[str, Any] = (estimate.validation or {}).get("checks", {})  # type: ignore[assignment]
+    findings = tuple(f"{name}: {c['detail']}" for name, c in checks.items() if c["passed"])
+    if not checks:
+        return Step(name="validate", reasons=("nothing was checked on the second record: it cannot be judged",))
+    failed = {name: f"{name}: {c['detail']}" for name, c in checks.items() if not c["passed"]}
+    reasons = tuple(text for name, text in failed.items() if name not in _RESIDUAL)
+    cautions = tuple(text for name, text in failed.items() if name in _RESIDUAL)
+    return Step(name="validate", findings=findings, reasons=reasons, cautions=cautions)
+
+
+def tracking(done: LiveTrack, limit: float) -> Step:
+    """Judge live tracking: the bench that was identified is the bench that runs.
+
+    `done`: from `track_live`, with its lines; `limit`: acceptable model error. Returns not passed where it ended early,
+    the error is beyond the limit, or a change was found.
+    """
+    reasons = list(ended(done.run, "tracking"))
+    summary, lines = done.track.summary, done.track.lines
+    if not lines or summary is None:
+        return Step(name="track", reasons=tuple(reasons) or ("no line of the track came: track longer",))
+    last = lines[-1]
+    findings = [
+        f"{summary.samples} samples in {summary.seconds_of_record:.3g} s, {summary.rejected_samples} rejected,"
+        f" {done.overruns} blocks overrun, model error {last.error:.3g}, state {last.state}"
+    ]
+    reasons += [f"the tracker saw a change at {change.t:.3g} s: {change.why}" for change in summary.changes]
+    if not last.error <= limit:
+        reasons.append(
+            f"the model error is {last.error:.3g} at the end, beyond {limit:g}: the bench is another one now"
+        )
+    if done.overruns:
+        reasons.append(f"{done.overruns} blocks found the ring full: the machine is too busy to track this rate")
+    return Step(
+        name="track", findings=tuple(findings), reasons=tuple(reasons), numbers={"error": last.error, "limit": limit}
+    )

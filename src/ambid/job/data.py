@@ -1,0 +1,269 @@
+"""Records as the jobs take them: read through a rig or without one, cut, and divided into inputs and outputs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ambid.errors import EstimationError, RecordError
+from ambid.physics.models import model
+from ambid.record import Record, read_record
+from ambid.rig import Rig, bench_record, default_rig, load_rig, mat_variables, read_bench, rig_text
+from ambid.signals.conditioning import cut
+from ambid.units import UNKNOWN
+
+if TYPE_CHECKING:
+    from ambid.bearing.multistart import Signals
+    from ambid.blackbox.data import IOData
+    from ambid.physics.linear_model import LinearModel
+
+Part = tuple[float | None, float | None]
+"""From and to, in s; None: the record's own begin or end."""
+
+WHOLE: Part = (None, None)
+
+
+class Clock:
+    """Laps in seconds of wall time."""
+
+    def __init__(self) -> None:
+        """Begin now."""
+        self._last, self.laps = time.perf_counter(), dict[str, float]()
+
+    def split(self, lap: str, part: str, seconds: float) -> None:
+        """Take a part out of a lap."""
+        self.laps[part] = seconds
+        self.laps[lap] -= seconds
+
+    def lap(self, name: str) -> None:
+        """End a lap."""
+        now = time.perf_counter()
+        self.laps[name], self._last = now - self._last, now
+
+
+def known_rig(rig: Rig | str | Path | None) -> Rig:
+    """Return a rig, read from its file where it is none; by default all is free and columns are named like roles."""
+    return default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
+
+
+def remembered(rig: Rig) -> dict[str, object]:
+    """Return what a result keeps of its rig, so that other records are read and judged alike."""
+    folder = Path.cwd() if rig.source is None else rig.source.resolve().parent
+    return {"name": rig.name, "text": rig_text(rig, folder), "folder": str(folder)}
+
+
+def origin(record: Record) -> dict[str, object]:
+    """Return what a result keeps of a record."""
+    return {
+        "samples": record.n_samples,
+        "rate_hz": record.rate_hz,
+        "sha256": record.provenance.get("sha256"),
+        "file": record.provenance.get("file"),
+        "history": [str(step) for step in record.history],
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """How files are read."""
+
+    # part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones
+    from_s: float | None = None
+    to_s: float | None = None
+    rate_hz: float | None = None  # for files without time
+    gaps: str | None = None  # ``"error"``, ``"interpolate"`` or ``"cut"``
+
+
+def load(
+    record: Record | str | Path,
+    rig: Rig,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+) -> Record:
+    """Read a record through a rig and cut it to the part that is to be used.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+        A file, or a record whose channels are named by role.
+    rig : Rig
+    from_s, to_s : float, optional
+        Override the rig's ``record.from`` and ``record.to``; s.
+    rate_hz : float, optional
+    gaps : {"error", "interpolate", "cut"}, optional
+
+    Returns
+    -------
+    Record
+        Channels named by role, SI units.
+
+    Raises
+    ------
+    AmbidError
+        If the file, its columns or the cut break a rule.
+    """
+    bench = record if isinstance(record, Record) else read_bench(record, rig, rate_hz=rate_hz, gaps=gaps)  # type: ignore[arg-type]
+    return _cut_by(rig, bench, (from_s, to_s))
+
+
+def signals_of(record: Record, plant: LinearModel) -> Signals:
+    """Take a model's inputs and outputs out of a record.
+
+    Parameters
+    ----------
+    record : Record
+        Channels named by role.
+    plant : LinearModel
+
+    Returns
+    -------
+    Signals
+        u (n_samples, n_inputs), y (n_samples, n_outputs), SI.
+    """
+    import numpy as np
+
+    from ambid.bearing.multistart import Signals
+
+    return Signals(
+        u=np.stack([record[r] for r in plant.inputs], axis=1),
+        y=np.stack([record[r] for r in plant.outputs], axis=1),
+        rate_hz=record.rate_hz,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channels:
+    """Which columns of records are inputs, outputs and references, and how their files are read."""
+
+    inputs: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    references: Sequence[str] = ()
+    open_loop: bool = False
+    rate_hz: float | None = None
+    gaps: str | None = None
+    rig: Rig | None = None
+
+    def read(self, record: Record | str | Path, part: Part = WHOLE) -> IOData:
+        """Read a record, cut it and take the columns out of it.
+
+        With a rig they are named by role or as in the file, and calibrated; where none are named all of its model are
+        taken. A reference may be any column of the file.
+        """
+        from ambid.blackbox.data import io_data
+
+        if self.rig is not None:
+            return self._through(self.rig, record, part)
+        if not isinstance(record, Record):
+            record = read_record(record, rate_hz=self.rate_hz, gaps=self.gaps or "error")  # type: ignore[arg-type]
+        if part != WHOLE:
+            record = cut(record, *part)
+        return io_data(record, self.inputs, self.outputs, references=self.references, open_loop=self.open_loop)
+
+    def _through(self, rig: Rig, record: Record | str | Path, part: Part) -> IOData:
+        from ambid.blackbox.data import io_data
+
+        plant = model(rig.model)
+        if isinstance(record, Record):
+            bench, raw = record, record
+        else:
+            mat = Path(record).suffix.lower() == ".mat"
+            raw = read_record(
+                record,
+                rate_hz=self.rate_hz if self.rate_hz is not None else rig.record.rate_hz,
+                gaps=self.gaps or rig.record.gaps or "error",  # type: ignore[arg-type]
+                variables={**{x: (x, UNKNOWN) for x in self.references}, **mat_variables(rig)} if mat else None,
+            )
+            bench = bench_record(raw, rig)
+        for name in self.references:
+            if name not in bench.names and name not in raw.names:
+                raise RecordError(
+                    f"the record has no column {name!r} for the reference; it has {', '.join(raw.names)}. Correct "
+                    "--reference"
+                )
+        beside = [raw.channel(name) for name in self.references if name not in bench.names]
+        bench = _cut_by(rig, replace(bench, channels=(*bench.channels, *beside)), part)
+        inputs = [_role(x, rig, plant.inputs, "input") for x in self.inputs] or list(plant.inputs)
+        outputs = [_role(x, rig, plant.outputs, "output") for x in self.outputs] or list(plant.outputs)
+        open_loop = self.open_loop or rig.open_loop
+        return io_data(bench, inputs, outputs, references=self.references, open_loop=open_loop)
+
+
+def _cut_by(rig: Rig, bench: Record, part: Part) -> Record:
+    """Cut a record to a part, or where that is left open to the rig's."""
+    first = rig.record.from_s if part[0] is None else part[0]
+    last = rig.record.to_s if part[1] is None else part[1]
+    return bench if first is None and last is None else cut(bench, first, last)
+
+
+def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
+    found = next((c.role for c in rig.channels if name in (c.role, c.column) and c.role in roles), None)
+    if found is None:
+        raise EstimationError(
+            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or leave "
+            f"--{what} out for all"
+        )
+    return found
+
+
+def read_data(
+    record: Record | str | Path,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str] = (),
+    *,
+    open_loop: bool = False,
+    part: Part = WHOLE,
+    rate_hz: float | None = None,
+    gaps: str | None = None,
+    rig: Rig | None = None,
+) -> IOData:
+    """Read a record, cut it and take inputs and outputs out of it.
+
+    Parameters
+    ----------
+    record : Record, str or Path
+    inputs, outputs, references : sequence of str
+        Channel names.
+    open_loop : bool, optional
+    part : (float or None, float or None), optional
+        From and to, in s.
+    rate_hz : float, optional
+    gaps : {"error", "interpolate", "cut"}, optional
+    rig : Rig, optional
+        Names inputs and outputs by role and calibrates them; where none are named, all of its model are taken.
+
+    Returns
+    -------
+    IOData
+
+    Raises
+    ------
+    AmbidError
+        If the file, its columns or the cut break a rule.
+    """
+    channels = Channels(
+        inputs=inputs, outputs=outputs, references=references, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, rig=rig
+    )
+    return channels.read(record, part)
+
+
+def check_same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:
+    """Refuse a second record whose rate (interval `dt` in s) or units are not those of the first."""
+    if abs(second.dt / dt - 1) > 1e-6:
+        raise EstimationError(
+            f"the second record is sampled at {1 / second.dt:g} Hz, the first at {1 / dt:g} Hz; they have to agree. "
+            "Resample one of them"
+        )
+    for name in (*second.inputs, *second.outputs):
+        one, other = units.get(name, UNKNOWN), second.units[name]
+        if one != other and UNKNOWN not in (one, other):
+            raise EstimationError(
+                f"channel {name!r} is in {other} in the second record, in {one} in the first; they have to agree. "
+                "Check that it is the same channel, and its unit"
+            )
