@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -84,8 +84,9 @@ def command(
     if scenario is not None:
         _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
                                "--position": position, "--periods": None if periods == 1 else periods})  # fmt: skip
-        course = Course(scenario, duration, rate, amplitude, at, size, seed, closed, log_excitation)
-        simulate_course(course, preset, rig, record)
+        words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
+                 "closed": closed, "log_excitation": log_excitation}  # fmt: skip
+        _run_scenario(scenario, preset, rig, record, seed, words)
         return
     _refuse("a simulation without --scenario", {"--at": at, "--size": size})
     if not nonlinear:
@@ -107,7 +108,10 @@ def command(
         if log_excitation:
             logged = Channel(name="excitation", unit="V", values=peak * shape)
             done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
-        comments = () if record.suffix in (".h5", ".hdf5") else _comments(rig, kind, peak, band, seed, done)
+        comments: tuple[str, ...] = ()
+        if record.suffix not in (".h5", ".hdf5"):
+            between = "" if band is None else f" in {band} Hz"
+            comments = (_made(rig, f"{kind} of {peak:.6g} V{between}", seed), f"truth: {truth_words(done)}")
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
     warn(done)
     typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {kind} of {peak:.4g} V, seed {seed}")
@@ -187,52 +191,32 @@ def _repeated(make: Callable[[int], Array], n: int, periods: int) -> Array:
     return np.tile(make(n // periods), periods)
 
 
-def _comments(rig: str, excitation: str, size: float, band: str | None, seed: int, done: Simulation) -> tuple[str, ...]:
+def _made(rig: str, what: str, seed: int) -> str:
     from importlib.metadata import version
 
-    between = "" if band is None else f" in {band} Hz"
-    made = (
-        f"simulated by ambid {version('ambid')}: {Path(rig).name}, {excitation} of {size:.6g} V{between}, seed {seed}"
-    )
-    return made, f"truth: {truth_words(done)}"
+    return f"simulated by ambid {version('ambid')}: {Path(rig).name}, {what}, seed {seed}"
 
 
-@dataclass(frozen=True, slots=True)
-class Course:
-    """What the user says of a scenario; None for what the scenario or the bench says."""
+def _run_scenario(
+    name: str, preset: Preset | None, rig: str, record: Path, seed: int, words: Mapping[str, Any]
+) -> None:
+    """Simulate a scenario, write the record and say what is in it; `words` are those of `simulate_scenario`.
 
-    name: str  # of the scenario
-    duration_s: float | None  # as `ambid.simulate.simulate_scenario`
-    rate_hz: float | None
-    amplitude: float | None
-    at_s: float | None
-    size: float | None
-    seed: int  # of excitation, noise and losses
-    closed: bool | None  # closed or open loop
-    log_excitation: bool  # a column ``excitation`` too
-
-
-def simulate_course(course: Course, preset: Preset | None, rig: str, record: Path) -> None:
-    """Simulate, write the record and say what is in it.
-
-    `course`: the scenario; `preset`: the bench; None: the rig file; `rig`: the bench in the user's words; `record`:
-    file to write; a scenario that loses samples is written as CSV.
+    A scenario that loses samples is written as CSV.
     """
     from ambid.record import write_record
     from ambid.rig import load_rig
     from ambid.simulate import damage, scenario, simulate_scenario
 
-    what = scenario(course.name)
+    what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
         outputs.claim(record, "-o", (".csv", ".csv.gz") if what.dropped else (".csv", ".csv.gz", ".h5", ".hdf5"))
-        done = simulate_scenario(
-            what, preset or load_rig(Path(rig)), duration_s=course.duration_s, rate_hz=course.rate_hz, seed=course.seed,
-            amplitude=course.amplitude, at_s=course.at_s, size=course.size, closed=course.closed,
-            log_excitation=course.log_excitation,
-        )  # fmt: skip
+        done = simulate_scenario(what, preset or load_rig(Path(rig)), seed=seed, **words)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")
-        comments = () if record.suffix in (".h5", ".hdf5") else (_made(rig, told), *lines)
+        size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""
+        made = _made(rig, f"scenario {told['name']}{size}, excitation of {told['amplitude']:.6g} V", seed)
+        comments = () if record.suffix in (".h5", ".hdf5") else (made, *lines)
         lost = 0
 
         def write(path: Path) -> None:
@@ -242,34 +226,26 @@ def simulate_course(course: Course, preset: Preset | None, rig: str, record: Pat
                 return
             first = round(told["from_s"] * done.record.rate_hz)
             share = told["size"]
-            found = damage(done.record, path, share=share, seed=course.seed, first=first, comments=comments)
+            found = damage(done.record, path, share=share, seed=seed, first=first, comments=comments)
             lost = sum(x.stop - x.first for x in found)
 
         outputs.stage(record, write)
     warn(done)
     n, rate = done.record.n_samples, done.record.rate_hz
     short = f", {lost} of them lost or without a value" if lost else ""
-    typer.echo(
-        f"{record}: {n} samples at {rate:g} Hz{short}, excitation of {told['amplitude']:.4g} V, seed {course.seed}"
-    )
+    typer.echo(f"{record}: {n} samples at {rate:g} Hz{short}, excitation of {told['amplitude']:.4g} V, seed {seed}")
     for line in lines:
         typer.echo(line)
 
 
 def warn(done: Simulation) -> None:
-    """Say on standard error what went wrong in a simulation.
-
-    `done`: with its warnings.
-    """
+    """Say on standard error what went wrong in a simulation."""
     for warning in done.warnings:
         typer.echo(f"ambid: warning: {warning}", err=True)
 
 
 def truth_words(done: Simulation) -> str:
-    """Return the parameters of a simulation in words.
-
-    `done`: with its truth. Returns names and values on one line.
-    """
+    """Return the parameters of a simulation on one line."""
     return ", ".join(f"{name} {value:.6g}" for name, value in done.truth.items()) + " (SI; delay in samples)"
 
 
@@ -283,13 +259,3 @@ def _words(done: Simulation, told: Mapping[str, Any]) -> str:
         moved.append(f"{name} {first:.6g}{unit}" if first == last else f"{name} {first:.6g} to {last:.6g}{unit}")
     begins = f", from {told['from_s']:g} s" if "from_s" in told else ""
     return (", ".join(moved) or "no parameter changes") + begins
-
-
-def _made(rig: str, told: Mapping[str, Any]) -> str:
-    from importlib.metadata import version
-
-    size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""
-    return (
-        f"simulated by ambid {version('ambid')}: {Path(rig).name}, scenario {told['name']}{size}, excitation of"
-        f" {told['amplitude']:.6g} V, seed {told['seed']}"
-    )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from ambid.acquire.device import Counters, Device, DeviceEvent, DeviceInfo
 from ambid.acquire.quality import Quality, QualityReport
@@ -39,6 +40,15 @@ class Acquired:
     not_stored: int = 0  # samples that came and are not in the record, because the disk was too slow or failed
 
 
+class Listeners(TypedDict, total=False):
+    """Who is told how a run goes."""
+
+    every_s: float  # how often `on_progress` is called, s of the device's clock
+    on_progress: Callable[[Progress], object]
+    on_event: Callable[[DeviceEvent], object]  # what the device tells
+    on_trouble: Callable[[DeviceError], object]  # what the recorder tells
+
+
 def acquire(
     device: Device,
     rig: Rig,
@@ -47,23 +57,41 @@ def acquire(
     *,
     force: bool = False,
     taps: Sequence[Tap] = (),
-    every_s: float = 0.25,
-    on_progress: Callable[[Progress], object] | None = None,
-    on_event: Callable[[DeviceEvent], object] | None = None,
-    on_trouble: Callable[[DeviceError], object] | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    **listeners: Unpack[Listeners],
 ) -> Acquired:
     """Record what a device samples during a course.
 
-    `device`: opened, idle; `rig`: its bench; its text goes with the record; `path`: the record: .h5, .hdf5, .csv or
-    .csv.gz; `course`: what the device is to do; `force`: whether a record that exists may be written over; `taps`:
-    others who listen; `every_s`: how often `on_progress` is called, s of the device's clock; `on_progress`, `on_event`:
-    told how far it is, and what the device tells. Returns also where a fault ended the run early: see ``run.fault``.
+    Parameters
+    ----------
+    device : Device
+        Opened, idle.
+    rig : Rig
+        Its bench; its text goes with the record.
+    path : str or Path
+        The record: .h5, .hdf5, .csv or .csv.gz.
+    course : Course
+        What the device is to do.
+    force : bool, optional
+        Whether a record that exists may be written over.
+    taps : sequence of Tap, optional
+        Others who listen.
+    stopped : callable, optional
+        Asked now and then; True ends the run.
+    **listeners
+        See `Listeners`.
+
+    Returns
+    -------
+    Acquired
+        Also where a fault ended the run early: see ``run.fault``.
+
+    Raises
+    ------
+    DeviceError
+        If the device or the disk fails.
     """
-    with recording(
-        device, rig, path, course, force=force, every_s=every_s, on_progress=on_progress, on_event=on_event,
-        on_trouble=on_trouble,
-    ) as tap:  # fmt: skip
+    with recording(device, rig, path, course, force=force, **listeners) as tap:
         report = run(
             device, course, taps=[tap, *taps], on_event=tap.tell, stopped=lambda: stopped() or tap.failed is not None
         )
@@ -72,28 +100,18 @@ def acquire(
 
 @contextmanager
 def recording(
-    device: Device,
-    rig: Rig,
-    path: str | Path,
-    course: Course,
-    *,
-    force: bool = False,
-    every_s: float = 0.25,
-    on_progress: Callable[[Progress], object] | None = None,
-    on_event: Callable[[DeviceEvent], object] | None = None,
-    on_trouble: Callable[[DeviceError], object] | None = None,
+    device: Device, rig: Rig, path: str | Path, course: Course, *, force: bool = False, **listeners: Unpack[Listeners]
 ) -> Iterator[Recording]:
-    """Record what a run passes on, whoever runs it.
+    """Record what a run passes on, whoever runs it: yield a tap of the run; on leaving, the journal becomes the record.
 
-    `device`, `rig`, `path`, `course`, `force`, `every_s`, `on_progress`, `on_event`, `on_trouble`: as `acquire`.
-    Returns a tap of the run; on leaving, the journal becomes the record.
+    Arguments as those of `acquire`.
     """
     troubles: list[DeviceError] = []
 
     def trouble(what: DeviceError) -> None:
         troubles.append(what)
-        if on_trouble is not None:
-            on_trouble(what)
+        if "on_trouble" in listeners:
+            listeners["on_trouble"](what)
 
     recorder = Recorder(
         path, JournalHeader.of(device.info, _text(rig)), seconds=course.seconds, force=force, on_trouble=trouble
@@ -102,7 +120,7 @@ def recording(
         with recorder:
             if course.program is not None:
                 recorder.event(Event(kind="excitation", what=str(course.program)))
-            yield Recording(recorder, device, course, every_s, on_progress, on_event, troubles)
+            yield Recording(recorder, device, course, listeners, troubles)
     except DeviceError as failure:
         if recorder.result is None:
             raise
@@ -118,28 +136,18 @@ def _text(rig: Rig) -> str:
 
 
 class Recording:
-    """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`.
-
-    `recorder`: opened; `device`: that samples; `course`: what it does; `every_s`: how often `on_progress` is called, s
-    of the device's clock; `on_progress`, `on_event`: as `acquire`; `troubles`: what the recorder tells.
-    """
+    """A tap that gives blocks to recorder and quality, and tells how far it is. Made by `recording`."""
 
     def __init__(
-        self,
-        recorder: Recorder,
-        device: Device,
-        course: Course,
-        every_s: float,
-        on_progress: Callable[[Progress], object] | None,
-        on_event: Callable[[DeviceEvent], object] | None,
-        troubles: list[DeviceError],
+        self, recorder: Recorder, device: Device, course: Course, listeners: Listeners, troubles: list[DeviceError]
     ) -> None:
         """Begin with nothing."""
         rate_hz = device.info.rate_hz
         self._recorder, self._device, self._troubles = recorder, device, troubles
         self._quality = Quality(device.info, course.program)
-        self._on_progress, self._on_event = on_progress, on_event
-        self._every, self._wanted = max(1, round(every_s * rate_hz)), round(course.seconds * rate_hz)
+        self._on_progress, self._on_event = listeners.get("on_progress"), listeners.get("on_event")
+        self._every = max(1, round(listeners.get("every_s", 0.25) * rate_hz))
+        self._wanted = round(course.seconds * rate_hz)
         self._samples = self._shown = 0
 
     @property
@@ -148,10 +156,7 @@ class Recording:
         return self._recorder.failed
 
     def take(self, frame: Frame) -> None:
-        """Take a block.
-
-        `frame`: as it came.
-        """
+        """Take a block as it came."""
         self._recorder.append(frame.block)
         self._quality.add(frame)
         self._samples += len(frame.block.values)
@@ -167,19 +172,13 @@ class Recording:
             )
 
     def tell(self, event: DeviceEvent) -> None:
-        """Take what the device tells.
-
-        `event`: it goes into the record too.
-        """
+        """Take what the device tells; it goes into the record too."""
         self._recorder.event(event)
         if self._on_event is not None:
             self._on_event(event)
 
     def acquired(self, report: RunReport) -> Acquired:
-        """Return what came of it, once the recording is closed.
-
-        `report`: of the run. Returns with the record's file.
-        """
+        """Return what came of a run, once the recording is closed."""
         return Acquired(
             info=self._device.info,
             run=report,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
 
 from ambid.errors import EstimationError, nearest
 from ambid.job.data import Reading, known_rig, load, origin
@@ -41,24 +41,22 @@ class TakenRecord:
     start_s: float  # time of its first sample in s
 
 
-def bearing_rig(
-    rig: Rig | str | Path | None,
-    *,
-    magnet: Magnet | None = None,
-    parameters: Sequence[Parameter] = (),
-    eddy: bool = False,
-    drift: bool = False,
-    off_below: float | None = None,
-) -> Rig:
-    """Return a rig whose magnet is known as it says, but for what is given here.
+class MagnetWords(TypedDict, total=False):
+    """What a caller says of a nonlinear bearing beside its rig."""
 
-    `rig`: none: nothing is known, columns are named like the roles; `magnet`: kind or whole law; None: as the rig says;
-    `parameters`: each instead of the rig's; `eddy`, `drift`: beside what the rig says; `off_below`: in V; None: as the
-    rig says. Returns with a `magnet`.
-    """
+    magnet: Magnet | None  # kind or whole law; None: as the rig says
+    parameters: Sequence[Parameter]  # each instead of the rig's
+    eddy: bool  # beside what the rig says
+    drift: bool
+    off_below: float | None  # in V; None: as the rig says
+
+
+def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[MagnetWords]) -> Rig:
+    """Return a rig whose `magnet` is known as it says, but for what is given here."""
     from ambid.bearing.magnet.problem import UNITS
 
-    bench = known_rig(rig)
+    bench, magnet, off_below = known_rig(rig), words.get("magnet"), words.get("off_below")
+    parameters = words.get("parameters", ())
     if bench.model != "one-axis":
         raise EstimationError(
             f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
@@ -74,8 +72,8 @@ def bearing_rig(
     new = [p for p in parameters if p.name not in _LINEAR]
     known = replace(
         before,
-        eddy=before.eddy or eddy,
-        drift=before.drift or drift,
+        eddy=before.eddy or words.get("eddy", False),
+        drift=before.drift or words.get("drift", False),
         off_below=before.off_below if off_below is None else off_below,
         parameters=(),
     )

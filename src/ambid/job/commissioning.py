@@ -12,15 +12,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Unpack
 
-from ambid.acquire.device import Device, DeviceEvent
+from ambid.acquire.device import Device
 from ambid.acquire.program import program
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.progress import Tick, silent
 from ambid.job import commissioning_steps as judge
-from ambid.job.acquisition import Acquired, Progress, acquire
+from ambid.job.acquisition import Acquired, Listeners, acquire
 from ambid.job.commissioning_steps import EXCITATION, STEPS, Step, StepName, Wishes
 from ambid.job.data import load
 from ambid.job.identification import evidence_of, identify, report_of
@@ -66,22 +67,47 @@ def commission(
     wishes: Wishes | None = None,
     on_begin: Callable[[StepName], object] | None = None,
     on_step: Callable[[Step], object] | None = None,
-    on_progress: Callable[[Progress], object] | None = None,
-    on_event: Callable[[DeviceEvent], object] | None = None,
     confirm: Callable[[StepName], bool] | None = None,
     stopped: Callable[[], bool] = lambda: False,
     tick: Tick | None = None,
+    **listeners: Unpack[Listeners],
 ) -> Commissioned:
     """Bring a bench from a controller that answers to physical parameters that are tracked.
 
-    `rig`: the bench, with ``[loop]`` and ``[daq]``; `wishes`: what is to be reached; `on_begin`, `on_step`: told of a
-    step before it begins, and of what it found; `on_progress`, `on_event`: as `ambid.job.acquire`; `confirm`:
-    asked before the rotor is lifted; False ends it; `tick`: sign of life while computing. Returns also where a step was
-    not good enough, or could not be done: the error is then the step's reason.
+    Parameters
+    ----------
+    device : Device
+        Opened, idle.
+    rig : Rig
+        The bench, with ``[loop]`` and ``[daq]``.
+    folder : str or Path
+        Where everything is left; see `FILES`.
+    wishes : Wishes, optional
+        What is to be reached.
+    on_begin, on_step : callable, optional
+        Called with the name of a step before it begins, and with what it found.
+    confirm : callable, optional
+        Asked before the rotor is lifted; False ends it.
+    stopped : callable, optional
+        Asked now and then; True ends it.
+    tick : callable, optional
+        Sign of life while computing.
+    **listeners
+        See `ambid.job.acquisition.Listeners`.
+
+    Returns
+    -------
+    Commissioned
+        Also where a step was not good enough, or could not be done: the error is then the step's reason.
+
+    Raises
+    ------
+    AmbidError
+        If the bench cannot be commissioned, or the folder holds an earlier one.
     """
     place = Path(folder)
     check_folder(place)
-    guide = _Guide(device, rig, place, wishes or Wishes(), on_progress, on_event, stopped, tick or silent)
+    guide = _Guide(device, rig, place, wishes or Wishes(), listeners, stopped, tick or silent)
     guide.check()
     write_text(place / "rig.toml", rig_text(rig, place))
     done: list[Step] = []
@@ -126,13 +152,12 @@ class _Guide:
         rig: Rig,
         place: Path,
         wishes: Wishes,
-        on_progress: Callable[[Progress], object] | None,
-        on_event: Callable[[DeviceEvent], object] | None,
+        listeners: Listeners,
         stopped: Callable[[], bool],
         tick: Tick,
     ) -> None:
         self._device, self._rig, self._place = device, rig, place
-        self._on_progress, self._on_event, self._stopped, self._told = on_progress, on_event, stopped, tick
+        self._listeners, self._stopped, self._told = listeners, stopped, tick
         self._room = Room.of(rig)
         self.wishes = wishes
         self.estimate: Estimate | None = None
@@ -194,7 +219,7 @@ class _Guide:
     def _acquire(self, name: str, amplitude_v: float, seconds: float, seed: int) -> Acquired:
         return acquire(
             self._device, self._rig, self._place / name, self._course(amplitude_v, seconds, seed),
-            on_progress=self._on_progress, on_event=self._on_event, stopped=self._stopped,
+            stopped=self._stopped, **self._listeners,
         )  # fmt: skip
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
@@ -233,8 +258,8 @@ class _Guide:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""
         course = self._course(amplitude_v, self.wishes.track_s, 2)
         done = track_live(
-            self._device, self._rig, course, start=self.estimate, limit=_LIMIT, on_event=self._on_event,
-            stopped=self._stopped,
+            self._device, self._rig, course, start=self.estimate, limit=_LIMIT,
+            on_event=self._listeners.get("on_event"), stopped=self._stopped,
         )  # fmt: skip
         with whole_file(self._place / "track.jsonl") as beside, TrackWriter(beside) as writer:
             writer.header(done.track.header)

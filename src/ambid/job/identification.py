@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Unpack
 
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, silent
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from ambid.bearing.uncertainty import Uncertainty
     from ambid.estimation.estimate import Check, Estimate
     from ambid.estimation.likelihood import Fit
-    from ambid.job.bearing_records import Magnet, TakenRecord
-    from ambid.physics.parameters import Parameter
+    from ambid.job.bearing_records import MagnetWords, TakenRecord
     from ambid.report.figures import BearingEvidence, Evidence
 
 
@@ -189,33 +188,50 @@ def identify_nonlinear(
     records: Sequence[Record | str | Path],
     rig: Rig | str | Path | None = None,
     *,
-    magnet: Magnet | None = None,
     held: Sequence[Record | str | Path] = (),
-    parameters: Sequence[Parameter] = (),
-    eddy: bool = False,
-    drift: bool = False,
-    off_below: float | None = None,
     validate: Record | str | Path | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
     gaps: str | None = None,
     tick: Tick | None = None,
+    **magnet: Unpack[MagnetWords],
 ) -> NonlinearBearingEstimate:
     """Identify one nonlinear bearing from several records at several operating points at once.
 
     Prediction error with an extended Kalman predictor, consistent under feedback as far as its linearised noise is.
 
-    `held`: records with the rotor held at rest at different distances: they show the coil; `validate`: a further
-    record, of a rotor that moves, to judge the estimate on; `rate_hz`: for files without time; `gaps`: what to do about
-    gaps in a file.
+    Parameters
+    ----------
+    records : sequence of Record, str or Path
+        In which the rotor moves.
+    rig : Rig, str or Path, optional
+        What is known of the bench, of the magnet in ``[magnet]``.
+    held : sequence of Record, str or Path, optional
+        With the rotor held at rest at different distances: they show the coil.
+    validate : Record, str or Path, optional
+        A further record, of a rotor that moves, to judge the estimate on.
+    from_s, to_s, rate_hz, gaps, tick : optional
+        As `identify`; the part is of every record in which the rotor moves.
+    **magnet
+        ``magnet``, ``parameters``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
+        `ambid.job.bearing_records.MagnetWords`.
+
+    Returns
+    -------
+    NonlinearBearingEstimate
+
+    Raises
+    ------
+    AmbidError
+        If a record or the rig breaks a rule.
+    EstimationError
+        If nothing can be identified from the records.
     """
     how = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
-    taken = read_records(
-        records, rig, held=held, validate=validate, magnet=magnet, parameters=parameters, eddy=eddy, drift=drift,
-        off_below=off_below, how=how, tick=tick,
-    )  # fmt: skip
-    return identify_taken(taken, tick=tick)
+    return identify_taken(
+        read_records(records, rig, held=held, validate=validate, how=how, tick=tick, **magnet), tick=tick
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -234,22 +250,15 @@ def read_records(
     *,
     held: Sequence[Record | str | Path],
     validate: Record | str | Path | None,
-    magnet: Magnet | None = None,
-    parameters: Sequence[Parameter] = (),
-    eddy: bool = False,
-    drift: bool = False,
-    off_below: float | None = None,
     how: Reading,
     tick: Tick | None = None,
+    **magnet: Unpack[MagnetWords],
 ) -> BearingJob:
-    """Read all records of one identification.
-
-    `off_below`: in V; `tick`: all as `identify_nonlinear`.
-    """
+    """Read all records of one identification; arguments as those of `identify_nonlinear`."""
     from ambid.job.bearing_records import bearing_rig, check_together, take_record
 
     say, clock = tick or silent, Clock()
-    bench = bearing_rig(rig, magnet=magnet, parameters=parameters, eddy=eddy, drift=drift, off_below=off_below)
+    bench = bearing_rig(rig, **magnet)
     if not records:
         raise EstimationError("no record, or every one holds the rotor; forces want one in which it moves. Give one")
     taken: list[TakenRecord] = []
