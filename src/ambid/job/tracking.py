@@ -120,7 +120,9 @@ def track(
     Raises
     ------
     AmbidError
-        If record, rig, start or settings break a rule.
+        If record or rig break a rule.
+    EstimationError
+        If start or settings make no sense, or nothing can be identified to start from.
     """
     check_settings(
         record, start=start, start_s=start_s, every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags,
