@@ -50,7 +50,8 @@ def command(
         option(
             "--method",
             "NAME",
-            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
+            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to"
+            " --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
             True,
         ),
     ] = "rpem",
