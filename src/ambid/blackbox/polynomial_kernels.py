@@ -67,7 +67,7 @@ def _recurse(c: Array, y: Array, pad: int, m: int) -> None:
             y[t] = s
 
 
-@compiled
+@compiled(inline="always")
 def _ring(c: Array, y: Array, pad: int, m: int) -> None:
     """Turn y into y / c in place and end the response where it is lost in rounding: denormal numbers are slow."""
     for t in range(pad, pad + m):
@@ -77,14 +77,15 @@ def _ring(c: Array, y: Array, pad: int, m: int) -> None:
         y[t] = s if np.abs(s) > _LOST else 0
 
 
-@compiled
+@compiled(inline="always")
 def _filter_block(filters: Table, terms: Table, coef: Array, s: Array, pad: int, m: int, impulse: int) -> None:
     """Run every filter over one block. `impulse`: 0 where nothing of the impulse at the first row is left."""
     for f in range(filters.shape[0]):
         if filters[f, _IMPULSE] and not impulse:
             continue
         y = s[filters[f, _DESTINATION]]
-        y[pad : pad + m] = 0
+        for t in range(pad, pad + m):
+            y[t] = 0
         for k in range(filters[f, _FIRST_TERM], filters[f, _LAST_TERM]):
             first = terms[k, _NUMERATOR]
             _add_moving_sum(
@@ -98,23 +99,25 @@ def _filter_block(filters: Table, terms: Table, coef: Array, s: Array, pad: int,
             _recurse(coef[first:last], y, pad, m)
 
 
-@compiled
+@compiled(inline="always")
 def _next_block(s: Array, y: Array, u: Array, impulse_row: int, t0: int, first: int, pad: int, m: int) -> None:
     """Keep the end of the last block as history and read the next samples."""
     for i in range(s.shape[0]):
         for t in range(pad):
             s[i, t] = s[i, m + t]
     last = min(first + m, y.size)
-    s[0, pad : pad + last - first] = y[first:last]
+    for t in range(first, last):  # a copy of slices would compile the text of an error as well
+        s[0, pad + t - first] = y[t]
     for i in range(u.shape[0]):
-        s[1 + i, pad : pad + last - first] = u[i, first:last]
-    s[impulse_row - 1, pad : pad + m] = 1
-    s[impulse_row, pad : pad + m] = 0
+        for t in range(first, last):
+            s[1 + i, pad + t - first] = u[i, t]
+    for t in range(pad, pad + m):
+        s[impulse_row - 1, t], s[impulse_row, t] = 1, 0
     if first <= t0 < last:
         s[impulse_row, pad + t0 - first] = 1
 
 
-@compiled
+@compiled(inline="always")
 def _still_ringing(filters: Table, s: Array, pad: int, m: int) -> int:
     """Return 1 while the history of any impulse response counts, else flush it to zero."""
     for f in range(filters.shape[0]):
@@ -124,36 +127,9 @@ def _still_ringing(filters: Table, s: Array, pad: int, m: int) -> int:
                     return 1
     for f in range(filters.shape[0]):
         if filters[f, _IMPULSE]:
-            s[filters[f, _DESTINATION], :] = 0
+            for t in range(s.shape[1]):
+                s[filters[f, _DESTINATION], t] = 0
     return 0
-
-
-@compiled
-def predictor_rows(
-    y: Array,
-    u: Array,
-    filters: Table,
-    terms: Table,
-    columns: Table,
-    coef: Array,
-    s: Array,
-    pad: int,
-    t0: int,
-    first: int,
-) -> Array:
-    """Return rows [gradients, residual] from row `t0` on, shape (n_columns, n - t0), of a record of one block.
-
-    `columns` holds source row, lag and sign; `s` (n_signals, pad + n) is work space of zeros.
-    """
-    m = y.size
-    _next_block(s, y, u, first, t0, 0, pad, m)
-    _filter_block(filters, terms, coef, s, pad, m, 1)
-    out = np.empty((columns.shape[0], m - t0), s.dtype)
-    for j in range(columns.shape[0]):
-        a = pad + t0 - columns[j, 1]
-        for t in range(m - t0):
-            out[j, t] = columns[j, 2] * s[columns[j, 0], a + t]
-    return out
 
 
 @compiled(fastmath={"contract", "reassoc", "nsz"})
@@ -224,45 +200,3 @@ def block_rows(
         for t in range(rows):
             out[t] = sign * x[t]
     return rows, ringing
-
-
-@compiled
-def predictor_triangle(
-    y: Array,
-    u: Array,
-    filters: Table,
-    terms: Table,
-    columns: Table,
-    coef: Array,
-    n_signals: int,
-    pad: int,
-    t0: int,
-    impulse_row: int,
-    n_initial: int,
-    block: int,
-) -> Array:
-    """Return the triangle R of the rows [gradients, residual] from row `t0` on, shape (n_columns, n_columns).
-
-    The first `n_initial` columns are responses to the impulse at `t0`; they are left out once they have died away.
-    """
-    n, p = y.size, columns.shape[0]
-    m = min(block, n)
-    s, w, R = np.zeros((n_signals, pad + m)), np.empty((p, m)), np.zeros((p, p))
-    ringing = 1
-    for first in range(0, n, m):
-        rows, ringing = block_rows(y, u, filters, terms, columns, coef, s, w, pad, t0, impulse_row, first, ringing)
-        add_rows(R, w, rows, 0 if ringing else n_initial)
-    return R
-
-
-@compiled
-def filter_signal(num: Array, den: Array, x: Array) -> Array:
-    """Return (num / den) x, from rest, den beginning with 1, shape (n_samples,)."""
-    pad = max(num.size, den.size)
-    padded = np.zeros(pad + x.size)
-    padded[pad:] = x
-    y = np.zeros(pad + x.size)
-    _add_moving_sum(num, 0, padded, y, pad, x.size)
-    if den.size > 1:
-        _recurse(den[1:], y, pad, x.size)
-    return y[pad:]

@@ -278,7 +278,7 @@ def liveliest_part(u: Array, size: int = 8192) -> slice:
 
 Table = NDArray[np.int64]
 
-_BLOCK = 512  # samples: signals and rows of a small model stay in the fast cache
+_BLOCK = 1024  # samples: signals and rows of a small model stay in the cache
 _ONE, _MINUS, _CONSTANT, _THETA = 0, 1, 2, 3  # places in the vector of all coefficients
 
 
@@ -312,78 +312,39 @@ class Predictor:
         `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
         (n_columns, n_columns).
         """
-        from ambid.blackbox.polynomial_kernels import predictor_triangle
+        from ambid.blackbox.polynomial_kernels import add_rows
 
-        R: Array = predictor_triangle(
-            y,
-            u,
-            self.filters,
-            self.terms,
-            self.columns,
-            self.coefficients(theta, nuisance),
-            self.n_signals,
-            self.pad,
-            self.first_row,
-            self.impulse_row,
-            self.n_initial,
-            max(_BLOCK, self.pad + 1),
-        )
+        R = np.zeros((self.columns.shape[0],) * 2)
+        for rows, n, ringing in self._blocks(y, u, self.coefficients(theta, nuisance), max(_BLOCK, self.pad + 1)):
+            # responses to the impulse are left out once they have died away
+            add_rows(R, rows, n, 0 if ringing else self.n_initial)
         return R
 
     def blocks(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Iterator[tuple[int, Array]]:
-        """Yield the rows [gradients, residual] block by block.
+        """Yield first sample and rows [gradients, residual] block by block; rows are good until the next is asked for.
 
-        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
-        (n_columns, n_rows), first sample, and rows, which are good until the next block is asked for.
+        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,).
         """
-        from ambid.blackbox.polynomial_kernels import block_rows
-
-        coef, m = self.coefficients(theta, nuisance), max(_BLOCK, self.pad + 1)
-        s, w = np.zeros((self.n_signals, self.pad + m)), np.empty((self.columns.shape[0], m))
-        ringing = 1
-        for first in range(0, y.size, m):
-            n, ringing = block_rows(
-                y,
-                u,
-                self.filters,
-                self.terms,
-                self.columns,
-                coef,
-                s,
-                w,
-                self.pad,
-                self.first_row,
-                self.impulse_row,
-                first,
-                ringing,
-            )
-            yield max(first, self.first_row), w[:, :n]
+        m = max(_BLOCK, self.pad + 1)
+        for k, (w, n, _) in enumerate(self._blocks(y, u, self.coefficients(theta, nuisance), m)):
+            yield max(k * m, self.first_row), w[:, :n]
 
     def rows(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
-        """Return the gradients and, last, the residual; complex where the coefficients are.
+        """Return the gradients and, last, the residual from `first_row` on; complex where the coefficients are."""
+        w, n, _ = next(self._blocks(y, u, self.coefficients(theta, nuisance), y.size))
+        return w[:, :n]
 
-        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
-        (n_columns, n_samples - first_row).
-        """
-        return self._rows(y, u, theta, nuisance, self.columns)
+    def _blocks(self, y: Array, u: Array, coef: Array, m: int) -> Iterator[tuple[Array, int, int]]:
+        """Yield rows (n_columns, m), how many of their samples count, and whether the impulses still ring."""
+        from ambid.blackbox.polynomial_kernels import block_rows
 
-    def residual(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
-        """Return the residual; complex where the coefficients are.
-
-        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
-        (n_samples - first_row,).
-        """
-        return np.asarray(self._rows(y, u, theta, nuisance, self.columns[-1:])[0])
-
-    def _rows(self, y: Array, u: Array, theta: Array, nuisance: Array, columns: Table) -> Array:
-        from ambid.blackbox.polynomial_kernels import predictor_rows
-
-        coef = self.coefficients(theta, nuisance)
-        s = np.zeros((self.n_signals, self.pad + y.size), dtype=coef.dtype)
-        out: Array = predictor_rows(
-            y, u, self.filters, self.terms, columns, coef, s, self.pad, self.first_row, self.impulse_row
-        )
-        return out
+        m = min(m, y.size)
+        s = np.zeros((self.n_signals, self.pad + m), dtype=coef.dtype)
+        w = np.empty((self.columns.shape[0], m), dtype=coef.dtype)
+        tables, places, ringing = (self.filters, self.terms, self.columns), (self.first_row, self.impulse_row), 1
+        for first in range(0, y.size, m):
+            n, ringing = block_rows(y, u, *tables, coef, s, w, self.pad, *places, first, ringing)
+            yield w, n, ringing
 
 
 @dataclass(slots=True)
@@ -492,3 +453,16 @@ def predictor(layout: Layout) -> Predictor:
         n_initial=len(initial),
         n_nuisance=n_nuisance,
     )
+
+
+def filter_signal(num: Array, den: Array, x: Array) -> Array:
+    """Return (num / den) x from rest, den beginning with 1: a predictor of one filter, nothing else to compile."""
+    from ambid.blackbox.polynomial_kernels import block_rows
+
+    pad = 2 + max(num.size, den.size)
+    signals, out = np.zeros((4, pad + x.size)), np.empty((1, x.size))  # x, a constant, an impulse, the result
+    filters = np.array([[3, num.size + 1, den.size - 1, 0, 1, 0]])
+    tables = (filters, np.array([[0, 0, num.size, 0]]), np.array([[3, 0, 1]]))
+    coef = np.concatenate([num, den])
+    block_rows(x, np.empty((0, x.size)), *tables, coef, signals, out, pad, 0, 2, 0, 1)
+    return np.asarray(out[0])

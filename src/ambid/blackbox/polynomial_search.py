@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from ambid.arrays import Array
-from ambid.blackbox.polynomial_kernels import filter_signal
-from ambid.blackbox.polynomial_predictor import Layout, Predictor, liveliest_part, predictor
+from ambid.blackbox.polynomial_predictor import Layout, Predictor, filter_signal, liveliest_part, predictor
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
 
