@@ -1,4 +1,4 @@
-"""Conversion to and from scipy.signal and python-control keeps the frequency response, delays included."""
+"""Conversion to scipy.signal and python-control keeps the frequency response, delays included."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from ambid.blackbox.convert import from_control, from_scipy, to_control, to_scipy
+from ambid.blackbox.convert import to_control, to_scipy
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
@@ -44,33 +44,28 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_scipy_and_back(name: str) -> None:
+def test_scipy_has_the_same_response(name: str) -> None:
     model = MODELS[name]
     system = to_scipy(model)
     assert (system.dt or None) == model.dt
-    back = from_scipy(system)
-    np.testing.assert_allclose(back.frequency_response(OMEGA), model.frequency_response(OMEGA), rtol=1e-8, atol=1e-12)
+    s, G = system.to_ss(), model.frequency_response(OMEGA)
+    for k, point in enumerate(1j * OMEGA if model.dt is None else np.exp(1j * OMEGA * DT)):
+        there = s.D + s.C @ np.linalg.solve(point * np.eye(s.A.shape[0]) - s.A, s.B)
+        np.testing.assert_allclose(there, G[k], rtol=1e-8, atol=1e-12)
     if model.n_inputs * model.n_outputs == 1:
         response = scipy.signal.freqresp if model.dt is None else scipy.signal.dfreqresp
         w = OMEGA if model.dt is None else OMEGA * DT
-        np.testing.assert_allclose(response(system, w)[1], model.frequency_response(OMEGA)[:, 0, 0], rtol=1e-8)
+        np.testing.assert_allclose(response(system, w)[1], G[:, 0, 0], rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_control_and_back(name: str) -> None:
+def test_control_has_the_same_response(name: str) -> None:
     model = MODELS[name]
     system = to_control(model)
     w = model.frequency_response(OMEGA)
     point = 1j * OMEGA if model.dt is None else np.exp(1j * OMEGA * DT)
     there = np.array([np.atleast_2d(system(z, squeeze=False)).reshape(w.shape[1:]) for z in point])
     np.testing.assert_allclose(there, w, rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(from_control(system).frequency_response(OMEGA), w, rtol=1e-8, atol=1e-12)
-
-
-def test_zeros_poles_and_gain_are_read() -> None:
-    system = scipy.signal.ZerosPolesGain([0.3], [0.5, 0.9], 2.0, dt=DT)
-    model = from_scipy(system)
-    np.testing.assert_allclose(np.sort(model.poles().real), [0.5, 0.9])
 
 
 @pytest.mark.parametrize("convert", [to_scipy, to_control])
@@ -81,11 +76,3 @@ def test_what_has_no_place_is_refused(convert) -> None:
         convert(late)
     with pytest.raises(ModelError, match="time series"):
         convert(series)
-
-
-def test_objects_of_other_kinds_are_refused() -> None:
-    for read in (from_scipy, from_control):
-        with pytest.raises(ModelError, match="Give"):
-            read(object())
-    with pytest.raises(ModelError, match="sampling interval"):
-        from_control(control.tf([1], [1, 0.5], True))

@@ -1,4 +1,4 @@
-"""Models to and from the objects of ``scipy.signal`` and python-control.
+"""Models as the objects of ``scipy.signal`` and python-control.
 
 What has no place in the other object is refused or named, never dropped silently: objects of both libraries know
 neither noise models nor operating points, and control's transfer functions no delay in continuous time.
@@ -51,24 +51,6 @@ def to_scipy(model: BlackBoxModel) -> Any:
     return TransferFunction(num, den, **timing)
 
 
-def from_scipy(system: Any) -> BlackBoxModel:
-    """Read a system of ``scipy.signal``.
-
-    `system`: state space, transfer function or zeros, poles and gain. Returns with white output noise (K = 0).
-    """
-    from scipy.signal import StateSpace, TransferFunction, ZerosPolesGain
-
-    if not isinstance(system, (StateSpace, TransferFunction, ZerosPolesGain)):
-        raise ModelError(f"a {type(system).__name__} is no system of scipy.signal. Give an lti or dlti object")
-    dt = _sampling(system.dt)
-    if isinstance(system, StateSpace):
-        return _state_space(system.A, system.B, system.C, system.D, dt)
-    tf = system.to_tf()
-    num = np.atleast_2d(tf.num)
-    rows = tuple((_reduced(n),) for n in num)
-    return _transfer(rows, tuple((np.asarray(tf.den),) for _ in rows), dt)
-
-
 def to_control(model: BlackBoxModel) -> Any:
     """Return the input-output part of a model as an object of python-control.
 
@@ -99,20 +81,6 @@ def to_control(model: BlackBoxModel) -> Any:
     return control.tf([[n for n, _ in row] for row in pairs], [[d for _, d in row] for row in pairs], dt)
 
 
-def from_control(system: Any) -> BlackBoxModel:
-    """Read a system of python-control.
-
-    Returns with white output noise (K = 0).
-    """
-    control = _control()
-    if isinstance(system, control.StateSpace):
-        return _state_space(system.A, system.B, system.C, system.D, _sampling(system.dt))
-    if isinstance(system, control.TransferFunction):
-        num = tuple(tuple(_reduced(np.asarray(n)) for n in row) for row in _rows(system.num))
-        return _transfer(num, tuple(tuple(np.asarray(d) for d in r) for r in _rows(system.den)), _sampling(system.dt))
-    raise ModelError(f"a {type(system).__name__} is no system of python-control. Give a StateSpace or TransferFunction")
-
-
 def _control() -> Any:
     try:
         import control
@@ -121,39 +89,9 @@ def _control() -> Any:
     return control
 
 
-def _rows(table: Any) -> list[list[Any]]:
-    """Entries by output, then input, from lists or object arrays."""
-    return [list(row) for row in table]
-
-
 def _with_inputs(model: BlackBoxModel) -> None:
     if not model.n_inputs:
         raise ModelError("a time series has no transfer function from inputs. Use its state_space() with the gain K")
-
-
-def _sampling(dt: Any) -> float | None:
-    if dt is None or dt == 0:
-        return None
-    if dt is True or not float(dt) > 0:
-        raise ModelError(f"the system is discrete with sampling interval {dt}; seconds are wanted. Set its dt")
-    return float(dt)
-
-
-def _state_space(A: Any, B: Any, C: Any, D: Any, dt: float | None) -> StateSpaceModel:
-    A, C = np.atleast_2d(A), np.atleast_2d(C)
-    return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], C.shape[0])), dt=dt)
-
-
-def _transfer(num: Any, den: Any, dt: float | None) -> TransferModel:
-    monic = [
-        [(np.asarray(n) / d[0], np.asarray(d) / d[0]) for n, d in zip(*r, strict=True)]
-        for r in zip(num, den, strict=True)
-    ]
-    return TransferModel(
-        num=tuple(tuple(n for n, _ in row) for row in monic),
-        den=tuple(tuple(d for _, d in row) for row in monic),
-        dt=dt,
-    )
 
 
 def _reduced(num: Array) -> Array:

@@ -630,143 +630,70 @@ def subspace_models(
     return tuple(out)
 
 
-def n4sid(
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
-    tick: Tick = None,
-) -> BlackBoxFit:
-    """Identify a state-space model by N4SID (Van Overschee and De Moor 1996, fig. 4.8; thesis eq. 1.1-1.3).
+_CONTRACT = """{summary}.
 
-    Parameters
-    ----------
-    data : IOData
-    orders : Mapping
-        ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
-        or one for each, at least 1 (default); larger ones become states of their own.
-    horizon, past : int, optional
-        Samples of future and past; chosen by an autoregression if missing.
-    feedthrough : bool, optional
-        Whether to estimate D. Missing: only where the record is said to be open loop and shows one, because a
-        controller that acts within the sample cannot be told from a feedthrough.
-    tick : callable, optional
-        Called between steps.
+Parameters
+----------
+data : IOData
+orders : Mapping
+    ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
+    or one for each, at least 1 (default); larger ones become states of their own.
+horizon, past : int, optional
+    Samples of future and past{bound}; chosen by an autoregression if missing.
+feedthrough : bool, optional
+    Whether to estimate D. Missing: only where the record is said to be open loop and shows one, because a
+    controller that acts within the sample cannot be told from a feedthrough.
+tick : callable, optional
+    Called between steps.
 
-    Returns
-    -------
-    BlackBoxFit
+Returns
+-------
+BlackBoxFit
+    StateSpaceModel with the covariance of its coefficients and, in `details`, the noise covariances Q, S and R.
 
-    Raises
-    ------
-    EstimationError
-        If orders or horizons break a rule, a channel is constant, or the record is too short.
-    """
-    return estimate("n4sid", data, orders, horizon, past, feedthrough, tick)
+Raises
+------
+EstimationError
+    If orders or horizons break a rule, a channel is constant, or the record is too short.
+"""
 
 
-def moesp(
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
-    tick: Tick = None,
-) -> BlackBoxFit:
-    """Identify a state-space model by PO-MOESP (Verhaegen 1994; Van Overschee and De Moor 1996, sec. 4.3.2).
+def _estimator(method: Method, summary: str, bound: str = "") -> Callable[..., BlackBoxFit]:
+    """Return the public function of one method."""
 
-    Parameters
-    ----------
-    data : IOData
-    orders : Mapping
-        As for `n4sid`.
-    horizon, past : int, optional
-        Samples of future and past.
-    feedthrough : bool, optional
-        As for `n4sid`.
-    tick : callable, optional
+    def fit(
+        data: IOData,
+        orders: Orders,
+        *,
+        horizon: int | None = None,
+        past: int | None = None,
+        feedthrough: bool | None = None,
+        tick: Tick = None,
+    ) -> BlackBoxFit:
+        return estimate(method, data, orders, horizon, past, feedthrough, tick)
 
-    Returns
-    -------
-    BlackBoxFit
-
-    Raises
-    ------
-    EstimationError
-        As for `n4sid`.
-    """
-    return estimate("moesp", data, orders, horizon, past, feedthrough, tick)
+    fit.__name__ = fit.__qualname__ = method
+    fit.__doc__ = _CONTRACT.format(summary=summary, bound=bound)
+    return fit
 
 
-def cva(
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
-    tick: Tick = None,
-) -> BlackBoxFit:
-    """Identify a state-space model by canonical variates (Larimore 1990; Van Overschee and De Moor 1996, sec. 4.3.3).
-
-    Parameters
-    ----------
-    data : IOData
-    orders : Mapping
-        As for `n4sid`.
-    horizon, past : int, optional
-        Samples of future and past.
-    feedthrough : bool, optional
-        As for `n4sid`.
-    tick : callable, optional
-
-    Returns
-    -------
-    BlackBoxFit
-
-    Raises
-    ------
-    EstimationError
-        As for `n4sid`.
-    """
-    return estimate("cva", data, orders, horizon, past, feedthrough, tick)
-
-
-def pbsid(
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
-    tick: Tick = None,
-) -> BlackBoxFit:
+n4sid = _estimator(
+    "n4sid",
+    "Identify a state-space model by N4SID (Van Overschee and De Moor 1996, fig. 4.8; thesis eq. 1.1-1.3)",
+)
+moesp = _estimator(
+    "moesp",
+    "Identify a state-space model by PO-MOESP (Verhaegen 1994; Van Overschee and De Moor 1996, sec. 4.3.2)",
+)
+cva = _estimator(
+    "cva",
+    "Identify a state-space model by canonical variates (Larimore 1990; Van Overschee and De Moor 1996, sec. 4.3.3)",
+)
+pbsid = _estimator(
+    "pbsid",
     """Identify a state-space model by PBSID-opt, consistent under feedback (Chiuso 2007, Automatica 43, 1034).
 
-    The controller has to hold a delay of a sample; where it does not, D stays zero (the default) and the estimate
-    stays consistent, but D itself cannot be identified.
-
-    Parameters
-    ----------
-    data : IOData
-    orders : Mapping
-        As for `n4sid`.
-    horizon, past : int, optional
-        Samples of future and past, horizon <= past.
-    feedthrough : bool, optional
-        As for `n4sid`.
-    tick : callable, optional
-
-    Returns
-    -------
-    BlackBoxFit
-
-    Raises
-    ------
-    EstimationError
-        As for `n4sid`.
-    """
-    return estimate("pbsid", data, orders, horizon, past, feedthrough, tick)
+The controller has to hold a delay of a sample; where it does not, D stays zero (the default) and the estimate
+stays consistent, but D itself cannot be identified""",
+    ", horizon <= past",
+)
