@@ -23,7 +23,6 @@ from ambid.blackbox.data import Orders, check_order_names, compact_order, left_o
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.threads import one_thread
@@ -78,45 +77,6 @@ class PoleResidueModel:
         """
         s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
         return np.asarray(self.D + np.einsum("fk,kyu->fyu", 1.0 / (s[:, None] - self.poles), self.residues))
-
-    def transfer_model(self) -> TransferModel:
-        """Return transfer functions with the common denominator."""
-        den, (_, n_y, n_u) = np.real(np.poly(self.poles)), self.residues.shape
-        rest = [np.poly(np.delete(self.poles, k)) for k in range(self.poles.size)]
-        num = [[self.D[o, i] * den for i in range(n_u)] for o in range(n_y)]
-        for o, i in np.ndindex(n_y, n_u):
-            for k, others in enumerate(rest):
-                num[o][i] = num[o][i] + np.concatenate([[0.0], np.real(self.residues[k, o, i] * others)])
-        return TransferModel(
-            num=tuple(tuple(row) for row in num), den=tuple(tuple(den for _ in row) for row in num), dt=self.dt
-        )
-
-    def state_space(self) -> StateSpaceModel:
-        """Return a real block-diagonal form: each pole as often as the rank of its residue matrix wants.
-
-        Returns with K = 0.
-        """
-        from scipy.linalg import block_diag
-
-        _, n_y, n_u = self.residues.shape
-        blocks: list[tuple[Array, Array, Array]] = []
-        for k, a in enumerate(self.poles):
-            if a.imag < 0:
-                continue
-            left, size, right = np.linalg.svd(self.residues[k])
-            for j in np.nonzero(size > 1e-9 * max(float(size[0]), 1e-300))[0]:
-                c, b = left[:, j] * np.sqrt(size[j]), right[j] * np.sqrt(size[j])
-                if a.imag == 0:
-                    # a real residue has real singular vectors, up to a phase that both share
-                    turn = np.exp(-1j * np.angle(b[np.argmax(np.abs(b))]))
-                    blocks.append((np.array([[a.real]]), np.real(b * turn)[None], np.real(c / turn)[:, None]))
-                else:
-                    block = np.array([[a.real, a.imag], [-a.imag, a.real]])
-                    blocks.append((block, 2 * np.stack([b.real, -b.imag]), np.stack([c.real, c.imag], axis=1)))
-        A = block_diag(*[b[0] for b in blocks]) if blocks else np.zeros((0, 0))
-        B = np.vstack([np.zeros((0, n_u)), *[b[1] for b in blocks]])
-        C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
-        return StateSpaceModel(A=A, B=B, C=C, D=self.D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
 
 
 def vector_fit(

@@ -242,6 +242,19 @@ class _Trial:
     singular_values: Array
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Asked:
+    """What `frf_subspace` was asked for beside the order."""
+
+    p: float | None
+    block_rows: int | None
+    delay: float
+    feedthrough: bool
+    domain: Literal["s", "z"]
+    refine: bool
+    resamples: int
+
+
 def frf_subspace(
     frf: FrequencyResponse,
     orders: Orders | Literal["auto"],
@@ -293,31 +306,23 @@ def frf_subspace(
         If orders, options or lines break a rule.
     """
     n = _order(frf, orders, delay, domain, max_order)
+    asked = _Asked(
+        p=p, block_rows=block_rows, delay=delay, feedthrough=feedthrough, domain=domain, refine=refine,
+        resamples=resamples,
+    )  # fmt: skip
     with one_thread():
         if n is None:
-            return _choose_order(frf, p, block_rows, delay, feedthrough, domain, refine, max_order, resamples)
-        return _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
+            return _choose_order(frf, asked, max_order)
+        return _of_order(frf, n, asked)
 
 
-def _of_order(
-    frf: FrequencyResponse,
-    n: int,
-    p: float | None,
-    block_rows: int | None,
-    delay: float,
-    feedthrough: bool,
-    domain: Literal["s", "z"],
-    refine: bool,
-    resamples: int,
-) -> BlackBoxFit:
+def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
     """One order: subspace, refinement or resampling, continuous form."""
     n_y, n_u = frf.n_outputs, frf.n_inputs
-    n_estimated = n * (n_y + n_u) + (n_y * n_u if feedthrough else 0)
-    ln = _remove_delay(check_lines(frf, n_estimated), delay)
-    rows = _block_rows(ln, n, block_rows)
-    best = _best_operator(ln, n, rows, feedthrough, p)
+    ln, rows, best, n_estimated = _start(frf, n, asked)
+    feedthrough = asked.feedthrough
     cost, model, converged = best.cost, best.model, True
-    if refine:
+    if asked.refine:
         cost, model, converged = refine_matrices(ln, model, feedthrough)
         covariance, condition = information(ln, model, feedthrough)
     else:
@@ -325,9 +330,9 @@ def _of_order(
         def again(response: Complex) -> StateSpaceModel:
             return _trial(ln, response, n, rows, feedthrough, best.p).model
 
-        covariance, condition = resample(ln, model, again, resamples) * ln.alike, None
+        covariance, condition = resample(ln, model, again, asked.resamples) * ln.alike, None
     warnings = []
-    if model.dt is not None and domain == "s":
+    if model.dt is not None and asked.domain == "s":
         found = to_continuous(model, covariance)
         if found is None:
             warnings.append(
@@ -347,7 +352,7 @@ def _of_order(
         n_estimated=n_estimated,
         offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
         converged=converged,
-        best=refine,
+        best=asked.refine,
         warnings=warnings,
         details={
             "p": best.p,
@@ -356,8 +361,8 @@ def _of_order(
             "condition": block_rows_condition(points, rows - 1, best.p),
             "condition_without": block_rows_condition(points, rows - 1),
             "condition_jacobian": condition,
-            "delay_s": delay,
-            "refined": refine,
+            "delay_s": asked.delay,
+            "refined": asked.refine,
             "subspace_cost": best.cost,
         },
     )
@@ -390,38 +395,34 @@ def _order(
     return None
 
 
-def _choose_order(
-    frf: FrequencyResponse,
-    p: float | None,
-    block_rows: int | None,
-    delay: float,
-    feedthrough: bool,
-    domain: Literal["s", "z"],
-    refine: bool,
-    max_order: int,
-    resamples: int,
-) -> BlackBoxFit:
+def _choose_order(frf: FrequencyResponse, asked: _Asked, max_order: int) -> BlackBoxFit:
     """The lowest order that noise explains, else the one of least BIC."""
     m, tried, bic = 2 * frf.G.size, list[tuple[float, int]](), dict[str, float]()
     for n in range(1, max_order + 1):
         try:
-            ln = _remove_delay(check_lines(frf, n * (frf.n_outputs + frf.n_inputs)), delay)
-            trial = _best_operator(ln, n, _block_rows(ln, n, block_rows), feedthrough, p)
+            ln, _, trial, count = _start(frf, n, asked)
         except EstimationError:
             if not tried:
                 raise
             break
-        cost = refine_matrices(ln, trial.model, feedthrough)[0]
-        count = n * (frf.n_outputs + frf.n_inputs) + (frf.n_outputs * frf.n_inputs if feedthrough else 0)
+        cost = refine_matrices(ln, trial.model, asked.feedthrough)[0]
         verdict = ln.verdict(cost, count)
         tried.append((2 * cost + count * float(np.log(m)), n))
         bic[str(n)] = tried[-1][0]
         if verdict.p is not None and verdict.p > 0.01:
             tried = [tried[-1]]
             break
-    n = min(tried)[1]
-    fit = _of_order(frf, n, p, block_rows, delay, feedthrough, domain, refine, resamples)
+    fit = _of_order(frf, min(tried)[1], asked)
     return replace(fit, details={**fit.details, "bic_by_order": bic})
+
+
+def _start(frf: FrequencyResponse, n: int, asked: _Asked) -> tuple[Lines, int, _Trial, int]:
+    """Lines, block rows, subspace estimate of one order, and how many numbers are estimated."""
+    n_y, n_u = frf.n_outputs, frf.n_inputs
+    n_estimated = n * (n_y + n_u) + (n_y * n_u if asked.feedthrough else 0)
+    ln = _remove_delay(check_lines(frf, n_estimated), asked.delay)
+    rows = _block_rows(ln, n, asked.block_rows)
+    return ln, rows, _best_operator(ln, n, rows, asked.feedthrough, asked.p), n_estimated
 
 
 def _remove_delay(ln: Lines, delay: float) -> Lines:
