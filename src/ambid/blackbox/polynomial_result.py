@@ -173,23 +173,24 @@ def _offsets(scaled: ScaledData, layouts: Sequence[Layout], fits: Sequence[Minim
     an offset of its input.
     """
     n_u = scaled.u.shape[0]
-    y, rows, right = np.zeros(len(fits)), [], []
+    y, levels, gains, rows, right = np.zeros(len(fits)), [], [], [], []
     for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
         constant = float(f.nuisance[-1]) if f.nuisance.size else 0.0
         level = float(f.theta[x.places["A", None]].sum())
-        p = x.polynomials(f.theta)
-        gain = [np.sum(b) / np.sum(a) if np.sum(a) else np.inf for b, a in zip(p.B, p.F, strict=True)]
-        if abs(constant) <= _FAR * abs(level) or (level and not np.all(np.isfinite(gain))):
+        sums = [(f.theta[x.places["B", i]].sum(), f.theta[x.places["F", i]].sum()) for i in range(n_u)]
+        gain = np.array([b / a if a else np.inf for b, a in sums])
+        finite = np.isfinite(gain)
+        levels.append(level)
+        gains.append(np.where(finite, gain, 0.0))
+        if abs(constant) <= _FAR * abs(level) or (level and not finite.all()):
             y[o] = constant / level  # an F that integrates has no static gain to shift an input by
-        elif n_u and np.all(np.isfinite(gain)):
-            rows.append([-g for g in gain])
+        elif n_u and finite.all():
+            rows.append(-gain)
             right.append(constant)
     u = np.linalg.lstsq(np.array(rows), np.array(right), rcond=1e-10)[0] if rows else np.zeros(n_u)
-    for o, (x, f) in enumerate(zip(layouts, fits, strict=True)):
-        if rows and y[o]:  # the shifted input moves the other outputs too
-            p = x.polynomials(f.theta)
-            static = np.array([np.sum(b) / np.sum(a) if np.sum(a) else 0.0 for b, a in zip(p.B, p.F, strict=True)])
-            y[o] += float(static @ u) / float(p.A.sum())
+    for o in range(len(fits) if rows else 0):  # the shifted input moves the other outputs too
+        if y[o]:
+            y[o] += float(gains[o] @ u) / levels[o]
     return Offsets(u=scaled.u_mean + scaled.u_scale * u, y=scaled.y_mean + scaled.y_scale * y)
 
 
