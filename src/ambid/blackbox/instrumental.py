@@ -288,8 +288,7 @@ def is_exact(found: ArxEstimate, signals: Signals) -> bool:
 
 
 _ROUNDS = 10  # of instruments from the model itself, at most
-_SETTLED_IV4 = 1e-4  # change of the filtered output by a round, relative to the innovations
-_INSIDE_IV4 = 0.999  # radius to which the poles of an unstable instrument are drawn
+_INSTRUMENT_RADIUS = 0.999  # radius to which the poles of an unstable instrument are drawn
 
 
 def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -340,8 +339,6 @@ def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Arra
 
     Returns means; standard deviations.
     """
-    from dataclasses import replace
-
     means = (data.u.mean(axis=0), data.y.mean(axis=0))
     sds = (data.u.std(axis=0), data.y.std(axis=0))
     reference = data.reference - data.reference.mean(axis=0)
@@ -395,15 +392,13 @@ def _one_output(signals: Signals, orders: ArxOrders, explained: Array | None) ->
         before = found.solution.theta
         found = optimal_step("iv4", signals, _simulate(signals, before, orders), orders, before, highest)
         moved = np.linalg.pinv(found.solution.inverse) @ (found.solution.theta - before)
-        if np.linalg.norm(moved) <= _SETTLED_IV4 * np.linalg.norm(found.innovations):
+        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
             break
     return found
 
 
 def _explained(deviations: IOData) -> Array | None:
     """What the inputs alone make of the outputs, by an autoregression of many lags; None where none is stable."""
-    from dataclasses import replace
-
     u, names = deviations.u, deviations.inputs
     alone = replace(deviations, u=np.empty((u.shape[0], 0)), inputs=(), reference=u, references=names)
     try:
@@ -416,7 +411,7 @@ def _simulate(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
     """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
     from scipy.signal import lfilter
 
-    A = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE_IV4)
+    A = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSTRUMENT_RADIUS)
     y, first = np.zeros(signals.y.size), orders.na
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
         y += lfilter(np.concatenate([np.zeros(nk), theta[first : first + nb]]), A, signals.u[:, i])
@@ -449,21 +444,16 @@ def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
     deviations, means, sds = centre(data)
     clean = reference_part("cliv", deviations)
     found = [
-        in_loop(Signals(y=deviations.y[:, o], u=deviations.u), Signals(y=clean.y[:, o], u=clean.u), used)
+        estimate_output(
+            "cliv", Signals(y=deviations.y[:, o], u=deviations.u), Signals(y=clean.y[:, o], u=clean.u), used
+        )
         for o in range(data.n_outputs)
     ]
-    fit = arx_fit("cliv", data, used, found, means, sds)
-    return fit
-
-
-def in_loop(signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
-    """Estimate one output with the parts of the signals that the reference makes as instruments."""
-    return estimate_output("cliv", signals, clean, orders)
+    return arx_fit("cliv", data, used, found, means, sds)
 
 
 _COLUMNS = 400  # of the finite impulse response, all references together
 _CERTAIN = 2.0  # standard deviations by which a pole is outside before the plant is called unstable
-_NOISE_ORDER_2 = 20
 _STAGE_ROUNDS = 30
 _STAGE_SETTLED = 1e-6  # change of the output by a step, relative to the noise
 
@@ -658,7 +648,7 @@ def _stage_covariance(found: _Refined, nk: tuple[int, ...]) -> Array:
     places = [int(s) + k for s, b, d in zip(b_starts, p.B, nk, strict=True) for k in range(d, b.size)]
     places += [int(s) + k for s, f in zip(f_starts, p.F, strict=True) for k in range(1, f.size)]
     out = np.zeros((int(starts[-1]),) * 2)
-    inner = found.step.covariance(autoregression(found.noise, _NOISE_ORDER_2))
+    inner = found.step.covariance(autoregression(found.noise, NOISE_ORDER))
     out[np.ix_(places, places)] = inner * (n / max(n - len(places) - 1, 1))
     return out
 

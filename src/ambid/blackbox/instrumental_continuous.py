@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, left_open, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instrumental import ArxEstimate, ArxOrders, Signals, centre, in_loop, operating_point
+from ambid.blackbox.instrumental import ArxEstimate, ArxOrders, Signals, centre, estimate_output, operating_point
 from ambid.blackbox.instruments import (
     Autoregression,
     Solution,
@@ -521,7 +521,7 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
         for o in range(data.n_outputs):
             own = Signals(y=deviations.y[:, o] / sds[1][o], u=deviations.u / sds[0])
             pure = Signals(y=clean.y[:, o] / sds[1][o], u=clean.u / sds[0])
-            found.append(in_loop(own, pure, sampled))
+            found.append(estimate_output("cliv", own, pure, sampled))
         w0 = [_time_scale(f.A, data.dt) for f in found]
         nearest = [_nearest(f, used, w * data.dt) for f, w in zip(found, w0, strict=True)]
     return _clsrivc_fit(data, used, found, nearest, w0, means, sds)
