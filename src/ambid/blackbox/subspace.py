@@ -34,10 +34,9 @@ from ambid.blackbox.subspace_projection import (
     compress,
     fit_prior,
     input_relation,
-    least_squares,
+    jackknife,
     leave_each_out,
     merge_factors,
-    observability,
     predict_states,
     predictor_columns,
     project,
@@ -288,61 +287,6 @@ def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offse
     shift = np.linalg.lstsq(by, -error, rcond=1e-6)[0]
     n_y = s.C.shape[0]
     return Offsets(u=given.mean_u - shift[n_y:] * given.scale_u, y=given.mean_y - shift[:n_y] * given.scale_y)
-
-
-def align_states(one: Realisation, like: Realisation, length: int) -> Realisation:
-    """Return a realisation in the state basis of another.
-
-    `one`, `like`: of equal order; `length`: block rows of the observability matrices that are compared.
-    """
-    T = least_squares(observability(one.A, one.C, length), observability(like.A, like.C, length))
-    back = np.linalg.inv(T)
-    return Realisation(
-        A=back @ one.A @ T,
-        B=back @ one.B,
-        C=one.C @ T,
-        D=one.D,
-        K=back @ one.K,
-        innovation=one.innovation,
-        Q=back @ one.Q @ back.T,
-        S=back @ one.S,
-        R=one.R,
-        stable_predictor=one.stable_predictor,
-    )
-
-
-def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, with_bias: bool) -> Array | None:
-    """Return the covariance of vec(A, B, C, D, K), each row by row.
-
-    `full`: from all groups; `others`: each without one group; `length`: block rows of the observability matrices that
-    are compared; `with_bias`: whether to add the square of the bias that leaving out data shows. Returns (n_theta,
-    n_theta), or None, none where a basis cannot be matched.
-    """
-    rows = []
-    for one in others:
-        try:
-            same = align_states(one, full, length)
-        except np.linalg.LinAlgError:
-            return None
-        rows.append(theta(same))
-    values = np.array(rows)
-    if not np.all(np.isfinite(values)):
-        return None
-    deviations = values - values.mean(0)
-    groups = values.shape[0]
-    covariance = (groups - 1) / groups * deviations.T @ deviations
-    if with_bias:
-        bias = (groups - 1) * (values.mean(0) - theta(full))
-        covariance = covariance + np.outer(bias, bias)
-    return np.asarray(covariance)
-
-
-def theta(one: Realisation) -> Array:
-    """Return the coefficients in the order of `StateSpaceModel.theta`.
-
-    Returns (n_theta,).
-    """
-    return np.concatenate([getattr(one, m).ravel() for m in "ABCDK"])
 
 
 Tick = Callable[[], None] | None
