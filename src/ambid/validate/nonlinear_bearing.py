@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.likelihood import BearingFit, run
+from ambid.bearing.magnet.likelihood import BearingFit, run, sweep
 from ambid.bearing.magnet.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.magnet.result import NonlinearBearingEstimate
 from ambid.bearing.magnet.weight import weight_carried
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
-from ambid.validate.residuals import P_LEAST, fit_of, joint_score
+from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
 
 _ROLES = ("position", "current")
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
@@ -44,18 +44,25 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     A lag between current and force (an eddy pole) leaves the innovations white, as the levels of the noise grow over
     it, but not independent of past voltages.
     """
-    found = run(fit.problem, fit.vector, r, slopes=True)
+    found = run(fit.problem, fit.vector, r)
     assert found is not None
     outputs = (1,) if fit.problem.records[r].held else (0, 1)
     n, first = found.e.shape[0], fit.problem.skip
     white = np.nan_to_num(found.e[:, outputs] / np.sqrt(found.s[:, outputs]))
-    jacobian = found.rows.reshape(n, 4, -1)[:, [2 * c for c in outputs], :-1]
     begin = first + max(*_LAGS, *_INPUT_LAGS)
     lagged = np.hstack([white[begin - k : n - k] for k in _LAGS])
     u = fit.problem.records[r].u
     inputs = np.column_stack([u[begin - k : n - k] for k in _INPUT_LAGS])
-    target, slopes = white[begin:], jacobian[begin:]
-    own, by_input = (joint_score(slopes, target, x - x.mean(axis=0))[0] for x in (lagged, inputs))
+    target, groups = white[begin:], [x - x.mean(axis=0) for x in (lagged, inputs)]
+    triangles: list[list[Array]] = [[], []]
+    for part in sweep(fit.problem, fit.vector, r, found, slopes=True):
+        assert part is not None
+        late = max(begin - part.first, 0)
+        slopes = part.rows[late:, [2 * c for c in outputs], :-1]
+        at = slice(part.first + late - begin, part.first + late - begin + len(slopes))
+        for own_triangles, x in zip(triangles, groups, strict=True):
+            own_triangles.append(joint_triangle(slopes, target[at], x[at]))
+    own, by_input = (score_of(x, slopes.shape[2])[0] for x in triangles)
     spread = np.std(target, axis=0)
     correlation = np.abs(lagged.T @ target) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
     rms = [float(np.sqrt(np.nanmean(found.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
@@ -152,7 +159,7 @@ def _fit(
 
 def _replayed(fit: BearingFit, name: str) -> BearingReplay:
     record, first = fit.problem.records[0], fit.problem.skip
-    found = run(fit.problem, fit.vector, 0, slopes=False)
+    found = run(fit.problem, fit.vector, 0)
     assert found is not None  # its criterion is finite
     e, s = found.e[first:], found.s[first:]
     return BearingReplay(

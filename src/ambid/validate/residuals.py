@@ -164,14 +164,24 @@ def joint_score(slopes: Array, residuals: Array, regressors: Array) -> tuple[flo
     `slopes`: (n_used, n_outputs, n_directions); `residuals`: (n_used, n_outputs); `regressors`: (n_used,
     n_regressors). Returns p, the statistic and its degrees of freedom.
     """
-    from scipy.special import chdtrc
+    return score_of([joint_triangle(slopes, residuals, regressors)], slopes.shape[2])
 
+
+def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
+    """Return the triangle of some of the samples of `joint_score`, so that not all have to be held at once."""
     (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[1]
     rows = np.zeros((n, n_y, p + n_y * width + 1))
     rows[:, :, :p], rows[:, :, -1] = slopes, residuals
     for o in range(n_y):
         rows[:, o, p + o * width : p + (o + 1) * width] = regressors
-    L, rest, _ = _project(triangle_of([rows.reshape(n * n_y, -1)]), p)
+    return triangle_of([rows.reshape(n * n_y, -1)])
+
+
+def score_of(triangles: Sequence[Array], n_directions: int) -> tuple[float, float, int]:
+    """Return what `joint_score` does, from the triangles of all samples."""
+    from scipy.special import chdtrc
+
+    L, rest, _ = _project(triangle_of([np.vstack(triangles)]), n_directions)
     _, z = _explain(L, rest @ L, _SAME)
     statistic = float(z @ z)
     return (float(chdtrc(z.size, statistic)) if z.size else 1.0), statistic, z.size

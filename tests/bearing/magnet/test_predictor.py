@@ -108,7 +108,7 @@ def test_sensitivities_of_one_magnet_with_an_exponential_gap():
 def test_innovations_are_as_large_as_predicted_and_white_at_the_truth(bench):
     record, truth = bench
     problem = problem_of([record], truth, MagnetLaw(pair=True), PAIR - {"c"}, NOISE, 1.0)
-    found = run(problem, problem.start(), 0, slopes=False)
+    found = run(problem, problem.start(), 0)
     white = (found.e / np.sqrt(found.s))[200:]
     n = len(white)
     assert np.abs(record.y[:, 0]).max() > 0.45 * truth["s"]  # far from the centre

@@ -330,29 +330,30 @@ def _correct(
 
 @compiled
 def predict(
-    u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, whole: int, th: Array, active: Integers,
-    chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, slopes: bool, e: Array,
-    s: Array, rows: Array,
+    u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, end: int, whole: int, th: Array,
+    active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, S: Array,
+    dP: Array, slopes: bool, e: Array, s: Array, rows: Array,
 ) -> bool:  # fmt: skip
-    """Run the predictor over one record; False where a gap closes or numbers cease to be finite.
+    """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite.
 
     `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what is not known of the force, and of
     the motional voltage; `y` (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,)
-    and `P` hold the state before sample `first`, and move along. `noise2` holds the squares of the levels of position,
+    and `P` hold the state before sample `first`, `S` (n_states, 1, p) and `dP` (n_states, n_states, p) their
+    derivatives, and all move along. `noise2` holds the squares of the levels of position,
     current, force, voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows`
-    (4 n, p + 1) the rows of the likelihood, where `slopes` wants them.
+    (4 (end - first), p + 1) the rows of the likelihood, where `slopes` wants them.
     """
     n, n_a = z.size, active.size
     p = n_a + 5
     w, dw = np.zeros(12), np.zeros((7, MAGNET))
     g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, N_NUMBERS))
-    S, dP, room = np.zeros((n, 1, p)), np.zeros((n, n, p)), np.zeros((3, n, 1, p))
+    room = np.zeros((3, n, 1, p))
     dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
     F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
     col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
     none, q2 = np.zeros((2, p + 1)), np.zeros(3)
     phi = th[LATE]
-    for k in range(first, u.size):
+    for k in range(first, end):
         for c in range(2):
             if not valid[k, c]:
                 continue
@@ -365,7 +366,8 @@ def predict(
                     if active[j] == X_OFF + c:
                         de[j] -= chain[j]
                 # the derivative of the innovation is -(d prediction); the correction adds K (dy - dC z) = K de
-            out = rows[4 * k + 2 * c : 4 * k + 2 * c + 2] if slopes else none
+            row = 4 * (k - first) + 2 * c
+            out = rows[row : row + 2] if slopes else none
             s[k, c] = _correct(error, de, at, noise2[c], n_a + c, z, S, P, dP, slopes, out, col, dcol, dk)
             e[k, c] = error
         late, now = u[k - whole - 1], u[k - whole]

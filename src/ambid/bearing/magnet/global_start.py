@@ -45,7 +45,7 @@ def failure(fit: BearingFit) -> str:
 
 def _unexplained(fit: BearingFit, r: int) -> float:
     """Part of the normalised errors' variance that a regression on past errors and voltages explains, by record."""
-    found = run(fit.problem, fit.vector, r, slopes=False)
+    found = run(fit.problem, fit.vector, r)
     if found is None:
         return 1.0
     e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]

@@ -7,6 +7,7 @@ Astrom 1980), exact in state and covariance. Its gradient and Fisher information
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,6 +26,7 @@ _ITERATIONS = 60
 _SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
 _SEARCHING = "identify"
 _ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
+_BLOCK = 4096  # samples of one block: their rows stay near
 _LONGEST = 1.0  # step of a logarithm at once
 
 
@@ -58,24 +60,44 @@ class Innovations:
     # was measured
     e: Array
     s: Array
-    rows: Array  # see `_kernels.predict`
-    columns: NDArray[np.int64]  # (n_columns,), place of each column in the vector; -1 where it has none
 
 
-def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Innovations | None:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """Rows of the likelihood of some samples in a row."""
+
+    first: int
+    rows: Array  # (n_samples, 4, n_columns + 1), see `_kernels.predict`; overwritten by the next ones
+    columns: NDArray[np.int64]  # (n_columns,), place of each column in the vector
+
+
+def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
     """Run the predictor over one record.
 
-    `vector`: (size,); `r`: which record; `slopes`: whether the rows of the likelihood are wanted. Returns none where
-    there is no predictor.
+    `vector`: (size,); `r`: which record. Returns none where there is no predictor.
+    """
+    n = problem.records[r].u.size
+    found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    for part in sweep(problem, vector, r, found, slopes=False):
+        if part is None:
+            return None
+    return found
+
+
+def sweep(problem: BearingProblem, vector: Array, r: int, found: Innovations, *, slopes: bool) -> Iterator[Rows | None]:
+    """Run the predictor over one record block after block, so that memory does not grow with it.
+
+    `vector`: (size,); `r`: which record; `found`: gets the innovations; `slopes`: whether the likelihood.s rows are
+    wanted. Yields None, and ends, where there is no predictor.
     """
     from ambid.bearing.magnet._kernels import predict
 
     record, n_e = problem.records[r], len(problem.estimated)
     theta, whole = problem.theta(vector, record.rate_hz)
-    if whole < 0 or whole > problem.skip - 1 or not np.all(np.isfinite(theta)):
-        return None
-    if abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
-        return None
+    possible = 0 <= whole <= problem.skip - 1 and bool(np.all(np.isfinite(theta)))
+    if not possible or abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
+        yield None
+        return
     names = [n.name for n in problem.numbers]
     active = [names.index(n.name) for n in problem.estimated]
     chain, columns = problem.chain(vector), list(range(n_e))
@@ -85,24 +107,29 @@ def run(problem: BearingProblem, vector: Array, r: int, *, slopes: bool) -> Inno
         columns.append(n_e + problem.rates.index(record.rate_hz))
     place, levels = problem.noise_slices[r], problem.levels(r)
     columns += [place.start + levels.index(j) if j in levels else -1 for j in range(5)]
+    used, p = np.flatnonzero(np.array(columns) >= 0), len(columns)
     noise2, flags = problem.noise2(vector, r), problem.flags(r)
-    n = record.u.size
-    e, s = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
-    rows = np.zeros((4 * n if slopes else 1, len(columns) + 1))
+    rows = np.zeros((4 * _BLOCK if slopes else 1, p + 1))
     steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
     valid, numbers = record.valid & np.array([not record.held, True]), np.array(active, dtype=np.int64)
-    for first, end in record.parts:
+    for first, last in record.parts:
         begin = max(first + (_ABOUT if first else 0), problem.skip)
-        if end - begin < _ABOUT:
+        if last - begin < _ABOUT:
             continue
         z, P = _initial(problem, r, begin)
-        done = predict(
-            record.u[:end], loose[:end], knocks[:end], record.y[:end], valid[:end], begin, whole, theta, numbers,
-            chain, noise2, flags, 1.0 / record.rate_hz, steps, z, P, slopes, e, s, rows,
-        )  # fmt: skip
-        if not done:
-            return None
-    return Innovations(e=e, s=s, rows=rows if slopes else np.zeros((0, 0)), columns=np.array(columns))
+        S, dP = np.zeros((z.size, 1, p)), np.zeros((z.size, z.size, p))
+        for at in range(begin, last, _BLOCK):
+            end, rows[:] = min(at + _BLOCK, last), 0.0
+            done = predict(
+                record.u, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2, flags,
+                1.0 / record.rate_hz, steps, z, P, S, dP, slopes, found.e, found.s, rows,
+            )  # fmt: skip
+            if not done:
+                yield None
+                return
+            if slopes:
+                own = rows[: 4 * (end - at), [*used, p]].reshape(end - at, 4, -1)
+                yield Rows(first=at, rows=own, columns=np.array(columns)[used])
 
 
 def _knocks(problem: BearingProblem, r: int) -> Array:
@@ -194,7 +221,7 @@ def criterion(problem: BearingProblem, vector: Array) -> float:
     """
     total = 0.0
     for r in range(len(problem.records)):
-        found = run(problem, vector, r, slopes=False)
+        found = run(problem, vector, r)
         if found is None:
             return np.inf
         total += _sum(found)
@@ -209,22 +236,28 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
     `vector`: (size,). Returns none where there is no predictor.
     """
     prior, J_prior = prior_rows(problem, vector)
-    total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], []
+    total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], list[Array]()
     stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
-    for r in range(len(problem.records)):
-        found = run(problem, vector, r, slopes=True)
-        if found is None or not np.all(np.isfinite(found.rows)):
-            return None
+    for r, record in enumerate(problem.records):
+        n = record.u.size
+        found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+        own, blocks, columns = np.zeros((-(-n // stretch), problem.size)), list[Array](), np.zeros(0, dtype=np.int64)
+        for part in sweep(problem, vector, r, found, slopes=True):
+            if part is None or not np.all(np.isfinite(part.rows)):
+                return None
+            columns, m = part.columns, part.rows.shape[0]
+            for b in range(part.first // stretch, (part.first + m - 1) // stretch + 1):
+                rows = part.rows[max(b * stretch - part.first, 0) : (b + 1) * stretch - part.first]
+                rows = rows.reshape(-1, rows.shape[2])
+                own[b, columns] += rows[:, :-1].T @ rows[:, -1]
+            blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
         total += _sum(found)
-        used = np.flatnonzero(found.columns >= 0)
-        local = np.delete(found.rows, np.flatnonzero(found.columns < 0), axis=1)
-        for first in range(0, local.shape[0], 4 * stretch):
-            part, score = local[first : first + 4 * stretch], np.zeros(problem.size)
-            score[found.columns[used]] = part[:, :-1].T @ part[:, -1]
-            scores.append(score)
-        triangle, short = np.zeros((local.shape[1], problem.size + 1)), triangle_of([local])
-        triangle[: short.shape[0], np.append(found.columns[used], problem.size)] = short
-        parts.append(triangle)
+        scores += [*own]
+        if blocks:
+            short = triangle_of([np.vstack(blocks)])
+            triangle = np.zeros((columns.size + 1, problem.size + 1))
+            triangle[: short.shape[0], np.append(columns, problem.size)] = short
+            parts.append(triangle)
     whole = triangle_of([np.vstack(parts)])
     return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
 
