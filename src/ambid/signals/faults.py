@@ -301,10 +301,18 @@ def _errors(x: Array, clean: Array, width: int, spread: float) -> list[Array]:
 def _local_scale(error: Array, spread: float) -> Array:
     """Robust sd of errors around each sample: the largest of its own and the two neighbouring blocks."""
     n_blocks = max(1, error.size // _BLOCK)
-    blocks = np.array([np.median(np.abs(b)) for b in np.array_split(error, n_blocks)])
+    length, longer = divmod(error.size, n_blocks)  # the first blocks are longer by one sample
+    cut, size = longer * (length + 1), np.abs(error)
+    blocks = np.concatenate(
+        [
+            np.median(size[:cut].reshape(longer, length + 1), axis=1),
+            np.median(size[cut:].reshape(n_blocks - longer, length), axis=1),
+        ]
+    )
     wide = np.concatenate((blocks[:1], blocks, blocks[-1:]))
     widest = np.maximum(np.maximum(wide[:-2], wide[1:-1]), wide[2:])
-    lengths = [b.size for b in np.array_split(error, n_blocks)]
+    lengths = np.full(n_blocks, length)
+    lengths[:longer] += 1
     # The floor keeps round-off of a noise-free record from being its own measure.
     scale: Array = np.repeat(np.maximum(_MAD_TO_SD * widest, 1e-6 * spread), lengths)
     return scale
@@ -439,7 +447,8 @@ def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | 
             raise RecordError(f"limits {limits} of channel {name!r}; the lower must be under the upper one. Swap them")
         lower, upper = (_limit(limits[0], x <= limits[0]), _limit(limits[1], x >= limits[1]))
     else:
-        lower, upper = _pile(x), _pile(-x)
+        values, counts = np.unique(x, return_counts=True)
+        lower, upper = _pile(x, values, counts), _pile(-x, -values[::-1], counts[::-1])
         upper = replace(upper, value=-upper.value) if upper else None
     firsts = [limit.first_index for limit in (lower, upper) if limit]
     return Saturation(
@@ -465,9 +474,8 @@ def _limit(value: float, at: np.ndarray) -> Limit | None:
     )
 
 
-def _pile(x: Array) -> Limit | None:
-    """Return the lower extreme of `x` as a limit if samples pile up at it."""
-    values, counts = np.unique(x, return_counts=True)
+def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
+    """Return the lower extreme of `x` as a limit if samples pile up at it; `values`: its levels, in order."""
     # Levels that only round-off keeps apart are one, as in a computed sine with a whole number of samples per period.
     apart = np.diff(values) > 1e-9 * (values[-1] - values[0])
     level_of = np.concatenate(([0], np.cumsum(apart)))
