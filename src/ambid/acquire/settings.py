@@ -11,11 +11,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ambid.acquire._limits import count_inside, duty_off, duty_range, trip_counts
-from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, drives, period_of
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, PWM_TOP, drives, period_of
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
-from ambid.acquire.layout import STREAM, carried, columns, has_position, in_si, stream_of
-from ambid.acquire.scales import scale_of, who
+from ambid.acquire.device import Column
+from ambid.acquire.scales import Scale, count_inside, duty_off, duty_range, scale_of, trip_counts, who
+from ambid.arrays import Array
 from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Loop
 from ambid.physics.models import model
@@ -41,6 +44,8 @@ _FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state
 _CONFIGURE = ("period", "stream")
 _LIMITS = ("position_low", "position_high", "current_low", "current_high", "duty_low", "duty_high", "duty_off")
 _GAINS = ("kp", "ki", "kd", "pole", "kc", "setpoint", "current_rest", "duty_bias")
+STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
+"""Roles of what a sample may carry, in the order of the bits of the stream mask and of a block's columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -254,3 +259,103 @@ def _check_line(rig: Rig, daq: Daq, settings: ControllerSettings) -> None:
             f"{who(rig)}: {settings.rate_hz:g} samples a second of {bits} bit times each do not fit into daq.baud ="
             f" {daq.baud} bit/s, but {daq.baud / bits:.0f} do. Lower daq.rate_hz"
         )
+
+
+def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tuple[Column, ...]:
+    """Return what a sample carries, column by column.
+
+    `rig`: names the columns; `settings`: which there are; `si`: as `in_si` gives them instead of in counts. Returns in
+    the order of the stream mask; spans are what the converter can give, for the voltage what the controller orders at
+    most.
+    """
+    taken = {c.column for c in rig.channels}
+    found = []
+    for role in carried(settings):
+        name, kept, span = _column(rig, settings, role)
+        if role == "excitation" and name in taken:
+            name = "excitation_counts"
+        scale = _si_scale(rig, settings, role) if si else None
+        unit = "1"
+        if scale is not None:
+            low, high = sorted(scale.to_si(span).tolist())
+            span, unit = (low, high), "V" if role == "excitation" else _unit(rig, kept)
+        found.append(Column(name=name, role=kept, unit=unit, span=span))
+    return tuple(found)
+
+
+def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
+    """Turn samples in counts into SI.
+
+    `rig`: with calibrations; `settings`: what a sample carries; `values`: (n_samples, n_columns), counts, as the
+    controller sends them. Returns (n_samples, n_columns), SI, columns without a calibration stay as they are.
+    """
+    out = np.array(values, dtype=np.float64)
+    for k, role in enumerate(carried(settings)):
+        scale = _si_scale(rig, settings, role)
+        if scale is not None:
+            out[:, k] = scale.to_si(out[:, k])
+    return out
+
+
+def stream_of(rig: Rig, daq: Daq) -> int:
+    """Return the stream mask: current, pulse width and excitation always, the rest where the rig has it.
+
+    `rig`: with channel ``reference`` or not; `daq`: with a third input or not. Returns one bit for each of `STREAM`.
+    """
+    wanted = {"current", "voltage", "excitation"} | ({"position"} if has_position(rig) else set())
+    wanted |= {"third"} if daq.third is not None else set()
+    wanted |= {"reference"} & {c.role for c in rig.channels}
+    return sum(1 << bit for bit, role in enumerate(STREAM) if role in wanted)
+
+
+def carried(settings: ControllerSettings) -> list[str]:
+    """Return the roles of what a sample carries.
+
+    `settings`: with the stream mask. Returns of `STREAM`, in its order.
+    """
+    return [role for bit, role in enumerate(STREAM) if settings.stream >> bit & 1]
+
+
+def has_position(rig: Rig) -> bool:
+    """Return whether the rig's model has a position.
+
+    `rig`: any. Returns false for a coil alone.
+    """
+    return "position" in model(rig.model).outputs
+
+
+def _third_role(rig: Rig) -> str | None:
+    """Role whose column the third input is, where the rig has one."""
+    third = rig.daq.third if rig.daq else None
+    return next((c.role for c in rig.channels if third is not None and c.column == third), None)
+
+
+def _column(rig: Rig, settings: ControllerSettings, role: str) -> tuple[str, str, tuple[float, float]]:
+    """Return name, role and span of what a sample carries, in counts."""
+    analog = (0.0, float(ADC_TOP))
+    if role == "third":
+        assert rig.daq is not None
+        return rig.daq.third or "third", "extra", analog
+    if role == "excitation":
+        return "excitation", role, (-float(PWM_TOP), float(PWM_TOP))
+    span = (float(settings.duty_low), float(settings.duty_high)) if role == "voltage" else analog
+    return rig.channel(role).column, role, span
+
+
+def _si_scale(rig: Rig, settings: ControllerSettings, role: str) -> Scale | None:
+    """Return the scale of a column, None where its counts have no meaning in SI."""
+    if role == "third":
+        of = _third_role(rig)
+        return scale_of(rig, of) if of is not None and rig.channel(of).calibration is not None else None
+    if role == "excitation":
+        slope = scale_of(rig, "voltage").slope(settings.duty_bias)
+        ends = np.array([0.0, float(PWM_TOP)])
+        return Scale(role=role, column=role, top=PWM_TOP, raw=ends, si=slope * ends)
+    return scale_of(rig, "position" if role == "reference" else role)
+
+
+def _unit(rig: Rig, role: str) -> str:
+    from ambid.rig.load import role_units
+
+    third = _third_role(rig) if role == "extra" else None
+    return role_units(model(rig.model)).get(third or role, "1")

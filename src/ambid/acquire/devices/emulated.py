@@ -7,11 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ambid.acquire.default_daq import with_default_daq
-from ambid.acquire.devices._folders import TemporaryFolder
 from ambid.acquire.devices.emulator import Emulator
 from ambid.acquire.devices.frames import ROOM
 from ambid.acquire.devices.line_device import LineDevice
-from ambid.acquire.devices.plant_file import write_plant_file
+from ambid.acquire.devices.plant_file import TemporaryFolder, write_plant_file
 from ambid.acquire.devices.played import Pace
 from ambid.acquire.link.port import Port, PortEnded, open_port
 from ambid.errors import DeviceError

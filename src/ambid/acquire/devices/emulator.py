@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from ambid.acquire.devices._folders import TemporaryFolder
+from ambid.acquire.devices.plant_file import TemporaryFolder
 from ambid.errors import DeviceError
 
 INSTALL = "apt-get install gcc-avr avr-libc libsimavr-dev"

@@ -11,12 +11,11 @@ from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Progra
 from ambid.acquire.devices.excitation import counts_of
 from ambid.acquire.devices.frames import ROOM
 from ambid.acquire.devices.stream import SampleStream
-from ambid.acquire.layout import columns, in_si
 from ambid.acquire.link.controller import Controller
 from ambid.acquire.link.port import Port
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.table import table
-from ambid.acquire.settings import controller_settings
+from ambid.acquire.settings import columns, controller_settings, in_si
 from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.rig.rig import Rig

@@ -7,14 +7,19 @@ is right in the mean.
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import tempfile
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 from ambid.acquire.board import ADC_TOP
 from ambid.acquire.devices.benches import Bench, bench_of
-from ambid.acquire.layout import has_position
 from ambid.acquire.scales import Scale, scale_of
+from ambid.acquire.settings import has_position
 from ambid.errors import DeviceError
 from ambid.physics.magnet import CoEnergy, DifferentialPair
 from ambid.physics.nonlinear import NonlinearPlant
@@ -22,9 +27,57 @@ from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 
+_PREFIX = "ambid-emulated-"
+_LOCK = "in_use"
+_YOUNG_S = 60.0  # a folder as young may be about to be locked
 _VOLT_PER_COUNT = 5.0 / (ADC_TOP + 1)
 _NO_POSITION = {"position_gain": 0.0, "position_offset": 2.5}
 _HELD = {"m": 1.0, "k_x": 0.0, "k_i": 0.0}  # a coil alone, in the words of one axis: nothing moves, nothing moves it
+
+
+class TemporaryFolder:
+    """A folder of this program alone."""
+
+    def __init__(self) -> None:
+        """Make it, and remove what dead programs have left."""
+        _remove_dead()
+        self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        self._lock = os.open(self.path / _LOCK, os.O_CREAT | os.O_RDWR | getattr(os, "O_CLOEXEC", 0), 0o600)
+        _locked(self._lock)
+
+    def remove(self) -> None:
+        """Remove it with all that it holds; again is harmless."""
+        if self._lock >= 0:
+            shutil.rmtree(self.path, ignore_errors=True)
+            os.close(self._lock)
+            self._lock = -1
+
+
+def _locked(fd: int) -> bool:
+    """Lock a file; whether nobody else holds it."""
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system: there is no emulated bench either
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_dead() -> None:
+    """Remove the folders of this user that nobody holds."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError):  # of another user, or just being removed
+            if folder.is_symlink() or time.time() - folder.stat().st_mtime < _YOUNG_S:
+                continue
+            fd = os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if _locked(fd):
+                    shutil.rmtree(folder, ignore_errors=True)
+            finally:
+                os.close(fd)
 
 
 def write_plant_file(

@@ -17,10 +17,9 @@ from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTes
 from ambid.acquire.devices.benches import Bench, bench_of
 from ambid.acquire.devices.excitation import counts_of
 from ambid.acquire.devices.played import Pace, PlayedDevice
-from ambid.acquire.layout import carried, columns, in_si
 from ambid.acquire.protocol.table import table
 from ambid.acquire.scales import Scale, scale_of
-from ambid.acquire.settings import ControllerSettings, controller_settings
+from ambid.acquire.settings import ControllerSettings, carried, columns, controller_settings, in_si
 from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset

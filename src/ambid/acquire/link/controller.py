@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from ambid.acquire.link.listener import Hearing, Listener
 from ambid.acquire.link.port import Port, PortEnded
+from ambid.acquire.link.reader import Hearing, Listener
 from ambid.acquire.link.refusals import refusal
 from ambid.acquire.protocol.codec import Message, message
 from ambid.acquire.protocol.framing import FrameCounters, encode

@@ -15,8 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from ambid.acquire.device import DeviceEvent
-from ambid.acquire.recorder._queue import Item, WriteQueue
-from ambid.acquire.recorder._writer import JournalWriter
+from ambid.acquire.recorder._writer import Item, JournalWriter, WriteQueue
 from ambid.acquire.recorder.convert import Recorded, check_target, recorded_from
 from ambid.acquire.recorder.disk import JournalFile, disk_error, free_bytes
 from ambid.acquire.recorder.frames import BLOCK, EVENT, LARGEST, NO_SAMPLE, packed_values
