@@ -9,6 +9,7 @@
 #include "daq.h"
 #include "frame.h"
 #include "report.h"
+#include "states.h"
 
 #define BYTES_A_PASS 8 /* some 0.2 ms with ticks and bytes coming: samples go first, and the watchdog is fed */
 

@@ -1,6 +1,6 @@
 /*
- * Everything that is particular to the board: ATmega328P at 16 MHz, pins of the Arduino Uno. board.c alone touches
- * registers; another controller needs another board.c (and the numbers below).
+ * Everything that is particular to the board: ATmega328P at 16 MHz, pins of the Arduino Uno. board_*.c alone touch
+ * registers; another controller needs other ones (and the numbers below).
  *
  *   A0 position, A1 current, A2 third input    D9 (OC1A) pulse width, 20 kHz, on for `duty` of 800 counts
  *   D0/D1 serial line, 1 Mbaud 8N1             D8 power stage on (high)

@@ -12,6 +12,7 @@
 #include "report.h"
 #include "safety.h"
 #include "selftest.h"
+#include "states.h"
 #include "tick.h"
 
 #define IN(state) (uint8_t)(1 << (state))

@@ -81,13 +81,4 @@ static inline void daq_count(volatile uint16_t *counter)
     }
 }
 
-/* As after a reset. */
-void daq_begin(uint8_t by_watchdog);
-/* Ticks from 0. */
-void daq_start(void);
-/* Output on from the next tick on: STATE_DRIVING or STATE_LEVITATING. */
-void daq_output(uint8_t state);
-/* Output off, no ticks; a fault stays. */
-void daq_stop(void);
-
 #endif

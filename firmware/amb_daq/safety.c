@@ -1,6 +1,6 @@
 /*
  * Checks of each tick and the way into and out of the safe state. The lines (interlock, cable) are watched by the
- * timer's interrupt in board.c, more often than ticks come.
+ * timer's interrupt in board_timers.c, more often than ticks come.
  */
 #include "safety.h"
 

@@ -1,10 +1,11 @@
 /*
- * Changes of state other than faults (safety.c).
+ * Changes of state other than faults (safety.h).
  */
-#include "daq.h"
+#include "states.h"
 
 #include <string.h>
 
+#include "daq.h"
 #include "tick.h"
 
 struct daq daq;
