@@ -207,7 +207,7 @@ def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
 def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tuple[str, ...]:
     """Return why a fit does not hold on a second record.
 
-    `found`: by output, as `validate.blackbox.judge.validation` or `validate.nonlinear.validation` give it. Returns one
+    `found`: by output, as `validate.blackbox.validation` or `validate.nonlinear.validation` give it. Returns one
     line each; empty where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the
     record lies outside the training data (which a linear fit does not know).
     """
