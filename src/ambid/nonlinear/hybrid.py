@@ -296,14 +296,40 @@ def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, work: _W
             "ne, or say --open-loop if there was no feedback"
         )
     work.warnings += [*cautions(work, problem, found, "neurons or terms"), *_cautions(work, found)]
-    if found.covariance is None:
+    covariance, spare = found.covariance, _spare_units(of, work.theta, problem, found)
+    if covariance is None:
         work.warnings.append(
             "no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons"
         )
+    elif spare:
+        covariance = None
+        work.warnings.append(
+            f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and "
+            f"intervals beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
+        )
     work.details = _details(records, data, work, problem)
     return finish(
-        "hybrid", records, used, data, work, problem, found, covariance=found.covariance, origin="laplace", seed=seed
+        "hybrid", records, used, data, work, problem, found, covariance=covariance, origin="laplace", seed=seed
     )
+
+
+def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found: Laplace) -> int:
+    """Units whose output weights' Wald statistic is below Bayes' price of the unit's numbers.
+
+    Beside them coefficients of the polynomial are off by 1.5 to 2 times their deviations: the likelihood is far from
+    quadratic in what a unit does that is hardly there.
+    """
+    if found.covariance is None:
+        return 0
+    layer = of.blocks[2]
+    assert isinstance(layer, Tanh)
+    price = (of.p + layer.width + 1) * np.log(problem.n_errors / of.p)
+    spare = 0
+    for k in range(of.neurons):
+        own = of.n_linear + k + of.neurons * np.arange(of.p)
+        wald = theta[own] @ np.linalg.solve(found.covariance[np.ix_(own, own)], theta[own])
+        spare += bool(wald < price)
+    return spare
 
 
 def _cautions(work: _Work, found: Laplace) -> list[str]:
