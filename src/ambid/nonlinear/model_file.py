@@ -19,6 +19,7 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:read_model",
+        "hammerstein": "ambid.nonlinear.hammerstein:read_model",
         "lpv": "ambid.nonlinear.lpv.model:LpvModel.from_json",
     }
 )

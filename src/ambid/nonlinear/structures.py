@@ -90,6 +90,13 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
         feedback="with noise model",
     ),
     NonlinearStructure(
+        name="hammerstein",
+        summary="static polynomial of each input, then a linear difference equation",
+        options="ambid.nonlinear.hammerstein:HammersteinSettings",
+        home="ambid.nonlinear.hammerstein:hammerstein",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
         name="rbf",
         summary="radial basis functions of lagged outputs and inputs, beside a linear part (thesis eqs 1.13-1.14)",
         options="ambid.nonlinear.rbf:RbfSettings",
