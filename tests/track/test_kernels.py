@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.track import rpem_kernels as kernels
+from ambid.track.supervise_kernels import gather
 
 P = 7
 
@@ -93,13 +94,18 @@ def test_fold_keeps_the_normal_equations():
 
 def test_gather_moves_blocks_to_one_point():
     rng = np.random.default_rng(7)
-    point, q = rng.normal(size=P), rng.normal(size=P)
-    R, scratch, loss = np.zeros((P + 1, P + 1)), np.empty((P + 1, P)), 0.0
+    point, q, other = rng.normal(size=P), rng.normal(size=P), rng.normal(size=P)
+    T, scratch, row = np.zeros((P, P + 1)), np.empty((P, P + 1)), np.empty(P + 1)
+    more = 0.0
     for _ in range(3):
         J, r, at = block(rng)
-        kernels.gather(R, scratch, J, r, at, point)
-        loss += np.sum((r + J @ (q - at)) ** 2)
-    assert np.sum((R @ np.append(q - point, 1.0)) ** 2) == pytest.approx(loss)
+        assert gather(J, r, at, T, point, scratch, row)
+        more += np.sum((r + J @ (q - at)) ** 2) - np.sum((r + J @ (other - at)) ** 2)
+    left, right = (np.sum((T @ np.append(x - point, 1.0)) ** 2) for x in (q, other))
+    assert left - right == pytest.approx(more)
+    before = T.copy()
+    assert not gather(J, np.full(P, np.nan), at, T, point, scratch, row)
+    assert np.array_equal(T, before)
 
 
 def test_far_is_what_it_says():

@@ -113,7 +113,7 @@ class Gate:
         self._gather, self._weigh = gather, weigh
         self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation
         p = len(self.names)
-        self._inlet, self._sides, self._out = np.zeros((p + 1, p + 1)), np.zeros((2 * p + 1, p)), np.zeros(5 + p)
+        self._sides, self._out = np.zeros((2 * p + 1, p)), np.zeros(5 + p)
         self._scratch = (np.zeros((p, p)), np.zeros((p, p + 1)), np.zeros((p, p + 1)))
         self._z, self._z_back, self._misfit = float(-ndtri(level)), float(-ndtri(back)), float(chdtri(p, level))
         values, P = self._checked(start, covariance)
@@ -171,14 +171,12 @@ class Gate:
             return None
         if not math.isfinite(evidence.rest):
             return None
-        p = len(self.names)
-        self._inlet[:p, :p], self._inlet[:p, p], self._inlet[p, :p] = evidence.J, evidence.r, evidence.at
         back = self._judge_probation(evidence, t)
         if back is not None:
             return back
         if self._candidate is None:
             return None
-        if not self._trial.add(evidence, self._inlet, self._gather) or self._trial.blocks < self._blocks:
+        if not self._trial.add(evidence, self._gather) or self._trial.blocks < self._blocks:
             return None
         new, old = self._candidate, self.accepted
         seen = self.last = self._compare(self._trial, new, old)
@@ -236,7 +234,7 @@ class Gate:
         """Go back if the earlier numbers predict better than chance allows; looked at each time the blocks double."""
         if self._before is None:
             return None
-        self._watched.add(evidence, self._inlet, self._gather)
+        self._watched.add(evidence, self._gather)
         n = self._watched.blocks
         if n < self._next and n < self._probation:
             return None
@@ -316,8 +314,8 @@ class _Sum:
         self.T[:, -1] += self.T[:, :-1] @ (at - self.at)
         self.at = at
 
-    def add(self, evidence: Evidence, inlet: Array, gather: Callable[..., bool]) -> bool:
-        if not gather(inlet, self.T, self.at, self.other, self.scratch):
+    def add(self, evidence: Evidence, gather: Callable[..., bool]) -> bool:
+        if not gather(evidence.J, evidence.r, evidence.at, self.T, self.at, self.other, self.scratch):
             return False
         self.rest += evidence.rest
         self.freedom += evidence.freedom

@@ -185,13 +185,3 @@ class ExcitationMonitor:
             )
         self._before = self._fresh.copy()
         return tuple(events)
-
-
-def rate_of(sd: float, duration_s: float) -> float:
-    """Return the information rate behind an estimate.
-
-    `sd`: relative standard deviation; `duration_s`: of the data, s. Returns 1/(sd² duration), 1/s.
-    """
-    if not (sd > 0 and duration_s > 0):
-        raise EstimationError(f"an information rate wants sd and duration over 0; got {sd:g} and {duration_s:g} s")
-    return 1.0 / (sd * sd * duration_s)

@@ -142,7 +142,8 @@ class DriftRates:
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
-        from ambid.track.rpem_kernels import gather, walk_score
+        from ambid.track.rpem_kernels import walk_score
+        from ambid.track.supervise_kernels import gather
 
         p = start.size
         self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
@@ -154,7 +155,7 @@ class DriftRates:
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
         self._scratch = np.zeros((room, p, p)), np.zeros((room, p, 2))
-        self._triangle, self._rows = np.zeros((p + 1, p + 1)), np.zeros((p + 1, p))
+        self._triangle, self._rows = np.zeros((p, p + 1)), (np.zeros((p, p + 1)), np.zeros(p + 1))
         self._point = start
         self._parts = self._count = self._next = self._since = self._looks = 0
         self._score, self._gather = walk_score, gather
@@ -169,12 +170,12 @@ class DriftRates:
         if not self._parts:
             self._q[self._next], self._P[self._next] = before.q, before.covariance
             self._triangle[:], self._point = 0.0, evidence.at
-        self._gather(self._triangle, self._rows, evidence.J, evidence.r, evidence.at, self._point)
+        self._gather(evidence.J, evidence.r, evidence.at, self._triangle, self._point, *self._rows)
         self._parts += 1
         if self._parts < self._per_chunk:
             return
         self._parts = 0
-        self._J[self._next], self._r[self._next] = self._triangle[:-1, :-1], self._triangle[:-1, -1]
+        self._J[self._next], self._r[self._next] = self._triangle[:, :-1], self._triangle[:, -1]
         self._at[self._next] = self._point
         self._next = (self._next + 1) % _WINDOW
         self._count = min(self._count + 1, _WINDOW)
@@ -204,7 +205,8 @@ class DriftRates:
         return {k: v for k, v in self.__dict__.items() if k not in ("_score", "_gather")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        from ambid.track.rpem_kernels import gather, walk_score
+        from ambid.track.rpem_kernels import walk_score
+        from ambid.track.supervise_kernels import gather
 
         self.__dict__.update(state)
         self._score, self._gather = walk_score, gather

@@ -22,7 +22,7 @@ Flags = NDArray[np.bool_]
 _MOST = 0.5  # part of a positive number by which one block may lower it
 
 
-@compiled(fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def advance(
     u: Array,
     y: Array,
@@ -138,7 +138,7 @@ def advance(
     return len(y)
 
 
-@compiled(fastmath={"contract", "reassoc", "nsz"})
+@compiled(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def fold(R: Array, w: Array, n: int) -> None:
     """Take the first `n` samples of rows `w` (p, room) into the upper triangle R (p, p); `w` is used up."""
     p = R.shape[0]
@@ -165,7 +165,7 @@ def fold(R: Array, w: Array, n: int) -> None:
                 x[t] -= g * v[t]
 
 
-@compiled
+@compiled(error_model="numpy")
 def lower(W: Array) -> None:
     """Turn W (p, m), m >= p, into [L 0] with the same W W^T, L lower triangular, its diagonal not negative."""
     p, m = W.shape
@@ -194,7 +194,7 @@ def lower(W: Array) -> None:
                 W[k, i] = -W[k, i]
 
 
-@compiled
+@compiled(error_model="numpy")
 def absorb(
     q: Array, S: Array, J: Array, r: Array, at: Array, active: Flags, positive: Flags, noise: float
 ) -> tuple[float, float]:
@@ -275,7 +275,7 @@ def absorb(
     return total, part
 
 
-@compiled
+@compiled(error_model="numpy")
 def spread(S: Array, variance: Array, active: Flags, time: float) -> None:
     """Let the active numbers walk: their diagonal of S S^T grows by time x variance."""
     p = S.shape[0]
@@ -291,7 +291,7 @@ def spread(S: Array, variance: Array, active: Flags, time: float) -> None:
             S[a, k] = W[a, k]
 
 
-@compiled
+@compiled(error_model="numpy")
 def far(q: Array, at: Array, J: Array, S: Array, curved: Array, most: float) -> bool:
     """Return whether |J (q - at)|^2 passes `most`, or a squared move its standard deviation times `curved`."""
     p, total = q.size, 0.0
@@ -307,20 +307,7 @@ def far(q: Array, at: Array, J: Array, S: Array, curved: Array, most: float) -> 
     return total > most
 
 
-@compiled
-def gather(R: Array, w: Array, J: Array, r: Array, at: Array, point: Array) -> None:
-    """Fold a block's triangle into R (p + 1, p + 1), which is held at `point`; `w` (p + 1, p) is scratch."""
-    p = r.size
-    for i in range(p):
-        v = r[i]
-        for k in range(p):
-            w[k, i] = J[i, k] if k >= i else 0.0
-            v += w[k, i] * (point[k] - at[k])
-        w[p, i] = v
-    fold(R, w, p)
-
-
-@compiled(fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def walk_score(
     J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float,
     K: Array, errors: Array,

@@ -21,7 +21,7 @@ _SETTLE_GAIN = 12.0  # over the number of tests, while settling: one over the de
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 
 
-@compiled(fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def fold(A: Array, B: Array, s: Array) -> None:
     """Replace the upper triangle `A` (p, w), w >= p, by that of [A; B]; B is destroyed, s (w,) is scratch.
 
@@ -54,7 +54,7 @@ def fold(A: Array, B: Array, s: Array) -> None:
                 B[i, j] -= s[j] * b
 
 
-@compiled(fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def whiten(T: Array, before: Array, extra: Array, M: Array, X: Array) -> None:
     """Fill `X` (p, p + 1) with M^-1/2 [J rho], where M = I + J P J^T and rho = r + J q.
 
@@ -93,7 +93,7 @@ def whiten(T: Array, before: Array, extra: Array, M: Array, X: Array) -> None:
             X[i, j] *= a
 
 
-@compiled
+@compiled(error_model="numpy")
 def _level_of(rest: float, freedom: float) -> float:
     """Return a standard normal number for rest/freedom of a chi-squared `rest` (Wilson and Hilferty 1931)."""
     if freedom < 1.0:
@@ -102,7 +102,7 @@ def _level_of(rest: float, freedom: float) -> float:
     return float(((rest / freedom) ** (1.0 / 3.0) - (1.0 - v)) / math.sqrt(v))
 
 
-@compiled
+@compiled(error_model="numpy")
 def _copy(A: Array, B: Array) -> None:
     """Copy `A` to `B`, both (p, w)."""
     for i in range(A.shape[0]):
@@ -110,7 +110,7 @@ def _copy(A: Array, B: Array) -> None:
             B[i, j] = A[i, j]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _take(inlet: Array, base: Array, note: Array, before: Array, reference: Array, block: int) -> None:
     """Store the triangle of a block, and estimate and covariance before it, at the reference point."""
     p = base.shape[0]
@@ -126,7 +126,7 @@ def _take(inlet: Array, base: Array, note: Array, before: Array, reference: Arra
     note[3] = float(block)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _test(
     X: Array, rest: float, freedom: float, row: Array, marks: Array, tested: Counts, gain: float, noise: float,
     now: Array, found: Array,
@@ -176,7 +176,7 @@ def _test(
         found[0] = 3.0
 
 
-@compiled
+@compiled(error_model="numpy")
 def watch(
     inlet: Array, bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array,
     tested: Counts, rows: Array, state: Array, scratch: Array, result: Array,
@@ -268,14 +268,14 @@ def watch(
         state[0] += state[3] if newest / freedom_now > middle else -state[3]
 
 
-@compiled
+@compiled(error_model="numpy")
 def _learn(row: Array, at: int, statistic: float, point: float, gain: float) -> None:
     """Move the log of a scale (at least 0) so that a share `_QUANTILE` lies above `point` times the scale."""
     up = 1.0 - _QUANTILE if statistic > point * math.exp(row[at]) else -_QUANTILE
     row[at] = max(row[at] + gain * up, 0.0)
 
 
-@compiled(fastmath={"contract"})
+@compiled(error_model="numpy", fastmath={"contract"})
 def inform(
     R: Array, J: Array, decay: float, duration: float, limits: Array, reference: Array, fresh: Counts, out: Array,
     work: Array,
@@ -328,29 +328,29 @@ def inform(
     return changed
 
 
-@compiled(fastmath={"contract"})
-def gather(inlet: Array, T: Array, point: Array, other: Array, s: Array) -> bool:
+@compiled(error_model="numpy", fastmath={"contract"})
+def gather(J: Array, r: Array, at: Array, T: Array, point: Array, other: Array, s: Array) -> bool:
     """Fold a block into `T` (p, p + 1), which is held at `point`; do nothing and return False if it is not finite.
 
-    `inlet` (p + 1, p + 1): [J r], [at .]. `other` (p, p + 1) and `s` (p + 1,) are scratch.
+    `other` (p, p + 1) and `s` (p + 1,) are scratch.
     """
     p, total = T.shape[0], 0.0
     for i in range(p):
-        r = inlet[i, p]
+        v = r[i]
         for j in range(p):
-            a = inlet[i, j] if j >= i else 0.0
+            a = J[i, j] if j >= i else 0.0
             other[i, j] = a
             total += a
-            r += a * (point[j] - inlet[p, j])
-        other[i, p] = r
-        total += r
+            v += a * (point[j] - at[j])
+        other[i, p] = v
+        total += v
     if not math.isfinite(total):
         return False
     fold(T, other, s)
     return True
 
 
-@compiled
+@compiled(error_model="numpy")
 def weigh(T: Array, sides: Array, M: Array, X: Array, before: Array, out: Array) -> None:
     """Compare two sets of numbers on the evidence `T` (p, p + 1) held at the first of them.
 
