@@ -9,7 +9,7 @@ from scipy.stats import chi2, kstest
 
 from ambid.bearing.greybox import greybox
 from ambid.bearing.physical import agreement, physical_parameters
-from ambid.bearing.physical_response import physical_response
+from ambid.bearing.physical_target import physical_response
 from ambid.bearing.uncertainty import uncertainty
 from ambid.blackbox import structures
 from ambid.blackbox.data import IOData

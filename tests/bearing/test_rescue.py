@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ambid.bearing import rescue
-from ambid.bearing.global_start import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.greybox import greybox
+from ambid.bearing.rescue import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
@@ -186,4 +186,4 @@ def test_an_interruption_keeps_the_best_so_far(weak: Bench, before: Fit, monkeyp
     assert fit.global_search["interrupted"]
     assert fit.global_search["evaluations"] == 300
     assert fit.criterion <= before.criterion
-    assert "interrupted" in rescue.told(fit.global_search)
+    assert "interrupted" in rescue.describe_search(fit.global_search)

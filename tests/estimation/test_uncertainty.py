@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.hints import experiment_hint
-from ambid.bearing.uncertainty import uncertainty
+from ambid.bearing.uncertainty import experiment_hint, uncertainty
 from ambid.estimation.likelihood import search
 from ambid.estimation.linear import directions
 from ambid.estimation.uncertainty import WEAK

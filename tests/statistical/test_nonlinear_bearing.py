@@ -11,8 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from ambid.bearing.magnet.likelihood import search
-from ambid.bearing.magnet.uncertainty import uncertainty
+from ambid.bearing.magnet.likelihood import search, uncertainty
 from ambid.job.bearing_estimate import judged
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw

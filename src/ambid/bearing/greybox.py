@@ -3,7 +3,7 @@
 Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for
 stable and unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole
 samples and then as a real number; noise is described by disturbance and sensor levels, or by a free predictor gain
-where the data ask for it. Where the starts lead nowhere, a global search gives others (`ambid.bearing.global_start`).
+where the data ask for it. Where the starts lead nowhere, a global search gives others (`ambid.bearing.rescue`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.global_start import Rescue
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
-from ambid.bearing.rescue import EVALUATIONS, reason, rescued
+from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescued
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import stable
 from ambid.estimation.likelihood import Fit, score_statistic, search, workspace_near

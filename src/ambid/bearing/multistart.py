@@ -16,8 +16,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation import start as weak_form
 from ambid.estimation.likelihood import evaluate, search, with_linear_part
-from ambid.estimation.problem import PredictorProblem, Scales
-from ambid.estimation.scaling import noise_floor, scales_for
+from ambid.estimation.problem import PredictorProblem, Scales, noise_floor, scales_for
 from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter

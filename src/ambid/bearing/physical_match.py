@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.physical_response import physical_response
-from ambid.bearing.physical_target import Target
+from ambid.bearing.physical_target import Target, physical_response
 from ambid.errors import EstimationError
 from ambid.estimation.start import candidates
 from ambid.physics.linear_model import LinearModel

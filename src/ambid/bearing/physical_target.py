@@ -6,20 +6,21 @@ box knows at each frequency, and come with their whole covariance, whose rank is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from ambid.arrays import Array
-from ambid.bearing.physical_weight import point_weight
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import response_covariance
 from ambid.blackbox.polynomial_model import PolynomialModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.start import Moments
+from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import LinearModel
 
 Complex = NDArray[np.complex128]
@@ -28,6 +29,9 @@ _KNOWN = 0.3  # relative standard deviation up to which a point of the response 
 _RANK = 1e-7  # singular values below this part of the largest are rounding
 _POINTS = 160  # frequencies of the match, half of them in equal steps, half in equal ratios
 _LINES = 800  # frequencies of a start's regression
+Indices = NDArray[np.intp]
+_HATS = 14  # pieces of the weight in equal ratios, and as many in equal steps
+_SMOOTH = 0.02  # pull of every piece to zero beside the match of the information
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -217,3 +221,95 @@ def _moments(
     signals = {role: g[:, o, 0] for o, role in enumerate(model.outputs)}
     signals[model.inputs[0]] = entered * use
     return Moments(omega=omega, signals={role: (v, jw * v, jw**2 * v) for role, v in signals.items()})
+
+
+def physical_response(
+    model: LinearModel,
+    theta: Mapping[str, float],
+    omega: Array,
+    *,
+    dt: float | None,
+    delay_s: float = 0.0,
+    along: Sequence[str] = (),
+    with_delay: bool = False,
+) -> tuple[Complex, Complex]:
+    """Return G of a model at physical parameters, and its derivatives.
+
+    `theta`: every parameter, SI; `omega`: (n_frequencies,), rad/s; `dt`: sampling interval in s of the held input; None
+    for continuous time; `delay_s`: delay of the inputs, s; `along`: parameters by which derivatives are wanted;
+    `with_delay`: whether the derivative by the delay (per second) comes last. Returns `response`: (n_frequencies,
+    n_outputs, n_inputs), complex; `derivative`: (n_frequencies, n_outputs, n_inputs, n_along), complex, one more along
+    the last axis with `with_delay`.
+    """
+    space = model.matrices(theta)
+    slopes = [model.derivative(theta, name) for name in along]
+    if dt is None:
+        lag = np.exp(-1j * omega * delay_s)[:, None, None]
+        inner = _Resolvent(space.A, space.C, np.asarray(1j * omega, dtype=np.complex128))
+        found = inner.response(np.broadcast_to(space.B, (omega.size, *space.B.shape))) * lag
+        rows = [inner.slope(space.B, d.A, np.broadcast_to(d.B, (omega.size, *d.B.shape)), d.C) * lag for d in slopes]
+        if with_delay:
+            rows.append(-1j * omega[:, None, None] * found)
+        return found, _stacked(rows, found)
+    whole = int(np.floor(delay_s / dt + 1e-9))
+    fraction = max(0.0, delay_s / dt - whole)
+    discrete, directions = discretise(space, dt, fraction=fraction, derivatives=slopes)
+    z = np.exp(1j * omega * dt)
+    late, lag = (1 / z)[:, None, None], (z**-whole)[:, None, None]
+
+    def entered(d: DiscreteSpace) -> Complex:
+        return np.asarray(d.B + d.B_late * late)
+
+    inner, b = _Resolvent(discrete.A, discrete.C, z), entered(discrete)
+    rows = [inner.slope(b, d.A, entered(d), d.C) * lag for d in directions]
+    wanted = rows if with_delay else rows[: len(slopes)]
+    if with_delay:
+        wanted[-1] = wanted[-1] / dt
+    found = inner.response(b) * lag
+    return found, _stacked(wanted, found)
+
+
+class _Resolvent:
+    """C (p I - A)^-1 at points p, ready for many right-hand sides."""
+
+    def __init__(self, A: Array, C: Array, points: Complex) -> None:
+        self._inverse = np.linalg.inv(points[:, None, None] * np.eye(A.shape[0]) - A)
+        self._c = C
+
+    def response(self, b: Complex | Array) -> Complex:
+        return np.asarray(self._c @ self._inverse @ b)
+
+    def slope(self, b: Complex | Array, d_a: Array, d_b: Complex | Array, d_c: Array) -> Complex:
+        state = self._inverse @ b
+        return np.asarray(d_c @ state + self._c @ self._inverse @ (d_a @ state + d_b))
+
+
+def _stacked(rows: list[Complex], found: Complex) -> Complex:
+    return np.stack(rows, axis=-1) if rows else np.empty((*found.shape, 0), dtype=np.complex128)
+
+
+def point_weight(spread: Array, frequency: Indices, channel: Indices, omega: Array) -> Array:
+    """Return the weight of every point.
+
+    `spread`: (2 n_points, rank), half factor of the points' covariance, real parts first; full column rank;
+    `frequency`: (n_points,), place of each point in `omega`; `channel`: (n_points,), which way from input to output it
+    belongs to; `omega`: (n_frequencies,), rad/s, rising. Returns (n_points,), one over the unit of `spread` squared.
+    """
+    n, rank = spread.shape[0] // 2, spread.shape[1]
+    places = [np.linspace(scale[0], scale[-1], _HATS) for scale in (np.log(omega), omega)]
+    each = np.vstack(
+        [
+            [np.interp(scale, knots, one) for one in np.eye(_HATS)]
+            for scale, knots in zip((np.log(omega), omega), places, strict=True)
+        ]
+    )
+    hats = np.vstack([each[:, frequency] * (channel == c) for c in np.unique(channel)])
+    hats = hats[np.any(hats > 0, axis=1)]
+    i, j = np.triu_indices(rank)
+    pair = np.where(i == j, 1.0, np.sqrt(2.0))
+    points = (spread[:n, i] * spread[:n, j] + spread[n:, i] * spread[n:, j]) * pair
+    given = (hats @ points).T
+    size = np.linalg.norm(given, axis=0)
+    wanted = np.concatenate([(i == j).astype(np.float64), np.zeros(size.size)])
+    found = nnls(np.vstack([given / size, _SMOOTH * np.eye(size.size)]), wanted)[0]
+    return np.asarray((found / size) @ hats)

@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from ambid.bearing.magnet.likelihood import BearingFit
+    from ambid.bearing.magnet.likelihood import BearingFit, BearingUncertainty
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
-    from ambid.bearing.magnet.uncertainty import BearingUncertainty
     from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
     from ambid.validate.nonlinear_bearing import WhitenessTest
 
@@ -191,7 +190,7 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
     """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
-    from ambid.bearing.magnet.weight import weight_carried
+    from ambid.bearing.magnet.contact import weight_carried
     from ambid.estimation.estimate import Check
 
     law, values = fit.problem.law, fit.problem.values(fit.vector)
@@ -234,10 +233,10 @@ def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> 
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
     from ambid.bearing.magnet.rescue import RescuedFit
-    from ambid.bearing.rescue import told
+    from ambid.bearing.rescue import describe_search
 
     if isinstance(fit, RescuedFit):
-        found.append(told(fit.global_search))
+        found.append(describe_search(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(

@@ -170,11 +170,11 @@ def judged(
 
 def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
-    from ambid.bearing.rescue import told
+    from ambid.bearing.rescue import describe_search
 
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
     if fit.global_search is not None:
-        found.append(told(fit.global_search))
+        found.append(describe_search(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
@@ -284,7 +284,7 @@ def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBea
     `tick`: as `identify_nonlinear`.
     """
     from ambid.bearing.magnet.estimate import estimate_bearing
-    from ambid.bearing.magnet.uncertainty import uncertainty
+    from ambid.bearing.magnet.likelihood import uncertainty
     from ambid.job.bearing_estimate import judged as judged_bearing
     from ambid.job.bearing_records import laws_of, numbers_of
     from ambid.validate.nonlinear_bearing import validation

@@ -20,8 +20,8 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.global_search import STAGE, GlobalFound, global_search
 from ambid.estimation.linear import triangle_of
+from ambid.estimation.problem import noise_floor
 from ambid.estimation.progress import Tick, guessed, silent
-from ambid.estimation.scaling import noise_floor
 from ambid.estimation.search import search
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Scaled

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import gain_derivatives, predictor_gain
-from ambid.estimation.scaling import scales_for
+from ambid.estimation.problem import scales_for
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import LinearModel, StateSpace
 from ambid.recursive.estimator import as_blocks

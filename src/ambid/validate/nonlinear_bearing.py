@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.magnet.contact import weight_carried
 from ambid.bearing.magnet.likelihood import BearingFit, run, sweep
 from ambid.bearing.magnet.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.magnet.result import NonlinearBearingEstimate
-from ambid.bearing.magnet.weight import weight_carried
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of

@@ -23,9 +23,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.greybox import carry
-from ambid.bearing.hints import experiment_hint
 from ambid.bearing.multistart import MAX_DELAY
-from ambid.bearing.uncertainty import Uncertainty
+from ambid.bearing.uncertainty import Uncertainty, experiment_hint
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions

@@ -15,8 +15,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.likelihood import Fit, search, weight_of
-from ambid.estimation.problem import PredictorProblem
-from ambid.estimation.scaling import noise_floor, scales_for
+from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.estimation.threads import one_thread
 from ambid.nonlinear.fit import NonlinearFit

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.bearing.magnet.estimate import estimate_bearing
-from ambid.bearing.magnet.likelihood import criterion, search
+from ambid.bearing.magnet.likelihood import criterion, search, uncertainty
 from ambid.bearing.magnet.start import balance
-from ambid.bearing.magnet.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter

@@ -7,9 +7,8 @@ import pytest
 
 from ambid.bearing.magnet import rescue
 from ambid.bearing.magnet.estimate import estimate_bearing
-from ambid.bearing.magnet.global_start import bearing_cost, failure, global_problems
-from ambid.bearing.magnet.rescue import RescuedFit
-from ambid.bearing.magnet.uncertainty import uncertainty
+from ambid.bearing.magnet.likelihood import uncertainty
+from ambid.bearing.magnet.rescue import RescuedFit, bearing_cost, failure, global_problems
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset

@@ -13,10 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ambid.bearing.magnet.global_start import EVALUATIONS
 from ambid.bearing.magnet.likelihood import BearingFit, criterion, linearise, promise, search
 from ambid.bearing.magnet.problem import LEVELS, BearingProblem, BearingRecord, Number
-from ambid.bearing.magnet.rescue import rescued
+from ambid.bearing.magnet.rescue import EVALUATIONS, rescued
 from ambid.bearing.magnet.start import LinearStart, linear_start, start_numbers, with_noise
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions

@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 
 import numpy as np
 
-from ambid.bearing.magnet.global_start import bearing_cost, failure, global_problems
-from ambid.bearing.magnet.likelihood import BearingFit, criterion, search
+from ambid.arrays import Array
+from ambid.bearing.magnet.likelihood import BearingFit, criterion, run, search
 from ambid.bearing.magnet.problem import BearingProblem, BearingRecord
-from ambid.estimation.global_search import STAGE
-from ambid.estimation.progress import Tick
+from ambid.estimation.global_search import STAGE, global_search
+from ambid.estimation.problem import noise_floor
+from ambid.estimation.progress import Tick, silent
 
-_TRIED = 15  # iterations from each place found
+_ITERATIONS = 15  # iterations from each place found
 _CHOICE = 2.0  # numbers' worth (BIC) by which a fit must be better: in noisy records delays and places nearly tie
 _EVEN = 0.5  # of the criterion: a fit with the same delay that has converged is taken where it is no worse
+EVALUATIONS = 800  # of the likelihood: one to three seconds
+FAR = 0.5  # part of the innovations' variance that a linear regression may explain before a fit counts as failed
+_PAST = 10  # samples of innovations and voltages that it looks at
+_LOOKED = 4096  # samples of each record that it looks at
+_SAMPLES = 4000  # of all records together, on which the global search compares
+_SHORTEST = 500  # samples of one record
+_WIDTH = 30.0  # factor about a start value
+_SHARE = 3.0  # factor about the strength that the weight says
+_LONGEST = 6  # samples of delay
+_FORCE, _VOLTAGE = (1e-4, 3.0), (3e-3, 3.0)  # noise levels, over what the sensors would show as such
+_TRIED = 4  # delays that are searched from
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,7 +75,7 @@ def rescued(
     began, cost = perf_counter(), bearing_cost(before, search_delay=search_delay)
     try:
         places = global_problems(cost, seed=seed, evaluations=evaluations, tick=told)
-        fits = [search(p, p.start(), iterations=_TRIED, tick=told) for p in places]
+        fits = [search(p, p.start(), iterations=_ITERATIONS, tick=told) for p in places]
         fits = [f for f in fits if f.status != "failed"]
         if fits:
             nearest = min(fits, key=lambda f: f.criterion)
@@ -106,3 +118,156 @@ def _better(after: BearingFit | None, before: BearingFit) -> bool:
     return (
         gain > -_EVEN and after.problem.delays == before.problem.delays and after.status == "converged" != before.status
     )
+
+
+def failure(fit: BearingFit) -> str:
+    """Return why a fit counts as failed.
+
+    Returns empty where it did not: it converged, or a linear regression on the past explains little of what it leaves.
+    """
+    if fit.status == "converged":
+        part = max(_unexplained(fit, r) for r in range(len(fit.problem.records)))
+        return f"a linear regression on the past explains {100 * part:.0f} % of the errors' variance" * (part > FAR)
+    return "no search converged"
+
+
+def _unexplained(fit: BearingFit, r: int) -> float:
+    """Part of the normalised errors' variance that a regression on past errors and voltages explains, by record."""
+    found = run(fit.problem, fit.vector, r)
+    if found is None:
+        return 1.0
+    e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
+    u, n = fit.problem.records[r].u[: e.shape[0], None], e.shape[0]
+    Z = np.hstack([*[x[_PAST - k : n - k] for x in (e, u) for k in range(1, _PAST + 1)], np.ones((n - _PAST, 1))])
+    sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(e[_PAST:]), axis=1)
+    Z, E = Z[sound], e[_PAST:][sound]
+    if E.shape[0] < 4 * Z.shape[1]:
+        return 0.0
+    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
+    left = np.sum((E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]) ** 2) / (E.shape[0] - Z.shape[1])
+    return 1.0 - float(left / (np.sum(E**2) / E.shape[0]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BearingCost:
+    """The likelihood of short records over numbers between 0 and 1."""
+
+    problem: BearingProblem  # delays whole and not in the vector; its numbers are the start values
+    names: tuple[str, ...]  # what is searched: numbers, ``"force"``, ``"voltage"`` (levels), ``"delay"``
+    # of each, in the logarithm (a single magnet's ``s`` and the delay: as they are; ``k`` or ``L_g`` of a magnet that
+    # carries a weight: over what the weight says)
+    bounds: tuple[tuple[float, float], ...]
+    weight: float  # that one magnet carries, N; 0 for a pair
+    # by delay in samples: least cost so far, and where it is; so that an interruption loses nothing
+    best: dict[int, tuple[float, tuple[float, ...]]] = field(default_factory=dict)
+
+    def __call__(self, z: Array) -> float:
+        """Return the criterion per measured value.
+
+        `z`: (n_names,). Returns infinite where there is no predictor.
+        """
+        problem = self.at(z)
+        if problem is None:
+            return np.inf
+        with np.errstate(all="ignore"):
+            value = criterion(problem, problem.start()) / problem.n_used
+        delay = int(next(iter(problem.delays.values())))
+        if np.isfinite(value):
+            self.best[delay] = min(self.best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
+        return value
+
+    def found(self) -> list[BearingProblem]:
+        """Return the problems at the best vectors that were evaluated, of a few delays, best first."""
+        places = [self.at(np.array(z)) for _, z in sorted(self.best.values())[:_TRIED]]
+        return [p for p in places if p is not None]
+
+    def at(self, z: Array) -> BearingProblem | None:
+        """Return the problem whose start lies at a vector.
+
+        `z`: (n_names,). Returns none where the gap would close.
+        """
+        low, high = np.array(self.bounds).T
+        told = dict(zip(self.names, (low + z * (high - low)).tolist(), strict=True))
+        problem = self.problem
+        values = {n.name: n.value for n in problem.numbers}
+        values |= {k: v if k == "s" and not problem.law.pair else np.exp(v) for k, v in told.items() if k in values}
+        free = [r for r in problem.records if not r.held]
+        x, i, u = (float(np.mean(np.concatenate(c))) for c in zip(*((*r.kept.T, r.u) for r in free), strict=True))
+        if self.weight:
+            first, second = problem.law.names[:2]
+            length = values[second]
+            if problem.law.gap == "exponential":
+                said = 2.0 * self.weight * length * np.exp(x / length) / i**2
+            else:
+                if length + min(float(r.kept[:, 0].min()) for r in free) <= 0.0:
+                    return None
+                said = 2.0 * self.weight * (length + x) ** 2 / i**2
+            values[first] = said * values[first] if first in told else values[first]
+        estimated = {n.name for n in problem.estimated}
+        if "v_offset" in estimated:
+            values["v_offset"] = u - values["R"] * i
+        if not all(np.isfinite(v) for v in values.values()):
+            return None
+        centre = _levels(problem, values, np.exp(told["force"]), np.exp(told["voltage"]))
+        delays = problem.delays
+        if "delay" in told:
+            rate = free[0].rate_hz
+            whole = float(min(int(told["delay"]), _LONGEST))
+            delays = {r: whole / rate * r for r in delays} | {rate: whole}
+        numbers = tuple(replace(n, value=float(values[n.name])) if n.estimated else n for n in problem.numbers)
+        return replace(problem, numbers=numbers, noise_center=centre, delays=delays)
+
+
+def _levels(problem: BearingProblem, values: dict[str, float], force: float, voltage: float) -> Array:
+    """Noise levels of each record, from what its sensors' roughness says (as `with_noise` has them)."""
+    centre = np.zeros((len(problem.records), 5))
+    for r, record in enumerate(problem.records):
+        floor, rate = np.log(noise_floor(record.kept)), record.rate_hz
+        push = floor[0] + np.log(values["m"] * rate**2 * force)
+        centre[r] = [*floor, push, floor[1] + np.log(values["L_leak"] * rate * voltage), push - np.log(30.0)]
+    return centre
+
+
+def bearing_cost(fit: BearingFit, *, search_delay: bool) -> BearingCost:
+    """Set up what is searched globally, about the start values of a fit.
+
+    `fit`: of all records; its problem's numbers are the start values.
+    """
+    old = fit.problem
+    count = max(_SAMPLES // len(old.records), _SHORTEST)
+    whole = {r: float(round(d)) for r, d in old.delays.items()} if search_delay else old.delays
+    problem = replace(
+        old, records=tuple(r.first(count) for r in old.records), delays=whole, free_delay=frozenset(),
+        skip=max(old.skip, _LONGEST + 8),
+    )  # fmt: skip
+    values = {n.name: n.value for n in problem.numbers}
+    weight = 0.0 if problem.law.pair else values["m"] * values["g"]
+    names: list[str] = ["force", "voltage"]
+    bounds = [(np.log(_FORCE[0]), np.log(_FORCE[1])), (np.log(_VOLTAGE[0]), np.log(_VOLTAGE[1]))]
+    distance = np.concatenate([r.kept[:, 0] for r in problem.records if not r.held])
+    for n in problem.estimated:
+        if n.signed and not (n.name == "s" and not problem.law.pair):
+            continue  # offsets and differences: small, and found by what follows
+        names.append(n.name)
+        if n.name == "s" and n.signed:
+            bounds.append((-0.9 * float(distance.min()), 3.0 * float(np.mean(distance))))
+        elif weight and n.name == problem.law.names[0]:
+            bounds.append((-np.log(_SHARE), np.log(_SHARE)))
+        else:
+            width = np.log(_WIDTH) if not np.isfinite(n.prior_sd) else 4.0 * n.prior_sd / abs(n.value)
+            width = min(width, np.log(_WIDTH))
+            bounds.append((np.log(n.value) - width, np.log(n.value) + width))
+    if search_delay:
+        names.append("delay")
+        bounds.append((0.0, _LONGEST + 1.0))
+    return BearingCost(problem=problem, names=tuple(names), bounds=tuple(bounds), weight=weight)
+
+
+def global_problems(cost: BearingCost, *, seed: int, evaluations: int, tick: Tick = silent) -> list[BearingProblem]:
+    """Search globally for problems whose start values are better.
+
+    `evaluations`: at most. Returns of the short records, the best of each of a few delays, best first.
+    """
+    n = len(cost.names)
+    global_search(cost, np.zeros(n), np.ones(n), seed=[seed, 7], evaluations=evaluations, tick=tick, stage=STAGE)
+    return cost.found()

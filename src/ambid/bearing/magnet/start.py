@@ -21,7 +21,7 @@ from ambid.bearing.rescue import EVALUATIONS
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
-from ambid.estimation.scaling import noise_floor
+from ambid.estimation.problem import noise_floor
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.one_axis import OneAxis
 from ambid.physics.parameters import Parameter
