@@ -28,7 +28,6 @@ FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
-_SHORTLY, _NEARLY = 8, 0.1  # steps of such a search, and squared standard deviations to the end that do
 _KEPT = 6  # candidates scored on the whole record
 _RACE = 3  # candidates searched a little way
 _CLOSE = 0.5  # difference of the criterion per sample within which candidates race
@@ -100,7 +99,7 @@ def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
     problem, vector = candidate.problem, candidate.vector
     stretch = busiest(problem.u, _SHORT)
     part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-    fit = search(part, at_first_sample(part, vector), most=_SHORTLY, settled=_NEARLY, tick=tick)
+    fit = search(part, at_first_sample(part, vector), rounds=3, tick=tick)
     moved = at_first_sample(problem, fit.vector)
     # noise levels move slowly on a logarithmic scale: look again where they stand best
     work = candidate.work.of(problem) if candidate.work else Workspace(problem)

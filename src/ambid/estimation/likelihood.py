@@ -1,7 +1,7 @@
 """Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2).
 
-The determinant of the innovation covariance is minimised by damped Gauss-Newton steps with exact Jacobians; each is
-that of the least-squares problem weighted by the innovation covariance at the vector where it begins.
+The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given
+to SciPy's trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import directions, least_squares, triangle_of
+from ambid.estimation.linear import BLIND, directions, least_squares, triangle_of
 from ambid.estimation.problem import PredictorProblem
 from ambid.estimation.search import Status
-from ambid.estimation.search import search as damped_search
-from ambid.estimation.sensitivity import Linearisation, Workspace, innovations, linearise
+from ambid.estimation.sensitivity import Workspace, innovations, linearise
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
-_MOST = 60  # steps of a search
-_SETTLED = 1e-5  # squared length of a step in standard deviations below which a search has converged
+_ROUNDS = 20  # of reweighting by the innovation covariance
+_EVALUATIONS = 10  # of the residual in one round
+_SETTLED = 0.03  # Newton step of every physical parameter, in standard deviations, below which a search has converged
+_FLAT = 0.1  # fall of the criterion in one round below which a search has converged; a needless number earns one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,47 +173,72 @@ def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) 
     return out
 
 
+def _step_left(J: Array, r: Array, n_physical: int) -> float:
+    """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
+    found = directions(J)
+    half = found.root(BLIND)
+    ratio = np.abs(half @ (found.U.T @ r)) / np.linalg.norm(half, axis=1)
+    return float(np.max(ratio[: n_physical or None]))
+
+
 def search(
     problem: PredictorProblem,
     start: Array,
     *,
-    most: int = _MOST,
-    settled: float = _SETTLED,
+    rounds: int = _ROUNDS,
+    evaluations: int = _EVALUATIONS,
     tick: Callable[[], None] | None = None,
     work: Workspace | None = None,
 ) -> Fit:
     """Minimise the likelihood criterion from `start`.
 
-    `start`: (size,); `most`: steps, at most; `settled`: squared length of a step in standard deviations
-    below which it has converged; `tick`: called after each evaluation (progress, interruption); `work`: of
-    this problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor at `start`.
+    `start`: (size,); `rounds`, `evaluations`: bounds on reweightings, and on residual evaluations in each; `tick`:
+    called after each evaluation (progress, interruption); `work`: of this problem, or of one with the same data.
+    Returns with status ``"failed"`` where there is no predictor at `start`.
     """
+    from scipy.optimize import least_squares
+
     work = Workspace(problem) if work is None else work.of(problem)
     vector = with_linear_part(problem, start, work)
-    target = _Likelihood(problem, work, tick)
-    found = damped_search(
-        target,
-        vector,
-        most=most,
-        tolerance=0.0,
-        settled=settled,
-        wanted=slice(0, problem.n_physical or None),
-        damping=1e-4,
-    )
-    at = target.linearisation(found.theta) if np.isfinite(found.cost) else None
+    value, covariance = evaluate(problem, vector, work)
+    if covariance is None:
+        return _failed(problem, start)
+    target = _Weighted(problem, work, tick)
+    status: Status = "stalled"
+    count = 1
+    for _ in range(rounds):
+        target.reweigh(weight_of(covariance))
+        if not np.all(np.isfinite(target.residual(vector))):  # innovations exist, their sensitivities overflow
+            return _failed(problem, start)
+        # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
+        small = 4e-3 / (problem.n_used * problem.y.shape[1])
+        found = least_squares(
+            target.residual, vector, jac=target.jacobian, method="trf", x_scale="jac",
+            ftol=small, xtol=1e-12, gtol=1e-14, max_nfev=evaluations,
+        )  # fmt: skip
+        count += found.nfev
+        before, vector = value, found.x
+        J = target.jacobian(vector)
+        r, covariance = target.r, target.covariance
+        value = criterion(problem, vector, covariance)
+        # the covariance moved since r was weighted: that changes the step only to second order
+        if before - value < _FLAT and _step_left(J, r, problem.n_physical) < _SETTLED:
+            status = "converged"
+            break
+    at = linearise(problem, vector, weight_of(covariance), work)
     if at is None:
         return _failed(problem, start)
-    r_prior, J_prior = prior_rows(problem, found.theta)
+    r_prior, J_prior = prior_rows(problem, vector)
     return Fit(
         problem=problem,
-        vector=found.theta,
-        covariance=at.covariance,
+        vector=vector,
+        covariance=covariance,
         J=at.J,
         J_prior=J_prior,
         r_prior=r_prior,
-        criterion=found.cost,
-        status=found.status,
-        evaluations=target.evaluations,
+        criterion=value,
+        status=status,
+        evaluations=count,
         work=work,
     )
 
@@ -225,38 +251,34 @@ def _failed(problem: PredictorProblem, start: Array) -> Fit:
     )  # fmt: skip
 
 
-class _Likelihood:
-    """The criterion n log det S + priors and its triangle: J'J is the information matrix, -J'r half the gradient."""
+class _Weighted:
+    """Residual and Jacobian as SciPy's optimiser asks for them: one evaluation serves both."""
 
     def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
         self.problem, self.work, self.tick = problem, work, tick
-        self.evaluations = 0
-        self._at = np.full(problem.size, np.nan)  # where `_covariance` belongs to
-        self._covariance: Array | None = None
-        self._linear: tuple[Array, Linearisation | None] = (self._at, None)
+        self.weight = np.eye(problem.y.shape[1])
+        self.at = np.full(self.problem.size, np.nan)
+        self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
 
-    def cost(self, vector: Array) -> float:
-        self.evaluations += 1
+    def reweigh(self, weight: Array) -> None:
+        self.weight = weight
+        self.at = np.full(self.problem.size, np.nan)
+
+    def residual(self, vector: Array) -> Array:
+        if np.array_equal(self.at, vector):  # once more would begin from another gain, and may find no predictor
+            return self.r
+        prior, J_prior = prior_rows(self.problem, vector)
+        result = linearise(self.problem, vector, self.weight, self.work)
         if self.tick is not None:
             self.tick()
-        value, covariance = evaluate(self.problem, vector, self.work)
-        self._at, self._covariance = vector.copy(), covariance
-        return value
+        if result is None:  # infinite: the trust region shrinks
+            return np.full(self.problem.size + 1 + prior.size, np.inf)
+        self.at = vector.copy()
+        self.r, self.J = np.concatenate([result.r, prior]), np.vstack([result.J, J_prior])
+        self.covariance = result.covariance
+        return self.r
 
-    def triangle(self, vector: Array) -> Array:
-        at = self.linearisation(vector)
-        if at is None:
-            return np.full((1, vector.size + 1), np.inf)
-        r, J = prior_rows(self.problem, vector)
-        return np.vstack([np.column_stack([at.J, -at.r]), np.column_stack([J, -r])])
-
-    def linearisation(self, vector: Array) -> Linearisation | None:
-        """Innovations and Jacobian, weighted by the innovation covariance at the same vector; made once for each."""
-        if not np.array_equal(self._linear[0], vector):
-            if not np.array_equal(self._at, vector):
-                self.cost(vector)
-            at = None
-            if self._covariance is not None:
-                at = linearise(self.problem, vector, weight_of(self._covariance), self.work)
-            self._linear = (vector.copy(), at)
-        return self._linear[1]
+    def jacobian(self, vector: Array) -> Array:
+        if not np.array_equal(self.at, vector):
+            self.residual(vector)
+        return self.J
