@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     __version__: str
     from ambid.errors import AmbidError as AmbidError
     from ambid.estimation.estimate import Estimate as Estimate
-    from ambid.estimation.estimate_file import estimate_from_json as estimate_from_json
+    from ambid.estimation.estimate import estimate_from_json as estimate_from_json
     from ambid.physics.models import model as model
     from ambid.physics.models import model_names as model_names
     from ambid.physics.presets import preset as preset

@@ -16,8 +16,7 @@ from ambid.bearing.greybox import greybox
 from ambid.bearing.rescue import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
-from ambid.estimation.estimate_file import estimate_from_json
+from ambid.estimation.estimate import Estimate, estimate_from_json
 from ambid.estimation.likelihood import Fit
 from ambid.job import identify
 from ambid.record import Channel, Record

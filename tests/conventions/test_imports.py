@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.conventions.import_rules import RANK, violations
+from tests.conventions.import_rules import RANK, circles, imported_names, violations
 from tests.conventions.sources import ROOT, module_name, package_files, parsed, rooms, shown
 
 
@@ -13,6 +13,24 @@ def test_every_import_points_downward():
         for violation in violations(parsed(path), module_name(path), is_package=path.name == "__init__.py")
     ]
     assert not found, "\n" + "\n".join(found)
+
+
+def test_no_files_import_each_other_in_a_circle():
+    files = {module_name(path): path for path in package_files()}
+    imports = {}
+    for module, path in files.items():
+        names = (name for _, name in imported_names(parsed(path), module, is_package=path.name == "__init__.py"))
+        homes = {name if name in files else name.rpartition(".")[0] for name in names}
+        imports[module] = {home for home in homes if home in files and home != module}
+    lazy = {module for module in files if "exports(__name__)" in files[module].read_text(encoding="utf-8")}
+    for module in lazy:
+        imports[module] = set()  # what a room exports is imported when it is first used, not with the room
+    assert circles(imports) == []
+
+
+def test_a_circle_is_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+    assert circles({"a": {"b"}, "b": set()}) == []
 
 
 def test_every_room_stands_in_a_tier_and_on_the_map():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate_file import estimate_from_json, estimate_text, estimate_to_json
+from ambid.estimation.estimate import estimate_from_json, estimate_text, estimate_to_json
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.estimation.estimate_file import estimate_to_json
+from ambid.estimation.estimate import estimate_to_json
 from ambid.job import identify, track
 from ambid.physics.presets import preset
 from ambid.record import Record, write_record

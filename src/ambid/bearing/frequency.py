@@ -19,8 +19,9 @@ from ambid.arrays import Array
 from ambid.blackbox.frequency_lines import Lines, check_lines
 from ambid.errors import EstimationError, nearest
 from ambid.estimation import start as weak_form
-from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, parameter_named
+from ambid.estimation.estimate import Continuous
 from ambid.estimation.linear import directions
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, parameter_named
 from ambid.estimation.threads import one_thread
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.discretise import discretise

@@ -9,8 +9,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.uncertainty import Uncertainty
-from ambid.estimation.estimate import Check, Continuous, Delay, Estimate, EstimatedParameter, NoiseModel, OutputFit
+from ambid.estimation.estimate import Continuous, Estimate, NoiseModel
 from ambid.estimation.likelihood import Fit
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.predictor import Predictor, assemble
 from ambid.physics.parameters import Parameter
 

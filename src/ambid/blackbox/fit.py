@@ -15,7 +15,7 @@ from ambid.blackbox.model import BlackBoxModel
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check, OutputFit
+from ambid.estimation.parts import Check, OutputFit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

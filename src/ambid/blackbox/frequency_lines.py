@@ -19,7 +19,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import BlackBoxModel
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check
+from ambid.estimation.parts import Check
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import NoReturn, TextIO
 
-INTERRUPTED = 130
+from ambid.cli.interrupts import INTERRUPTED
+
 BROKEN_PIPE = 141
 
 

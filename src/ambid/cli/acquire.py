@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from ambid.cli import INTERRUPTED
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, course_mode, opened
-from ambid.cli.interrupts import Stop, signals
+from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import FAILED_CHECK, LARGEST, band_of, check_positive, json_path, option, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, watching

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli import INTERRUPTED
 from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
-from ambid.cli.interrupts import Stop, signals
+from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import FAILED_CHECK, band_of, check_positive, option, switch
 from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError

@@ -22,7 +22,7 @@ from ambid.errors import AmbidError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ambid.estimation.estimate import EstimatedParameter
+    from ambid.estimation.parts import EstimatedParameter
     from ambid.report.text import Paint
     from ambid.simulate import Simulation
 

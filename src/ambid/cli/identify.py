@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.cli import INTERRUPTED
-from ambid.cli.interrupts import Stop, interruptible, signals
+from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
 from ambid.cli.options import (
     FAILED_CHECK,
     FIGURE_ENDINGS,

@@ -10,6 +10,8 @@ from types import FrameType
 
 from ambid.estimation.progress import Tick
 
+INTERRUPTED = 130  # exit code
+
 
 @contextmanager
 def signals(take: Callable[[int], None]) -> Iterator[None]:

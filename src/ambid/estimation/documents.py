@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 import numpy as np
 
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter
+from ambid.estimation.parts import Check, Delay, EstimatedParameter
 
 T = TypeVar("T")
 

@@ -2,60 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstimatedParameter:
-    """One parameter as it came out."""
-
-    name: str  # name and SI unit
-    unit: str
-    value: float  # SI; `sd` is 0 for a fixed parameter
-    sd: float
-    ci95: tuple[float, float]  # 95 % interval, value -+ 1.96 sd
-    role: Literal["free", "fixed", "prior"]
-    # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
-    identifiable: bool
-    data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Delay:
-    """Delay of an input: `samples` whole periods and a `fraction` of one."""
-
-    samples: int
-    fraction: float  # 0 <= fraction < 1
-    sd: float | None  # standard deviation of samples + fraction, where it was estimated as a real number
-    how: Literal["estimated", "given"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
-    """Outcome of one check."""
-
-    passed: bool
-    detail: str  # one line for people: what was looked at, what was found, what to do
-    p: float | None = None  # probability of a result at least as extreme if the model is right
-    values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # further numbers
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputFit:
-    """How well one output is predicted: 1 - |e| / |y - mean|, 1 is perfect."""
-
-    one_step: float  # from all samples before
-    simulation: float | None  # from the input alone; None where the plant is unstable in open loop
-    innovation_sd: float  # SI
+from ambid.estimation.documents import (
+    check_schema,
+    covariance_apart,
+    covariance_together,
+    fields_json,
+    json_text,
+    read_as,
+    read_whole,
+)
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit, parameter_named
+from ambid.physics.models import model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,17 +142,79 @@ class Estimate:
         -------
         str
         """
-        from ambid.estimation.estimate_file import estimate_text
-
         return estimate_text(self)
 
 
-def parameter_named(parameters: Sequence[EstimatedParameter], name: str) -> EstimatedParameter:
-    """Return one of several parameters."""
-    for p in parameters:
-        if p.name == name:
-            return p
-    names = [p.name for p in parameters]
-    raise EstimationError(
-        f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
-    )
+SCHEMA = "ambid.estimate/1"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """Return the JSON text of an estimate."""
+    return json_text(estimate_to_json(estimate))
+
+
+def estimate_to_json(estimate: Estimate) -> dict[str, Any]:
+    """Return an estimate in the form of schema ``ambid.estimate/1``: SI values, JSON numbers only.
+
+    Parameters
+    ----------
+    estimate : Estimate
+
+    Returns
+    -------
+    dict
+    """
+    return {"schema": SCHEMA, **covariance_together(fields_json(estimate))}
+
+
+def estimate_from_json(document: Mapping[str, Any], where: str) -> Estimate:
+    """Read an estimate back.
+
+    Parameters
+    ----------
+    document : Mapping
+        Parsed JSON of schema ``ambid.estimate/1``.
+    where : str
+        Name of the file, for messages.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    EstimationError
+        If the document is not an estimate, or lacks an entry.
+    """
+    check_schema(document, SCHEMA, where, "an estimate", "identify")
+
+    def read() -> Estimate:
+        estimate = read_as(Estimate, covariance_apart(document))
+        _check_consistent(estimate)
+        return estimate
+
+    return read_whole(read, where, "estimate", "identify")
+
+
+def _check_consistent(estimate: Estimate) -> None:
+    """Raise ValueError where the parts do not belong together: an edited file, or one of another program."""
+    plant = model(estimate.model)
+    specs = {p.name: p for p in plant.parameters}
+    n, n_y = len(plant.states), len(plant.outputs)
+    if [p.name for p in estimate.parameters] != list(specs):
+        raise ValueError(f"the parameters are not those of model {estimate.model!r}")
+    for p in estimate.parameters:
+        if p.unit != specs[p.name].unit:
+            raise ValueError(f"{p.name} is in {p.unit!r} instead of {specs[p.name].unit!r}")
+        if not 1e-15 < abs(p.value) < 1e15 and (p.name in ("m", "L") or p.value != 0):
+            raise ValueError(f"{p.name} = {p.value:g} is no number that a plant can have")
+    if estimate.noise.gain.shape != (n, n_y) or estimate.noise.innovation_covariance.shape != (n_y, n_y):
+        raise ValueError("the noise model is not of the model's size")
+    size = len(estimate.covariance_names)
+    if set(estimate.covariance_names) - set(specs) or estimate.covariance.shape != (size, size):
+        raise ValueError("the covariance is not of the parameters")
+    if not float(str(estimate.record["rate_hz"])) > 0 or estimate.status not in ("converged", "stalled"):
+        raise ValueError("the record's rate or the status is not that of a finished estimate")
+    for delay in (estimate.delay[role] for role in plant.inputs):
+        if not 0 <= delay.samples < 10**6 or not 0 <= delay.fraction < 1:
+            raise ValueError("the delay is not whole samples and a fraction")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from ambid.bearing.magnet.likelihood import BearingFit, BearingUncertainty
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
-    from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+    from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
     from ambid.validate.nonlinear_bearing import WhitenessTest
 
 _P_LEAST = 1e-3  # as for the linear model
@@ -75,7 +75,7 @@ def judged(
 
 def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
     """One-step errors against their own past and against past voltages: a check passes where every record does."""
-    from ambid.estimation.estimate import Check
+    from ambid.estimation.parts import Check
 
     against = {
         "residuals_white": ("their past", [t.p_own for t in tests]),
@@ -97,7 +97,7 @@ def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
     import math
 
-    from ambid.estimation.estimate import Delay
+    from ambid.estimation.parts import Delay
 
     found = {}
     for rate in fit.problem.delays:
@@ -112,7 +112,7 @@ def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[
 def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
     import math
 
-    from ambid.estimation.estimate import OutputFit
+    from ambid.estimation.parts import OutputFit
 
     found: dict[str, dict[str, OutputFit]] = {}
     for name, record, test in zip(names, fit.problem.records, tests, strict=True):
@@ -142,7 +142,7 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
     import numpy as np
 
     from ambid.bearing.magnet.problem import UNITS
-    from ambid.estimation.estimate import EstimatedParameter
+    from ambid.estimation.parts import EstimatedParameter
     from ambid.estimation.uncertainty import WEAK
 
     law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
@@ -178,7 +178,7 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
-    from ambid.estimation.estimate import Check
+    from ambid.estimation.parts import Check
 
     hidden = [p.name for p in parameters if not p.identifiable]
     detail = "the records show every number" if not hidden else (
@@ -191,7 +191,7 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 def _gravity(fit: BearingFit) -> dict[str, Check]:
     """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
     from ambid.bearing.magnet.contact import weight_carried
-    from ambid.estimation.estimate import Check
+    from ambid.estimation.parts import Check
 
     law, values = fit.problem.law, fit.problem.values(fit.vector)
     weight = values["m"] * values["g"]

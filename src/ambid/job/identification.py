@@ -20,8 +20,9 @@ from ambid.rig import Rig
 if TYPE_CHECKING:
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
     from ambid.bearing.uncertainty import Uncertainty
-    from ambid.estimation.estimate import Check, Estimate
+    from ambid.estimation.estimate import Estimate
     from ambid.estimation.likelihood import Fit
+    from ambid.estimation.parts import Check
     from ambid.job.bearing_records import MagnetWords, TakenRecord
     from ambid.report.figures import BearingEvidence, Evidence
 

@@ -39,8 +39,8 @@ def read_estimate(path: str | Path) -> AnyEstimate | AnyFit:
         If the file cannot be read, or is no whole result.
     """
     from ambid.blackbox.fit_file import SCHEMA, fit_from_json
-    from ambid.estimation.estimate_file import SCHEMA as ESTIMATE
-    from ambid.estimation.estimate_file import estimate_from_json
+    from ambid.estimation.estimate import SCHEMA as ESTIMATE
+    from ambid.estimation.estimate import estimate_from_json
     from ambid.record.files import file_bytes, utf8_text
 
     path = Path(path)
@@ -66,7 +66,7 @@ def read_estimate(path: str | Path) -> AnyEstimate | AnyFit:
             return nonlinear_fit_from_json(document, f"fit {path}")
         return fit_from_json(document, f"fit {path}")
     if schema == ESTIMATE and "law" in document:
-        from ambid.bearing.magnet.result_file import bearing_from_json
+        from ambid.bearing.magnet.result import bearing_from_json
 
         return bearing_from_json(document, f"estimate {path}")
     return estimate_from_json(document, f"estimate {path}")

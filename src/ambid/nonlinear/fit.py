@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Check, OutputFit
+from ambid.estimation.parts import Check, OutputFit
 from ambid.nonlinear.model import NonlinearModel
 
 Settings = Mapping[str, int | float | str | tuple[int, ...]]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Check, Estimate, EstimatedParameter
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.parts import Check, EstimatedParameter
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.models import model
 from ambid.report.drawing import save

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.report.numbers import Quantity, quantity, sized
 
 Style = Literal["good", "bad", "dim", "strong"]

@@ -27,8 +27,8 @@ from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.structures import structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.estimation.criteria import criteria, skipped
-from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
+from ambid.estimation.parts import Check
 from ambid.validate.blackbox_predictor import Errors, Gradient, errors, errors_elsewhere, gradient
 from ambid.validate.residuals import (
     LEAST,

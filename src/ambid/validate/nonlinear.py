@@ -13,7 +13,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria, skipped
-from ambid.estimation.estimate import Check
+from ambid.estimation.parts import Check
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.model import NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure

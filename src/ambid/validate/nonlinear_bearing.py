@@ -13,7 +13,7 @@ from ambid.bearing.magnet.likelihood import BearingFit, run, sweep
 from ambid.bearing.magnet.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.magnet.result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check
+from ambid.estimation.parts import Check
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
 
 _ROLES = ("position", "current")

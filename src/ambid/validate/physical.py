@@ -25,9 +25,9 @@ from ambid.arrays import Array
 from ambid.bearing.greybox import carry
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import Uncertainty, experiment_hint
-from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
+from ambid.estimation.parts import Check
 from ambid.estimation.predictor import Predictor, assemble
 from ambid.estimation.sensitivity import Products, Workspace, innovations, products, run
 from ambid.physics.linear_model import LinearModel

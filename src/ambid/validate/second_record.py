@@ -13,8 +13,9 @@ from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.estimate import Estimate
 from ambid.estimation.likelihood import Fit, search, weight_of
+from ambid.estimation.parts import Check
 from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.estimation.threads import one_thread
