@@ -2,7 +2,7 @@
 
 import pytest
 
-from ambid.acquire.causes import fault_words
+from ambid.acquire.default_daq import fault_words
 from ambid.acquire.device import DeviceEvent, Program
 from ambid.acquire.protocol.table import table
 from ambid.acquire.session import Course, run

@@ -12,7 +12,7 @@ from io import FileIO
 
 import pytest
 
-from ambid.acquire.causes import fault_words
+from ambid.acquire.default_daq import fault_words
 from ambid.acquire.device import DeviceEvent
 from ambid.cli import _Told
 from ambid.cli.interrupts import Stop, signals

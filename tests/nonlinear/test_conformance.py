@@ -12,9 +12,14 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.fit_file import nonlinear_fit_from_json, nonlinear_fit_text
+from ambid.nonlinear.fit_file import (
+    MODEL_KINDS,
+    model_from_json,
+    model_to_json,
+    nonlinear_fit_from_json,
+    nonlinear_fit_text,
+)
 from ambid.nonlinear.model import NonlinearModel
-from ambid.nonlinear.model_file import MODEL_KINDS, model_from_json, model_to_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, NonlinearStructure, nonlinear_structure
 from tests.nonlinear.systems import SETTINGS, runaway, smooth
 

@@ -10,9 +10,9 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.nonlinear.cloud import cloud_of
+from ambid.nonlinear.fit_file import model_from_json, model_to_json
 from ambid.nonlinear.lagged import UNITS, Block, LaggedFunction, LaggedModel, Regressors, Rows, Terms, lags
 from ambid.nonlinear.lagged_problem import problem_at
-from ambid.nonlinear.model_file import model_from_json, model_to_json
 from ambid.nonlinear.narx import NarxFunction
 from ambid.nonlinear.rbf_network import RbfFunction
 from tests.nonlinear.rbf.systems import network

@@ -16,7 +16,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 
 LIMIT = (
     "limit of the three blocks: the mass is normalised to 1, so that only ratios to the mass are found (N/A, N/m per "

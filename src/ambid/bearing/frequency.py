@@ -20,9 +20,8 @@ from ambid.blackbox.frequency_lines import Lines, check_lines
 from ambid.errors import EstimationError, nearest
 from ambid.estimation import start as weak_form
 from ambid.estimation.estimate import Continuous
-from ambid.estimation.linear import directions
+from ambid.estimation.linear import directions, one_thread
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, parameter_named
-from ambid.estimation.threads import one_thread
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel

@@ -21,10 +21,10 @@ from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescued
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import stable
 from ambid.estimation.likelihood import Fit, score_statistic, search, workspace_near
+from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.estimation.problem import PredictorProblem
 from ambid.estimation.sensitivity import Workspace
-from ambid.estimation.threads import one_thread
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 

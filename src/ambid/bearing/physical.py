@@ -19,8 +19,8 @@ from ambid.bearing.physical_match import Match, Spread, matched, spread
 from ambid.bearing.physical_target import Target, target_of
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
+from ambid.estimation.linear import one_thread
 from ambid.estimation.parts import Check, Delay, EstimatedParameter
-from ambid.estimation.threads import one_thread
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter

@@ -25,7 +25,7 @@ from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_line
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]

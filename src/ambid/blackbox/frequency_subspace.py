@@ -26,7 +26,7 @@ from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_line
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import StateSpace
 from ambid.signals.response import FrequencyResponse

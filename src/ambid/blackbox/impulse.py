@@ -27,7 +27,7 @@ from ambid.blackbox.instruments import autoregression
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 from ambid.signals.delay import lagged_triangle
 
 Kernel = Literal["tc", "dc", "ss"]

@@ -35,7 +35,7 @@ from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 
 _NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
 _NO_AVERAGE = np.ones(1)

@@ -40,7 +40,7 @@ from ambid.blackbox.instruments import (
 from ambid.blackbox.response import Numbers, Offsets, Responses, companion, filter_states, free_response, responses
 from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 from ambid.physics.discretise import zero_order_hold
 
 WHITE = Autoregression(D=np.ones(1), variance=1.0)

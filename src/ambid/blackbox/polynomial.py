@@ -33,7 +33,7 @@ from ambid.blackbox.polynomial_search import (
 )
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 
 _CONTRACT = """{summary} (Ljung 1999, sec. 4.2), by prediction error, each output by itself.
 

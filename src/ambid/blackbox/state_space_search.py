@@ -26,8 +26,7 @@ from ambid.blackbox.subspace import FirstModel, Method, embed_delays, first_mode
 from ambid.blackbox.subspace_projection import Realisation, kalman_gain, radius
 from ambid.errors import EstimationError
 from ambid.estimation.kernels import state_scan
-from ambid.estimation.linear import directions
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import directions, one_thread
 
 _DOUBLINGS = 24  # samples as a power of two
 _FAINT = 1e-10  # Hankel singular value beside the largest below which a state is not scaled further

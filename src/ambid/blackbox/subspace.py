@@ -46,7 +46,7 @@ from ambid.blackbox.subspace_projection import (
     triangular_factor,
 )
 from ambid.errors import EstimationError
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import one_thread
 
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
 

@@ -33,8 +33,7 @@ from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
 from ambid.errors import EstimationError
-from ambid.estimation.linear import directions
-from ambid.estimation.threads import one_thread
+from ambid.estimation.linear import directions, one_thread
 
 _OVERLAP = 7  # rows on half a support: closer ones say the same again, wider ones leave something out
 _SMOOTH = 13  # degree beyond the highest derivative: over 20 samples sums are then integrals to 1e-7

@@ -374,7 +374,7 @@ def finish(done: Acquired, wish: Wish, stop: Stop, *, strict: bool) -> None:
     stored = done.run.samples - done.not_stored - done.quality.repeated
     kept = f"{wish.record} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
     if done.run.fault is not None:
-        from ambid.acquire.causes import fault_words
+        from ambid.acquire.default_daq import fault_words
         from ambid.rig.rig import Daq
 
         rate_hz = done.info.rate_hz

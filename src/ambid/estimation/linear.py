@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,3 +123,23 @@ def information_inverse(R: Array) -> tuple[Array | None, float]:
         return None, found.condition
     inverse = found.inverse()
     return (inverse + inverse.T) / 2.0, found.condition
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep the linear algebra library to one thread inside a ``with`` block."""
+    libraries = _controller()
+    if all(x.num_threads == 1 for x in libraries.lib_controllers if x.user_api == "blas"):
+        yield  # so already, from the environment or a caller: setting it would take longer than a small fit's algebra
+        return
+    with libraries.limit(limits=1, user_api="blas"):
+        yield
+
+
+@cache
+def _controller() -> Any:
+    """Controller of the linear algebra libraries that NumPy and SciPy have loaded."""
+    import scipy.linalg  # noqa: F401  (SciPy brings a library of its own, which has to be there to be found)
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -225,7 +225,7 @@ def _run(
     say: Tick,
 ) -> BlackBoxFit | NonlinearFit:
     """Read the records, let the method estimate and judge, and keep the times."""
-    from ambid.estimation.threads import one_thread
+    from ambid.estimation.linear import one_thread
 
     if validate is None and parts[1] != (None, None):
         raise EstimationError(
@@ -311,7 +311,7 @@ def compare(
     AmbidError
         If the record, its channels or the orders break a rule.
     """
-    from ambid.estimation.threads import one_thread
+    from ambid.estimation.linear import one_thread
     from ambid.validate.comparison import compare as compare_fits
 
     for name, _ in candidates:

@@ -71,7 +71,7 @@ def identify(
     """
     from ambid.bearing.greybox import greybox
     from ambid.bearing.uncertainty import uncertainty
-    from ambid.estimation.threads import one_thread
+    from ambid.estimation.linear import one_thread
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
     bench = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)

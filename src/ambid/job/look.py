@@ -13,8 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ambid.acquire.causes import fault_words
-from ambid.acquire.default_daq import with_default_daq
+from ambid.acquire.default_daq import fault_words, with_default_daq
 from ambid.acquire.device import Device, Mode
 from ambid.acquire.program import program
 from ambid.acquire.scales import scale_of

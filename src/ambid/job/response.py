@@ -168,7 +168,7 @@ def _check(
 
 def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
     """Measure the response by the wanted method, in the wanted band."""
-    from ambid.estimation.threads import one_thread
+    from ambid.estimation.linear import one_thread
 
     r = data.reference if data.references else None
     if method == "auto":

@@ -16,7 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ambid.acquire.causes import fault_words
+from ambid.acquire.default_daq import fault_words
 from ambid.acquire.device import Device, DeviceEvent
 from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.acquire.view import BenchView

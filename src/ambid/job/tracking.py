@@ -16,8 +16,8 @@ import numpy as np
 
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
+from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.estimation.threads import one_thread
 from ambid.job.data import known_rig
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of
 from ambid.physics.models import model

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.blackbox.data import IOData
 from ambid.estimation.parts import Check, OutputFit
 from ambid.nonlinear.model import NonlinearModel
 
@@ -115,3 +116,47 @@ class NonlinearFit:
     def passed(self) -> bool:
         """Whether the search converged and every check passed."""
         return self.status == "converged" and all(c.passed for c in self.checks.values())
+
+
+NO_WEIGHTS = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
+"""Why the weights of a network that looks at measured signals alone come to nothing."""
+
+
+def provenance(records: Sequence[IOData]) -> dict[str, Any]:
+    """Return channels, units, rate and records, by the names that `NonlinearFit` has for them."""
+    first = records[0]
+    return {
+        "inputs": first.inputs,
+        "outputs": first.outputs,
+        "units": dict(first.units),
+        "dt": first.dt,
+        "records": tuple(dict(x.record) for x in records),
+    }
+
+
+def failed_fit(
+    structure: str,
+    records: Sequence[IOData],
+    settings: Mapping[str, object],
+    seed: int,
+    reason: str,
+    timing_s: Mapping[str, float],
+) -> NonlinearFit:
+    """Return a fit without a model.
+
+    `reason`: one line. Returns with status ``failed``.
+    """
+    p = records[0].n_outputs
+    return NonlinearFit(
+        structure=structure,
+        settings=dict(settings),
+        model=None,
+        covariance=None,
+        n_estimated=0,
+        noise_covariance=np.full((p, p), np.nan),
+        seed=seed,
+        status="failed",
+        reason=reason,
+        timing_s=dict(timing_s),
+        **provenance(records),
+    )

@@ -20,8 +20,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.failed import NO_WEIGHTS, failed_fit
-from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Mask, Regressors, Table, Terms, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,

@@ -20,8 +20,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.criteria import CRITERIA
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.failed import failed_fit
-from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.hybrid_choice import (
     MOST_NOISE,
     SHARED,

@@ -20,8 +20,7 @@ from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.failed import provenance
-from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit, provenance
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Mask, Rows
 from ambid.nonlinear.records import Parts, Scaled
 

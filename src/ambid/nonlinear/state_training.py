@@ -20,8 +20,7 @@ from ambid.estimation.progress import Tick, part_of
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped, sandwich
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.failed import failed_fit, provenance
-from ambid.nonlinear.fit import LearningCurve, NonlinearFit
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit, failed_fit, provenance
 from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals._joint import FEEDBACK, checked, labels, ratio, weak_inputs
-from ambid.signals.response import FrequencyResponse, Hold
+from ambid.signals.response import FEEDBACK, FrequencyResponse, Hold, checked, labels, ratio, weak_inputs
 
 _CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
 _WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1

@@ -17,9 +17,19 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals._joint import FEEDBACK, checked, labels, ratio_map, right_inverse, scatter, transformed, weak_inputs
 from ambid.signals.conditioning import runs
-from ambid.signals.response import FrequencyResponse, Hold
+from ambid.signals.response import (
+    FEEDBACK,
+    FrequencyResponse,
+    Hold,
+    checked,
+    labels,
+    ratio_map,
+    right_inverse,
+    scatter,
+    transformed,
+    weak_inputs,
+)
 
 Lines = NDArray[np.intp]
 _LARGEST_GAP_FROM = 1e-3  # of the largest line: no line under it counts as excited

@@ -15,8 +15,16 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals._joint import FEEDBACK, checked, labels, product_covariance, ratio, weak_inputs
-from ambid.signals.response import FrequencyResponse, Hold
+from ambid.signals.response import (
+    FEEDBACK,
+    FrequencyResponse,
+    Hold,
+    checked,
+    labels,
+    product_covariance,
+    ratio,
+    weak_inputs,
+)
 from ambid.signals.spectra import CrossSpectra, cross_spectra
 
 Kind = Literal["h1", "h2", "hv"]

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
-from ambid.estimation.threads import one_thread
 from ambid.track.numbers import TrackedNumbers
 
 

@@ -15,10 +15,10 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.likelihood import Fit, search, weight_of
+from ambid.estimation.linear import one_thread
 from ambid.estimation.parts import Check
 from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.estimation.threads import one_thread
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.models import model
 from ambid.validate.physical import expected_prediction_sd, innovation_tests, prediction_error, simulation_error

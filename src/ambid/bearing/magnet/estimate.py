@@ -18,8 +18,8 @@ from ambid.bearing.magnet.problem import LEVELS, BearingProblem, BearingRecord, 
 from ambid.bearing.magnet.rescue import EVALUATIONS, rescued
 from ambid.bearing.magnet.start import LinearStart, linear_start, start_numbers, with_noise
 from ambid.errors import EstimationError
+from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, portions
-from ambid.estimation.threads import one_thread
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 

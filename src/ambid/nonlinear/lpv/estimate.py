@@ -18,8 +18,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, portions
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.failed import failed_fit, provenance
-from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit, provenance
 from ambid.nonlinear.lpv.candidates import (
     Candidate,
     Fitting,

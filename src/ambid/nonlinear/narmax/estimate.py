@@ -21,8 +21,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.criteria import information
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
-from ambid.nonlinear.failed import failed_fit, provenance
-from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings
+from ambid.nonlinear.fit import LearningCurve, NonlinearFit, Settings, failed_fit, provenance
 from ambid.nonlinear.narmax.choice import (
     add_all_noise,
     add_noise_terms,
