@@ -9,7 +9,7 @@ import numpy as np
 
 import scipy_baseline
 import scipy_simulation
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
 from ambid.job import identify

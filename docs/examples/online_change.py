@@ -71,7 +71,7 @@ def main(figure: str | None = None, seed: int = 1) -> Result:
 
 def _draw(followed: Track, time_s: np.ndarray, k_i: np.ndarray, path: Path) -> None:
     from ambid.report.drawing import save
-    from ambid.report.track_figure import track_figure
+    from ambid.report.track_figures import track_figure
 
     save(track_figure(followed, truth={"k_i": (time_s, k_i)}), path)
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.bearing.greybox import Signals
+from ambid.bearing.linear import Signals
 from ambid.estimation.problem import PredictorProblem, Scales
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Loop, Noise

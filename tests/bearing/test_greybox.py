@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.greybox import Signals, carry, greybox
+from ambid.bearing.linear import Signals, carry, greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.predictor import assemble

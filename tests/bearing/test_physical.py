@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.stats import chi2, kstest
 
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.bearing.physical import agreement, physical_parameters
 from ambid.bearing.physical_target import physical_response
 from ambid.bearing.uncertainty import uncertainty

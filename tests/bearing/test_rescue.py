@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing import rescue
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.bearing.rescue import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
@@ -24,7 +24,7 @@ from ambid.rig import load_rig
 from tests.bearing import benches
 from tests.bearing.benches import SETTINGS, Bench, parameters, run
 
-home = import_module("ambid.bearing.greybox")  # the room exports a function of the same name
+home = import_module("ambid.bearing.linear")  # the room exports a function of the same name
 
 
 def shifts(fit: Fit, bench: Bench) -> dict[str, float]:

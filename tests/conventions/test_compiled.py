@@ -28,7 +28,11 @@ def test_a_caller_is_compiled_again_after_an_edit_of_what_it_calls(tmp_path: Pat
     for factor in (2, 2, 5):
         (package / "inner_kernel.py").write_text(KERNEL.format(factor=factor))
         done = subprocess.run(
-            [sys.executable, "-c", code], env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True
+            [sys.executable, "-c", code],
+            env={"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
         )
         printed.append(done.stdout.split())
     assert printed == [["2.0", "0"], ["2.0", "1"], ["5.0", "0"]]  # compiled, from the cache, compiled again
@@ -56,7 +60,11 @@ def test_a_first_compilation_is_announced_once_and_a_kernel_from_the_cache_works
     (package / "kernel.py").write_text(ALLOCATES)
     printed = [
         subprocess.run(
-            [sys.executable, "-c", SAYS], env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True
+            [sys.executable, "-c", SAYS],
+            env={"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            check=True,
         ).stdout.split("\n")
         for _ in range(2)
     ]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from ambid.bearing.greybox import Signals
+from ambid.bearing.linear import Signals
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model
 from ambid.signals import multisine

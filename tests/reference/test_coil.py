@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.bearing.coil import coil_instrumental, coil_least_squares
-from ambid.bearing.greybox import Signals, greybox
+from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.models import model

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model

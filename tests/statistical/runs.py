@@ -11,7 +11,7 @@ from unittest import mock
 
 import numpy as np
 
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import weight_of
 from ambid.estimation.predictor import assemble

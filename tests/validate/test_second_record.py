@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.greybox import Signals
+from ambid.bearing.linear import Signals
 from ambid.errors import EstimationError
 from ambid.job import identify, signals_of
 from ambid.physics.loop import Noise

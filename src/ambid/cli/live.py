@@ -22,7 +22,7 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
-    from ambid.report.track_figure import TrackHistory
+    from ambid.report.track_figures import TrackHistory
     from ambid.report.track_text import TrackView
     from ambid.track.lines_file import Tally, TrackWriter
 
@@ -165,7 +165,7 @@ class Follower:
         self._before_header.close()
         self._tally = Tally(header)
         if self._keep:
-            from ambid.report.track_figure import TrackHistory
+            from ambid.report.track_figures import TrackHistory
 
             self.history = TrackHistory(header)
         self._begin_wall = time.perf_counter()

@@ -219,7 +219,7 @@ def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
 
 def _draw(follower: Follower, record: Path, rate: float | None, plot: Path, outputs: Outputs) -> None:
     from ambid.report.drawing import save
-    from ambid.report.track_figure import track_figure
+    from ambid.report.track_figures import track_figure
 
     assert follower.header is not None
     assert follower.history is not None

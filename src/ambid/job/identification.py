@@ -69,7 +69,7 @@ def identify(
     EstimationError
         If nothing can be identified from the record.
     """
-    from ambid.bearing.greybox import greybox
+    from ambid.bearing.linear import greybox
     from ambid.bearing.uncertainty import uncertainty
     from ambid.estimation.linear import one_thread
 

@@ -8,6 +8,6 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.report.drawing import save as save
-    from ambid.report.track_figure import track_figure as track_figure
+    from ambid.report.track_figures import track_figure as track_figure
 
 __getattr__, __dir__, __all__ = exports(__name__)

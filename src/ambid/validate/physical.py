@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.greybox import carry
+from ambid.bearing.linear import carry
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import Uncertainty, experiment_hint
 from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ambid.bearing.greybox import greybox
+from ambid.bearing.linear import greybox
 from ambid.bearing.magnet.likelihood import criterion
 from ambid.bearing.magnet.problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.bearing.multistart import Signals
