@@ -70,9 +70,8 @@ def test_a_better_minimum_is_found_where_no_search_converges(noisy, before):
     assert 100 < told["evaluations"] <= 800
     assert fit.criterion < before.criterion - 100.0
     assert told["criterion_after"] < told["criterion_before"]
-    # R comes out 2.4 to 3.5 deviations off, by seed: so near to nothing the likelihood is no parabola
-    assert fit.status == "converged"
-    assert max(shifts(fit).values()) < 3.5
+    # neither search ends, so that their deviations promise nothing (R came out 2.4 to 3.5 of them off, by seed)
+    assert fit.status == "stalled"
     error = [abs(f.problem.values(f.vector)["R"] / TRUTH["R"] - 1.0) for f in (before, fit)]
     assert error[1] < 0.5 < 1.0 < error[0]
 
