@@ -17,15 +17,13 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import BLIND, Directions, directions, triangle_of
+from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick, guessed
 
 Status = Literal["converged", "stalled", "failed"]
 
 _USUAL = 10.0  # iterations, roughly, of a search
 _MOST_DAMPED = 1e9
-_FLAT = 0.01  # gain of two steps that counts as next to nothing, in units of the criterion
-_NEAR = 0.1  # standard deviations that a full step may then still move the numbers that are wanted
 _PATIENCE = 6  # iterations in a row in which held-out errors may grow
 
 
@@ -93,7 +91,6 @@ def search(
     tolerance: float = 1e-8,
     enough: float = 0.0,
     settled: float = 0.0,
-    wanted: slice | None = None,
     damping: float = 1e-3,
     upper: Array | None = None,
     longest: float = np.inf,
@@ -110,9 +107,8 @@ def search(
 
     `theta`: (n_theta,), start; `stage`: for `tick`; `most`: iterations; `tolerance`, `enough`: relative and absolute
     gain of a step below which the search is over; `settled`: what a full step promises below which it is over, in the
-    criterion's unit (squared Newton decrement: the step's squared length in standard deviations); `wanted`: numbers
-    that the search is for: it is also over where two steps gained next to nothing, and a full one would move these by
-    less than 0.1 standard deviations; `damping`: at the beginning, for columns of unit length; small where the start is
+    criterion's unit (squared Newton decrement: the step's squared length in standard deviations);
+    `damping`: at the beginning, for columns of unit length; small where the start is
     good; `upper`: (n_theta,), bounds; what stands at its bound and would go beyond rests; `longest`: change of any
     number in one step; `move`: takes a step along J's columns from a vector, by its own rules (shortened, projected, in
     a tangent space), None where it cannot; `held_out`: error on other data; training ends where it grows; `tick`:
@@ -136,7 +132,6 @@ def search(
         solved=solved,
         n_linear=n_linear,
         settled=settled,
-        wanted=wanted,
     )
     try:
         for k in range(most):
@@ -144,8 +139,7 @@ def search(
                 tick(stage, max(k / most, guessed(k, _USUAL)))
             if not np.isfinite(cost):
                 break
-            flat = wanted is not None and len(costs) > 2 and costs[-3] - cost < _FLAT
-            trial, trial_cost, damping, over = how.step(theta, cost, damping, flat=flat)
+            trial, trial_cost, damping, over = how.step(theta, cost, damping)
             if trial is None:
                 converged = over
                 break
@@ -193,9 +187,8 @@ class _How:
     solved: Callable[[Array], Array] | None
     n_linear: int
     settled: float
-    wanted: slice | None
 
-    def step(self, theta: Array, cost: float, damping: float, *, flat: bool) -> tuple[Array | None, float, float, bool]:
+    def step(self, theta: Array, cost: float, damping: float) -> tuple[Array | None, float, float, bool]:
         """Return a better vector (None without one), its cost, the next damping, and whether there is nothing to
         gain.
         """
@@ -211,8 +204,6 @@ class _How:
         found = directions(J)
         to_gain = found.explain(r)
         if to_gain <= max(self.settled, 1e-13 * abs(cost)):
-            return None, cost, damping, True
-        if flat and self.wanted is not None and _longest_step(found, r, self.wanted) < _NEAR:
             return None, cost, damping, True
         while damping < _MOST_DAMPED:
             trial = self._moved(theta, found.solve(r, damping))
@@ -236,9 +227,3 @@ class _How:
             return None
         trial = trial if self.upper is None else np.minimum(trial, self.upper)
         return trial if self.solved is None else self.solved(trial)
-
-
-def _longest_step(found: Directions, r: Array, wanted: slice) -> float:
-    """Largest full step of some numbers, in standard deviations."""
-    half = found.root(BLIND)
-    return float(np.max(np.abs(half @ (found.U.T @ r))[wanted] / np.linalg.norm(half, axis=1)[wanted]))
