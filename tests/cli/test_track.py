@@ -211,7 +211,7 @@ def test_routine_decisions_do_not_bury_a_change(bench, ambid, job, whole):
 
 def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
     from ambid.cli.track import truth_columns
-    from ambid.report import track_figure
+    from ambid.report import track_figures
 
     rows = "\n".join(f"{k / 100},{k},{1600 + k},5" for k in range(50))
     (bench / "true.csv").write_text(f"time [s],voltage [V],true_R [mohm],true_m [V]\n{rows}\n".replace("mohm", "ohm"))
@@ -222,8 +222,8 @@ def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
     assert "'true_m' is in [V], the tracked number in [kg]" in capsys.readouterr().err
     assert truth_columns(bench / "record.csv", None, {"R": "ohm"}) == {}
     given = {}
-    drawn = track_figure.track_figure
-    monkeypatch.setattr(track_figure, "track_figure", lambda h, truth: given.update(truth) or drawn(h, truth=truth))
+    drawn = track_figures.track_figure
+    monkeypatch.setattr(track_figures, "track_figure", lambda h, truth: given.update(truth) or drawn(h, truth=truth))
     assert ambid("track", "true.csv", "--plot", "t.png").code == 0
     assert list(given) == ["R"]
 

@@ -1,5 +1,7 @@
 """Imports point downward only (ARCHITECTURE.md); the rule itself is tested on fabricated sources."""
 
+import importlib
+
 import pytest
 
 from tests.conventions.import_rules import RANK, circles, imported_names, violations
@@ -26,6 +28,15 @@ def test_no_files_import_each_other_in_a_circle():
     for module in lazy:
         imports[module] = set()  # what a room exports is imported when it is first used, not with the room
     assert circles(imports) == []
+
+
+def test_no_room_with_lazy_exports_has_a_file_or_folder_of_the_same_name():
+    """Which of the two `room.name` meant would hang on the order of imports."""
+    modules = {module_name(path) for path in package_files()}
+    lazy = [f"ambid.{room}" for room in rooms() if hasattr(importlib.import_module(f"ambid.{room}"), "__getattr__")]
+    assert lazy
+    exported = {f"{room}.{name}" for room in lazy for name in importlib.import_module(room).__all__}
+    assert sorted(modules & exported) == []
 
 
 def test_a_circle_is_found():

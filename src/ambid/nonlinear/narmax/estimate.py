@@ -59,27 +59,7 @@ class Fitting:
 def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
     """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4).
 
-    Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``.
-
-    Parameters
-    ----------
-    records : sequence of IOData
-        Of one bench.
-    settings : Mapping
-        Described in the register of structures.
-    seed : int, optional
-        Taken for the contract's sake: nothing here is random.
-    tick : callable, optional
-        Called with the stage; may raise KeyboardInterrupt.
-
-    Returns
-    -------
-    NonlinearFit
-
-    Raises
-    ------
-    EstimationError
-        If a setting is not known, records do not belong together, are too short, or a channel does not move.
+    Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``; not random.
     """
     if not records:
         raise EstimationError("narmax: no record is given. Pass one at least")
