@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
+from ambid.nonlinear.blocks import UNITS, Block, Terms
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit_file import model_from_json, model_to_json
-from ambid.nonlinear.lagged import UNITS, Block, LaggedFunction, LaggedModel, Regressors, Rows, Terms, lags
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, Rows, lags
 from ambid.nonlinear.lagged_problem import problem_at
 from ambid.nonlinear.narx import NarxFunction
 from ambid.nonlinear.rbf_network import RbfFunction
@@ -37,13 +38,13 @@ class Rational(LaggedFunction):
 
     kind = "test"
 
-    def __init__(self, *, bends: bool, below: bool = True) -> None:
+    def __init__(self, *, bends: bool, below: bool = True, folded: int = 0) -> None:
         x = lags(2, 1, ny=2, nu=1, nk=0, ne=1)  # y1(t-1) y1(t-2) y2(t-1) y2(t-2) u(t) e1(t-1) e2(t-1)
         num = [(0,), (0, 2, 4), (3, 3), (5,), (6, 6) if bends else (6, 4)]
         terms = [(0, t, 0) for t in num] + [(0, (1, 1), 1)] * below + [(1, t, 0) for t in [(2,), (4,), (0, 6), (5,)]]
         table = np.array([[*t, *[-1] * (3 - len(t))] for _, t, _ in terms], dtype=np.int64)
         place = np.array([[o, d] for o, _, d in terms], dtype=np.int64)
-        self._x, self._terms = x, Terms(n_outputs=2, terms=table, place=place)
+        self.folded, self._x, self._terms = folded, x, Terms(n_outputs=2, terms=table, place=place)
 
     @property
     def regressors(self) -> Regressors:
@@ -65,7 +66,12 @@ class Rational(LaggedFunction):
         raise NotImplementedError
 
 
-NOISY = {"rational, affine in e": Rational(bends=False), "rational, bent in e": Rational(bends=True)}
+NOISY = {
+    "rational, affine in e": Rational(bends=False),
+    "rational, bent in e": Rational(bends=True),
+    "rational, magnitude": Rational(bends=False, folded=1),
+    "rational, mean magnitude": Rational(bends=False, folded=2),
+}
 FUNCTIONS: dict[str, LaggedFunction] = {**NARX, **RBF, **NOISY}
 every = pytest.mark.parametrize("f", FUNCTIONS.values(), ids=FUNCTIONS)
 named = pytest.mark.parametrize("f", [*NARX.values(), *RBF.values()], ids=[*NARX, *RBF])
@@ -77,7 +83,8 @@ def numbers(f: LaggedFunction, seed: int = 0, size: float = 1.0) -> np.ndarray:
 
 def signals(f: LaggedFunction, n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.standard_normal((n, f.n_outputs)), rng.standard_normal((n, f.n_inputs))
+    y, u = rng.standard_normal((n, f.n_outputs)), rng.standard_normal((n, f.n_inputs))
+    return np.abs(y) if f.folded else y, u
 
 
 def gentle(f: LaggedFunction) -> np.ndarray:
@@ -102,14 +109,15 @@ def test_slopes_through_own_outputs_and_innovations(f: LaggedFunction, free: boo
     theta, (y, u) = gentle(f), signals(f, 50)
 
     def run(t: np.ndarray) -> np.ndarray:
-        return f.free_run(t, y, u)[f.lag :] if free else f.predict(t, f.rows(y, u))[0]
+        return f.free_run(t, y, u)[0][f.lag :] if free else f.predict(t, f.rows(y, u))[0]
 
     def rows() -> Rows:
         if not free:
             return f.predict(theta, f.rows(y, u))[1]
-        return f.rows_of(f.regressors.signals(f.free_run(theta, y, u), u), y)
+        return f.rows_of(f.free_run(theta, y, u)[1], y)
 
-    J = f.slopes(theta, rows(), free=free)
+    signed = f.slopes(theta, rows(), free=free)
+    J = f.fold(signed, rows(), free=free)
     assert np.all(np.isfinite(J))
     for k in range(f.n_theta):
         d = np.zeros(theta.size)
@@ -118,16 +126,18 @@ def test_slopes_through_own_outputs_and_innovations(f: LaggedFunction, free: boo
         slope = (8 * (four[0] - four[1]) - (four[2] - four[3])) / 12e-4
         np.testing.assert_allclose(J[:, :, k], slope, atol=1e-8 * max(1.0, np.abs(J).max()))
     live = np.arange(f.n_theta) % 3 > 0
-    np.testing.assert_allclose(f.slopes(theta, rows(), free=free, live=live), J[:, :, live], rtol=1e-12, atol=1e-14)
-    head = f.slopes(theta, rows().part(slice(0, 17)), free=free)
-    tail = f.slopes(theta, rows().part(slice(17, None)), free=free, before=head)
-    np.testing.assert_allclose(np.concatenate([head, tail]), J, rtol=1e-12, atol=1e-14)
+    some = f.slopes(theta, rows(), free=free, live=live)
+    np.testing.assert_allclose(some, signed[:, :, live], rtol=1e-12, atol=1e-14)
+    head, tail = rows().part(slice(0, 17)), rows().part(slice(17, None))
+    begun = f.slopes(theta, head, free=free)
+    ended = f.fold(f.slopes(theta, tail, free=free, before=begun), tail, free=free, before=begun)
+    np.testing.assert_allclose(np.concatenate([f.fold(begun, head, free=free), ended]), J, rtol=1e-12, atol=1e-14)
 
 
 @named
 def test_a_compiled_run_is_the_function_of_its_own_past(f: LaggedFunction) -> None:
     theta, (y, u) = gentle(f), signals(f, 60)
-    z = f.free_run(theta, y, u)
+    z, _ = f.free_run(theta, y, u)
     np.testing.assert_array_equal(z[: f.lag], y[: f.lag])
     rows = f.rows(z, u)
     np.testing.assert_allclose(f.values(theta, rows), z[f.lag :], rtol=1e-12, atol=1e-12)
@@ -155,8 +165,8 @@ def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior(free: bool) ->
     R, whole = at.triangle(theta), []
     for (ys, us), counts in zip(at.parts, counted, strict=True):
         if free:
-            run = f.free_run(theta, ys, us)
-            rows, left = f.rows_of(f.regressors.signals(run, us), ys), (ys - run)[f.lag :]
+            run, z = f.free_run(theta, ys, us)
+            rows, left = f.rows_of(z, ys), (ys - run)[f.lag :]
         else:
             found, rows = f.predict(theta, f.rows(ys, us))
             left = ys[f.lag :] - found

@@ -20,8 +20,9 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
+from ambid.nonlinear.blocks import Block, Mask, Table, Terms
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Mask, Regressors, Table, Terms, lags
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     bias_caution,

@@ -20,6 +20,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.criteria import CRITERIA
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
+from ambid.nonlinear.blocks import Tanh
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.hybrid_choice import (
     MOST_NOISE,
@@ -33,7 +34,6 @@ from ambid.nonlinear.hybrid_choice import (
     train_network,
 )
 from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem, make_invertible, transfer
-from ambid.nonlinear.lagged import Tanh
 from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, cautions, finish, guarded, laplace
 from ambid.nonlinear.narmax import PolynomialNarmax, narmax
 from ambid.nonlinear.narmax.terms import Term, lagged, products, term_name

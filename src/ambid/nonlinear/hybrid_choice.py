@@ -20,6 +20,7 @@ from ambid.estimation.criteria import penalty
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import Found, search
+from ambid.nonlinear.blocks import Mask
 from ambid.nonlinear.hybrid_function import (
     HybridFunction,
     function_of,
@@ -27,7 +28,6 @@ from ambid.nonlinear.hybrid_function import (
     random_start,
     transfer,
 )
-from ambid.nonlinear.lagged import Mask
 from ambid.nonlinear.lagged_problem import LaggedProblem
 from ambid.nonlinear.narmax.terms import Term
 from ambid.nonlinear.records import Parts

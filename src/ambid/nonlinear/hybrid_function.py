@@ -20,19 +20,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.nonlinear.lagged import (
-    Block,
-    LaggedFunction,
-    LaggedModel,
-    Linear,
-    Mask,
-    Regressors,
-    Table,
-    Tanh,
-    Terms,
-    channel_names,
-    lags,
-)
+from ambid.nonlinear.blocks import Block, Linear, Mask, Table, Tanh, Terms
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
 from ambid.nonlinear.narmax.terms import Factor, Term, term_from_json, term_name, term_to_json
 from ambid.nonlinear.records import Parts

@@ -121,6 +121,8 @@ def run(
         for o in range(p):
             if recursive and not abs(f[o]) < _FAR:
                 out[t:] = np.nan
+                if free == 1:
+                    z[t:, :p] = np.nan
                 return
         for o in range(p):
             out[t, o] = f[o]

@@ -19,9 +19,10 @@ from ambid.estimation.linear import information_inverse, triangle_of
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
+from ambid.nonlinear.blocks import Mask
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, provenance
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Mask, Rows
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Rows
 from ambid.nonlinear.records import Parts, Scaled
 
 _BLOCK = 4096
@@ -77,7 +78,7 @@ class LaggedProblem:
         of = self.function
         for rows, (y, u) in zip(self.rows(), self.parts, strict=True):
             if self.free:
-                yield rows.y - of.free_run(theta, y, u)[of.lag :]
+                yield rows.y - of.free_run(theta, y, u)[0][of.lag :]
             else:
                 yield of.errors(theta, rows)
 
@@ -102,22 +103,25 @@ class LaggedProblem:
         """Yield record number and weighted slopes and errors of some of its rows, (n, n_outputs, n_live + 1)."""
         of, theta = self.function, self.whole(v)
         at = of.regressors.own if self.free else of.regressors.noisy
-        reach = int(of.regressors.back[at].max(initial=0))
+        reach = int(of.regressors.back[at].max(initial=int(of.folded == 2)))
         for k, (y, u) in enumerate(self.parts):
             rows = self.rows()[k]
             if self.free:
-                run = of.free_run(theta, y, u)
-                left, rows = rows.y - run[of.lag :], of.rows_of(of.regressors.signals(run, u), y)
+                run, z = of.free_run(theta, y, u)
+                left, rows = rows.y - run[of.lag :], of.rows_of(z, y)
             else:
                 predicted, rows = of.predict(theta, rows)
                 left = rows.y - predicted
-            counts, before = self.counts(k), None
+            before: Array | None = None
+            counts = self.counts(k)
             counts = np.ones(left.shape[0], dtype=np.bool_) if isinstance(counts, slice) else counts
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
-                J = of.slopes(theta, rows.part(part), free=self.free, live=self.live, before=before)
+                some, past = rows.part(part), before
+                J = of.slopes(theta, some, free=self.free, live=self.live, before=past)
                 if reach:
-                    before = J[-reach:].copy() if before is None else np.concatenate([before, J])[-reach:]
+                    before = J[-reach:].copy() if past is None else np.concatenate([past, J])[-reach:]
+                J = of.fold(J, some, free=self.free, before=past)
                 both = np.concatenate([J, left[part, :, None]], axis=2)[counts[part]]
                 yield k, np.matmul(self.weight, both)
 

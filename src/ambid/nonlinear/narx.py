@@ -24,8 +24,9 @@ from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped
+from ambid.nonlinear.blocks import Block, Linear, Tanh
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Linear, Regressors, Tanh, channel_names, lags
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,

@@ -19,8 +19,9 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
+from ambid.nonlinear.blocks import UNITS, unit_values
 from ambid.nonlinear.fit import NO_WEIGHTS, LearningCurve, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import UNITS, LaggedFunction, unit_values
+from ambid.nonlinear.lagged import LaggedFunction
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,

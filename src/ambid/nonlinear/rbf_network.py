@@ -13,18 +13,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.linear import triangle_of
-from ambid.nonlinear.lagged import (
-    UNITS,
-    Block,
-    LaggedFunction,
-    LaggedModel,
-    Linear,
-    Radial,
-    Regressors,
-    channel_names,
-    lags,
-    unit_values,
-)
+from ambid.nonlinear.blocks import UNITS, Block, Linear, Radial, unit_values
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
 from ambid.nonlinear.records import Parts
 from ambid.nonlinear.signals import finite

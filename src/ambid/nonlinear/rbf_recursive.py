@@ -22,8 +22,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick
+from ambid.nonlinear.blocks import UNITS
 from ambid.nonlinear.fit import LearningCurve
-from ambid.nonlinear.lagged import UNITS
 from ambid.nonlinear.lagged_problem import LaggedProblem
 from ambid.nonlinear.rbf_network import RbfFunction
 

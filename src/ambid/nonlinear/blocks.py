@@ -1,0 +1,379 @@
+"""What lagged functions are the sum of, each with parameters of its own.
+
+`Linear`, `Terms` (a polynomial or rational function), `Tanh` (one hidden layer), `Radial` (units about centres). They
+give values, and slopes by their parameters and by regressors, of many rows at once; all signals are scaled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+
+Table = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_NONE = 1e-300  # squared distance below which a thin plate is at its centre
+
+
+class Block(Protocol):
+    """One summand of a lagged function, with `n_theta` parameters; `x` (n, n_regressors) stands for the rows."""
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        ...
+
+    def bends(self, at: Table) -> bool:
+        """Whether it is anything but affine in the regressors at some places, the others fixed."""
+        ...
+
+    def uses(self, at: Table) -> bool:
+        """Whether it looks at any of the regressors at some places."""
+        ...
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """Return what it needs of the rows whatever its parameters, each with rows along axis 0."""
+        ...
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """Return its values, shape (n, n_outputs)."""
+        ...
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """Return slopes by the parameters where `live` and by the regressors at some places.
+
+        Of shapes (n, n_outputs, n_live) and (n or 1, n_outputs, at.size); one row stands for all.
+        """
+        ...
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """Put its parameters into those that the compiled run takes."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linear:
+    """L x + c over some of the regressors, shape by output: L (p, d), then c (p,) if there is a constant."""
+
+    n_outputs: int
+    at: slice
+    constant: bool
+
+    @property
+    def width(self) -> int:
+        """Regressors that it looks at."""
+        return int(self.at.stop - self.at.start)
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return self.n_outputs * (self.width + self.constant)
+
+    def parts(self, theta: Array) -> tuple[Array, Array]:
+        """Return L and c."""
+        n = self.n_outputs * self.width
+        return theta[:n].reshape(self.n_outputs, self.width), theta[n:] if self.constant else np.zeros(self.n_outputs)
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return bool(np.any((at >= self.at.start) & (at < self.at.stop)))
+
+    def bends(self, at: Table) -> bool:
+        """As `Block.bends`."""
+        del at
+        return False
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x[:, self.at],)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        L, c = self.parts(theta)
+        return np.asarray(rows[0] @ L.T + c)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        x, p, d = rows[0], self.n_outputs, self.width
+        out = np.zeros((x.shape[0], p, self.n_theta))
+        for o in range(p):
+            out[:, o, o * d : (o + 1) * d] = x
+            if self.constant:
+                out[:, o, p * d + o] = 1.0
+        by_x = np.zeros((1, p, at.size))
+        inside = (at >= self.at.start) & (at < self.at.stop)
+        by_x[0][:, inside] = self.parts(theta)[0][:, at[inside] - self.at.start]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        L, c = self.parts(theta)
+        if numbers["L"].shape[1] < self.at.stop:
+            more = self.at.stop - numbers["L"].shape[1]
+            numbers["L"] = np.hstack([numbers["L"], np.zeros((self.n_outputs, more))])
+        numbers["L"][:, self.at] += L
+        numbers["c"] += c
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terms:
+    """Sums of coefficient times product of regressors: numerators, over 1 + denominators where there are any.
+
+    Terms stand output by output, numerator before denominator.
+    """
+
+    n_outputs: int
+    terms: Table  # (n_terms, most factors), places of regressors, -1 behind the last
+    place: Table  # (n_terms, 2), output, and 1 for the denominator
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return int(self.place.shape[0])
+
+    @cached_property
+    def _slices(self) -> tuple[tuple[slice, slice], ...]:
+        """Numerator and denominator of each output in theta."""
+        out, first = [], 0
+        for o in range(self.n_outputs):
+            own = self.place[self.place[:, 0] == o, 1]
+            middle, last = first + int(np.count_nonzero(own == 0)), first + own.size
+            out.append((slice(first, middle), slice(middle, last)))
+            first = last
+        return tuple(out)
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return bool(np.any(np.isin(self.terms, at)))
+
+    def bends(self, at: Table) -> bool:
+        """As `Block.bends`."""
+        inside = np.isin(self.terms, at)
+        return bool(np.any(inside.sum(axis=1) > 1) or np.any(inside[self.place[:, 1] == 1]))
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        out = np.ones((self.n_theta, x.shape[0]))
+        columns = np.ascontiguousarray(x.T)
+        for row, term in zip(out, self.terms, strict=True):
+            for v in term[term >= 0]:
+                row *= columns[v]
+        return np.ascontiguousarray(out.T), x
+
+    def _sums(self, theta: Array, T: Array) -> tuple[Array, Array]:
+        num, den = np.zeros((T.shape[0], self.n_outputs)), np.ones((T.shape[0], self.n_outputs))
+        for o, (up, down) in enumerate(self._slices):
+            num[:, o] = T[:, up] @ theta[up]
+            if down.stop > down.start:
+                den[:, o] += T[:, down] @ theta[down]
+        return num, den
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        num, den = self._sums(theta, rows[0])
+        return num / den
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        T, x = rows
+        num, den = self._sums(theta, T)
+        out = np.zeros((T.shape[0], self.n_outputs, self.n_theta))
+        by_value = np.stack([1.0 / den, -num / den**2], axis=2)  # by numerator and denominator
+        for o, both in enumerate(self._slices):
+            for below, own in enumerate(both):
+                out[:, o, own] = T[:, own] * by_value[:, o, below, None]
+        by_x = np.zeros((T.shape[0], self.n_outputs, at.size))
+        where = {int(v): k for k, v in enumerate(at)}
+        for k, (term, (o, below)) in enumerate(zip(self.terms, self.place, strict=True)):
+            factors = [int(v) for v in term if v >= 0]
+            for v in sorted(set(factors) & where.keys()):
+                rest = list(factors)
+                rest.remove(v)
+                slope = theta[k] * factors.count(v) * np.prod(x[:, rest], axis=1)
+                by_x[:, o, where[v]] += slope * by_value[:, o, below]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(terms=self.terms, place=self.place, theta=theta)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tanh:
+    """W2 tanh(W1 x + b1), one hidden layer over the first regressors: W2 (p, h), W1 (h, d), b1 (h,)."""
+
+    n_outputs: int
+    width: int  # regressors that it looks at
+    neurons: int
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in W2, W1 and b1."""
+        return self.n_outputs * self.neurons, self.neurons * self.width, self.neurons
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return sum(self.sizes)
+
+    def parts(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Return W2, W1 and b1."""
+        a, b, _ = np.cumsum(self.sizes)
+        return theta[:a].reshape(self.n_outputs, -1), theta[a:b].reshape(self.neurons, self.width), theta[b:]
+
+    def hidden(self, theta: Array, x: Array) -> Array:
+        """Return what the units give, shape (n, neurons)."""
+        _, W1, b1 = self.parts(theta)
+        return np.asarray(np.tanh(x @ W1.T + b1))
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return self.neurons > 0 and bool(np.any(at < self.width))
+
+    bends = uses
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x[:, : self.width],)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        return np.asarray(self.hidden(theta, rows[0]) @ self.parts(theta)[0].T)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        (x,), p, h = rows, self.n_outputs, self.neurons
+        W2, W1, _ = self.parts(theta)
+        T = self.hidden(theta, x)
+        n, inside = x.shape[0], at < self.width
+        out = np.zeros((n, p, self.n_theta))
+        bends = h > 0 and bool(np.any(inside))
+        by_x = np.zeros((n if bends else 1, p, at.size))
+        a, b, _ = np.cumsum(self.sizes)
+        for o in range(p):
+            back = (1.0 - T**2) * W2[o]
+            out[:, o, o * h : (o + 1) * h] = T
+            out[:, o, a:b] = (back[:, :, None] * x[:, None, :]).reshape(n, -1)
+            out[:, o, b:] = back
+            if bends:
+                by_x[:, o, inside] = back @ W1[:, at[inside]]
+        return out if np.all(live) else out[:, :, live], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(zip(("W2", "W1", "b1"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
+
+
+UNITS: tuple[str, ...] = ("gaussian", "inverse-multiquadric", "thin-plate")
+"""exp(-q/2), 1/sqrt(1 + q), (q log q)/2 = r^2 log r; the place of a name is its number in the compiled loops."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Radial:
+    """W phi, phi_k = unit(|M x - C_k|^2 / width_k^2): W (p, h), C (h, n_seen), logarithms of the widths (h,).
+
+    M, no parameter, says which regressors the units see, and in which metric.
+    """
+
+    n_outputs: int
+    metric: Array  # (n_seen, n_regressors), M
+    neurons: int
+    unit: str  # one of `UNITS`
+
+    @property
+    def n_seen(self) -> int:
+        """Length of M x."""
+        return int(self.metric.shape[0])
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in W, C and the logarithms of the widths."""
+        return self.n_outputs * self.neurons, self.neurons * self.n_seen, self.neurons
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return sum(self.sizes)
+
+    def parts(self, theta: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        """Return W, C and the logarithms of the widths."""
+        a, b, _ = np.cumsum(self.sizes)
+        return theta[:a].reshape(self.n_outputs, -1), theta[a:b].reshape(self.neurons, self.n_seen), theta[b:]
+
+    def squared(self, theta: NDArray[Any], seen: Array) -> NDArray[Any]:
+        """Return squared distances of M x from the centres, in widths, shape (n, neurons)."""
+        _, C, s = self.parts(theta)
+        q = np.zeros((seen.shape[0], self.neurons), dtype=C.dtype)
+        for j in range(self.n_seen):
+            q += (seen[:, j, None] - C[:, j]) ** 2
+        found: NDArray[Any] = q * np.exp(-2.0 * s)
+        return found
+
+    def uses(self, at: Table) -> bool:
+        """As `Block.uses`."""
+        return self.neurons > 0 and bool(np.any(self.metric[:, at]))
+
+    bends = uses
+
+    def prepare(self, x: Array) -> tuple[Array, ...]:
+        """As `Block.prepare`."""
+        return (x @ self.metric.T,)
+
+    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """As `Block.values`."""
+        return np.asarray(unit_values(self.unit, self.squared(theta, rows[0])) @ self.parts(theta)[0].T)
+
+    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
+        """As `Block.derivatives`."""
+        (seen,), p, h = rows, self.n_outputs, self.neurons
+        W, C, s = self.parts(theta)
+        n, (a, b, _) = seen.shape[0], np.cumsum(self.sizes)
+        q = self.squared(theta, seen)
+        phi, by_q = unit_values(self.unit, q), unit_slopes(self.unit, q)
+        geometry, bends = bool(np.any(live[a:])), self.bends(at)
+        out = np.zeros((n, p, self.n_theta if geometry else a))
+        by_x = np.zeros((n if bends else 1, p, at.size))
+        if geometry or bends:
+            by_seen = 2.0 * (by_q * np.exp(-2.0 * s))[:, :, None] * (seen[:, None, :] - C)
+        for o in range(p):
+            out[:, o, o * h : (o + 1) * h] = phi
+            if geometry:
+                out[:, o, a:b] = (-W[o, :, None] * by_seen).reshape(n, -1)
+                out[:, o, b:] = -2.0 * W[o] * by_q * q
+            if bends:
+                by_x[:, o] = np.einsum("k,nkj->nj", W[o], by_seen) @ self.metric[:, at]
+        return out if np.all(live) else out[:, :, live[: out.shape[2]]], by_x
+
+    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
+        """As `Block.fill`."""
+        numbers.update(zip(("W", "C", "s"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
+        numbers.update(M=np.ascontiguousarray(self.metric), unit=UNITS.index(self.unit))
+
+
+def unit_values(unit: str, q: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of radial units at squared distances, in widths, from their centres."""
+    if unit == "gaussian":
+        return np.exp(-0.5 * q)
+    if unit == "inverse-multiquadric":
+        return 1.0 / np.sqrt(1.0 + q)
+    safe = np.where(q.real > _NONE, q, 1.0)
+    return 0.5 * safe * np.log(safe)
+
+
+def unit_slopes(unit: str, q: NDArray[Any]) -> NDArray[Any]:
+    """Return their derivatives by the squared distance; zero at the centre of a thin plate.
+
+    There it is infinite, but multiplies a distance of zero.
+    """
+    if unit == "gaussian":
+        return -0.5 * np.exp(-0.5 * q)
+    if unit == "inverse-multiquadric":
+        return -0.5 * (1.0 + q) ** -1.5
+    inside = q.real > _NONE
+    return np.where(inside, 0.5 * (np.log(np.where(inside, q, 1.0)) + 1.0), 0.0)
