@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from ambid.errors import EstimationError
 from ambid.recursive.streaming import PassiveLowpass, ScalarKalman
-from ambid.signals.kalman_bucy import kalman_bucy, kalman_bucy_gain, passive_lowpass
+from ambid.signals.scalar_filter import kalman_bucy, kalman_bucy_gain, passive_lowpass
 
 RATE = 1000.0
 

@@ -46,7 +46,7 @@ def program(
 ) -> Program:
     """Make an excitation for a controller.
 
-    `name`: ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation.excitation` knows them;
+    `name`: ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation` knows them;
     `amplitude_v`: peak at the coil, V; `rate_hz`: ticks in one second; `seed`: phases of a multisine, where the
     register of a PRBS starts; `table_length`: elements of the controller's table. Returns played until it is ended.
     """
@@ -119,7 +119,7 @@ def _multisine(
     table_length: int,
 ) -> Program:
     """The longest table of which four periods fit into the record, held only as far as its lowest line needs it."""
-    from ambid.signals.excitation import multisine
+    from ambid.signals.excitations import multisine
 
     low, high = band if band is not None else (0.0, rate_hz / 5.0)
     hold = max(1, math.ceil(rate_hz / (table_length * low) - 1e-9)) if low > 0.0 else 1

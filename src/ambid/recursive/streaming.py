@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import as_block, check_channels
-from ambid.signals.kalman_bucy import kalman_bucy_gain
+from ambid.signals.scalar_filter import kalman_bucy_gain
 
 Scan = Callable[[Array, Array, Array, Array], int]
 
@@ -110,11 +110,11 @@ class ScalarKalman(StreamingFilter):
     rate_hz : float
         Sampling rate in Hz.
     a, c, w, q, r : float
-        As in `ambid.signals.kalman_bucy.kalman_bucy_gain`: intensities, not variances of samples. White noise of
+        As in `ambid.signals.kalman_bucy_gain`: intensities, not variances of samples. White noise of
         variance σ² in samples of f Hz has r = σ²/f.
     form : {"continuous", "discrete"}
         "continuous": x̂' = A x̂ + L (y - C x̂) solved exactly, each sample of y held until the next; gives x̂ at the
-        sampling instants, from the samples before (as `ambid.signals.kalman_bucy.kalman_bucy`). "discrete": the
+        sampling instants, from the samples before (as `ambid.signals.kalman_bucy`). "discrete": the
         optimal filter of the sampled state, x⁺ = e^(aT) x + noise of the exact variance, y with variance r f.
     start_variance : float, optional
         Variance of the state before the first sample: the gain then follows the variance in time. None: stationary.
@@ -191,7 +191,7 @@ class ScalarKalman(StreamingFilter):
 class PassiveLowpass(StreamingFilter):
     """First-order RC low-pass, x' = (y - x)/τ with τ = 1/(2π corner), discretised exactly; y held over a sample.
 
-    Gives the voltage over the capacitor at the sampling instants, as `ambid.signals.kalman_bucy.passive_lowpass`. Over
+    Gives the voltage over the capacitor at the sampling instants, as `ambid.signals.passive_lowpass`. Over
     a missing value it stays where it is.
 
     Parameters

@@ -1,84 +1,58 @@
 """Signals: conditioning of records, excitation, spectra, frequency responses, signal-to-noise ratio, delay."""
 
-from ambid.signals.conditioning import cut, lowpass, remove_offset, remove_trend, replace_samples, resample, scale
-from ambid.signals.delay import Delay, PersistentExcitation, find_delay, persistent_excitation
-from ambid.signals.excitation import (
-    EXCITATIONS,
-    chirp,
-    crest_factor,
-    excitation,
-    gaussian,
-    multisine,
-    prbs,
-    schroeder_phases,
-    steps,
-)
-from ambid.signals.faults import (
-    Dropouts,
-    Limit,
-    Outliers,
-    Resolution,
-    Saturation,
-    find_dropouts,
-    find_outliers,
-    find_saturation,
-    resolution,
-)
-from ambid.signals.frf import frequency_response
-from ambid.signals.frf_local import frf_local
-from ambid.signals.frf_periodic import Distortions, find_experiments, find_period, frf_periodic
-from ambid.signals.frf_random import frf_random
-from ambid.signals.kalman_bucy import kalman_bucy, kalman_bucy_gain, passive_lowpass
-from ambid.signals.response import FrequencyResponse
-from ambid.signals.snr import Snr, snr
-from ambid.signals.spectra import CrossSpectra, PowerSpectrum, coherence, cross_spectra, power_spectrum
+from __future__ import annotations
 
-__all__ = [
-    "EXCITATIONS",
-    "CrossSpectra",
-    "Delay",
-    "Distortions",
-    "Dropouts",
-    "FrequencyResponse",
-    "Limit",
-    "Outliers",
-    "PersistentExcitation",
-    "PowerSpectrum",
-    "Resolution",
-    "Saturation",
-    "Snr",
-    "chirp",
-    "coherence",
-    "crest_factor",
-    "cross_spectra",
-    "cut",
-    "excitation",
-    "find_delay",
-    "find_dropouts",
-    "find_experiments",
-    "find_outliers",
-    "find_period",
-    "find_saturation",
-    "frequency_response",
-    "frf_local",
-    "frf_periodic",
-    "frf_random",
-    "gaussian",
-    "kalman_bucy",
-    "kalman_bucy_gain",
-    "lowpass",
-    "multisine",
-    "passive_lowpass",
-    "persistent_excitation",
-    "power_spectrum",
-    "prbs",
-    "remove_offset",
-    "remove_trend",
-    "replace_samples",
-    "resample",
-    "resolution",
-    "scale",
-    "schroeder_phases",
-    "snr",
-    "steps",
-]
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.signals.conditioning import cut as cut
+    from ambid.signals.conditioning import lowpass as lowpass
+    from ambid.signals.conditioning import remove_offset as remove_offset
+    from ambid.signals.conditioning import remove_trend as remove_trend
+    from ambid.signals.conditioning import replace_samples as replace_samples
+    from ambid.signals.conditioning import resample as resample
+    from ambid.signals.conditioning import scale as scale
+    from ambid.signals.delay import Delay as Delay
+    from ambid.signals.delay import PersistentExcitation as PersistentExcitation
+    from ambid.signals.delay import find_delay as find_delay
+    from ambid.signals.delay import persistent_excitation as persistent_excitation
+    from ambid.signals.excitations import EXCITATIONS as EXCITATIONS
+    from ambid.signals.excitations import chirp as chirp
+    from ambid.signals.excitations import crest_factor as crest_factor
+    from ambid.signals.excitations import excitation as excitation
+    from ambid.signals.excitations import gaussian as gaussian
+    from ambid.signals.excitations import multisine as multisine
+    from ambid.signals.excitations import prbs as prbs
+    from ambid.signals.excitations import schroeder_phases as schroeder_phases
+    from ambid.signals.excitations import steps as steps
+    from ambid.signals.faults import Dropouts as Dropouts
+    from ambid.signals.faults import Limit as Limit
+    from ambid.signals.faults import Outliers as Outliers
+    from ambid.signals.faults import Resolution as Resolution
+    from ambid.signals.faults import Saturation as Saturation
+    from ambid.signals.faults import find_dropouts as find_dropouts
+    from ambid.signals.faults import find_outliers as find_outliers
+    from ambid.signals.faults import find_saturation as find_saturation
+    from ambid.signals.faults import resolution as resolution
+    from ambid.signals.frf import frequency_response as frequency_response
+    from ambid.signals.local_response import frf_local as frf_local
+    from ambid.signals.noise_ratio import Snr as Snr
+    from ambid.signals.noise_ratio import snr as snr
+    from ambid.signals.periodic_response import Distortions as Distortions
+    from ambid.signals.periodic_response import find_experiments as find_experiments
+    from ambid.signals.periodic_response import find_period as find_period
+    from ambid.signals.periodic_response import frf_periodic as frf_periodic
+    from ambid.signals.random_response import frf_random as frf_random
+    from ambid.signals.response import FrequencyResponse as FrequencyResponse
+    from ambid.signals.scalar_filter import kalman_bucy as kalman_bucy
+    from ambid.signals.scalar_filter import kalman_bucy_gain as kalman_bucy_gain
+    from ambid.signals.scalar_filter import passive_lowpass as passive_lowpass
+    from ambid.signals.spectra import CrossSpectra as CrossSpectra
+    from ambid.signals.spectra import PowerSpectrum as PowerSpectrum
+    from ambid.signals.spectra import coherence as coherence
+    from ambid.signals.spectra import cross_spectra as cross_spectra
+    from ambid.signals.spectra import power_spectrum as power_spectrum
+
+__getattr__, __dir__, __all__ = exports(__name__)

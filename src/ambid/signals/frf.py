@@ -9,9 +9,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.signals.frf_local import frf_local
-from ambid.signals.frf_periodic import find_period, frf_periodic
-from ambid.signals.frf_random import frf_random
+from ambid.signals.local_response import frf_local
+from ambid.signals.periodic_response import find_period, frf_periodic
+from ambid.signals.random_response import frf_random
 from ambid.signals.response import FrequencyResponse
 
 Method = Literal["auto", "periodic", "random", "local"]

@@ -12,7 +12,7 @@ from ambid.physics.models import model
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.signals.frf_periodic import frf_periodic
+from ambid.signals.periodic_response import frf_periodic
 from ambid.signals.response import FrequencyResponse
 from ambid.simulate import simulate_preset
 
