@@ -11,8 +11,8 @@ import pytest
 
 from ambid.acquire.device import Program
 from ambid.acquire.devices.emulated import EmulatedDevice
+from ambid.acquire.devices.line_device import SerialDevice
 from ambid.acquire.devices.replay import ReplayDevice
-from ambid.acquire.devices.serial_device import SerialDevice
 from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.errors import DeviceError
 from ambid.record import Channel, Record, write_record

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquire.board import SHORTEST_PERIOD
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
+from ambid.acquire.scales import SHORTEST_PERIOD
 from ambid.acquire.session import Course
 from ambid.job.acquisition import acquire
 from ambid.record import read_record

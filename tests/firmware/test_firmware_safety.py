@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ambid.acquire.board import LIFTED_MS
 from ambid.acquire.devices import _kernels as k_
 from ambid.acquire.protocol.codec import unpack
+from ambid.acquire.scales import LIFTED_MS
 from tests.firmware.native.console import (
     DRIVING,
     EXCITATION,

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from ambid.acquire import board
+from ambid.acquire import scales as board
 from ambid.acquire.default_daq import with_default_daq
 from ambid.acquire.device import Program
 from ambid.acquire.program import expected, program

@@ -11,10 +11,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from ambid.acquire.board import ADC_TOP, PWM_TOP, nearest_rate, output_rates
 from ambid.acquire.device import DeviceEvent
 from ambid.acquire.protocol.table import table
-from ambid.acquire.scales import who
+from ambid.acquire.scales import ADC_TOP, PWM_TOP, nearest_rate, output_rates, who
 from ambid.errors import RigError
 from ambid.physics.loop import UNLIMITED, Interval
 from ambid.physics.models import model

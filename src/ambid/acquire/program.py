@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 
-from ambid.acquire.board import TABLE_LENGTH
 from ambid.acquire.device import Program
 from ambid.acquire.playing import FULL, MASKS, Played, amplitude_counts, elements_of, expected, period_ticks, played
+from ambid.acquire.protocol.table import table
+from ambid.acquire.scales import TABLE_LENGTH
+from ambid.acquire.settings import ControllerSettings
 from ambid.errors import DeviceError
+from ambid.rig.rig import Rig
 
 __all__ = [
     "NAMES",
@@ -154,3 +157,22 @@ def _lowest(high: float, rate_hz: float, table_length: int) -> float:
     """Lowest line of a table whose elements are fast enough for a highest one, Hz."""
     hold = max(1, int(_HIGHEST * rate_hz / high + 1e-9))
     return rate_hz / (hold * table_length)
+
+
+def counts_of(program: Program, rig: Rig, settings: ControllerSettings) -> dict[str, int]:
+    """Return the fields of the message ``excitation``.
+
+    `program`: amplitude in V; `rig`: with the calibration of its voltage; `settings`: of the device. Returns without
+    ``id``.
+    """
+    amplitude = 0
+    if program.kind != "none":
+        amplitude = amplitude_counts(program, rig, settings.duty_bias, (settings.duty_low, settings.duty_high))
+    return {
+        "kind": table().value("kind", program.kind),
+        "amplitude": amplitude,
+        "hold": program.hold,
+        "length": program.length,
+        "cycles": program.cycles,
+        "seed": program.seed,
+    }

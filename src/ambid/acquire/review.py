@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ambid.acquire.board import output_rates
-from ambid.acquire.scales import scale_of, who
+from ambid.acquire.scales import output_rates, scale_of, who
 from ambid.acquire.settings import ControllerSettings, exact_gains, has_position, realised
 from ambid.errors import ModelError, RigError
 from ambid.physics.models import model

@@ -14,10 +14,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ambid.acquire.board import ADC_TOP, BYTE_BITS, LAG_S, LARGEST_GAIN, PWM_HZ, PWM_TOP, drives, period_of
 from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.device import Column
-from ambid.acquire.scales import Scale, count_inside, duty_off, duty_range, scale_of, trip_counts, who
+from ambid.acquire.scales import (
+    ADC_TOP,
+    BYTE_BITS,
+    LAG_S,
+    LARGEST_GAIN,
+    PWM_HZ,
+    PWM_TOP,
+    Scale,
+    count_inside,
+    drives,
+    duty_off,
+    duty_range,
+    period_of,
+    scale_of,
+    trip_counts,
+    who,
+)
 from ambid.arrays import Array
 from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Loop

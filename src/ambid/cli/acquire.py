@@ -399,7 +399,7 @@ def left(record: Path, changed: bool) -> str:
 
     `changed`: whether it is another file than before. Returns what goes on after the word that it was interrupted.
     """
-    from ambid.acquire.recorder.header import journal_path
+    from ambid.acquire.recorder.layout import journal_path
 
     journal = journal_path(record)
     if changed:
@@ -409,7 +409,7 @@ def left(record: Path, changed: bool) -> str:
 
 def _kept(recorded: Recorded, record: Path) -> str:
     """Say why there is a journal beside the record, and what to do with it."""
-    from ambid.acquire.recorder.header import journal_path
+    from ambid.acquire.recorder.layout import journal_path
 
     journal, again = journal_path(record), recorded.survey.misplaced
     if again:
@@ -421,7 +421,7 @@ def _kept(recorded: Recorded, record: Path) -> str:
 
 def _not_stored(done: Acquired, record: Path) -> str:
     """Say what is not in the record, and where the rest is; why was told when it happened."""
-    from ambid.acquire.recorder.header import journal_path
+    from ambid.acquire.recorder.layout import journal_path
 
     journal = journal_path(record)
     text = f"{done.not_stored} samples are not in {record}"

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ambid.acquire.board import LAG_S
 from ambid.acquire.device import Program
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.devices.simulated import SimulatedDevice
+from ambid.acquire.scales import LAG_S
 from ambid.job import identify
 from ambid.rig import rig_from_text
 

@@ -8,8 +8,8 @@ import pytest
 
 from ambid.acquire.devices.choose import open_device
 from ambid.acquire.devices.emulated import EmulatedDevice
+from ambid.acquire.devices.line_device import SerialDevice
 from ambid.acquire.devices.replay import ReplayDevice
-from ambid.acquire.devices.serial_device import SerialDevice
 from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, DeviceError
 from ambid.rig import load_rig

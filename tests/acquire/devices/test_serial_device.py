@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ambid.acquire.devices.serial_device import SerialDevice
-from ambid.acquire.link.drift import ClockDrift
+from ambid.acquire.devices.line_device import SerialDevice
+from ambid.acquire.link.reader import ClockDrift
 from ambid.errors import DeviceError, RigError
 from ambid.rig import default_rig, load_rig
 from tests.acquire.fake import FakeController, PtyBoard

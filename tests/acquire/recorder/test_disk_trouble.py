@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ambid.acquire.recorder import JournalHeader, Recorder, _writer, journal_path
-from ambid.acquire.recorder.frames import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE
-from ambid.acquire.recorder.header import json_bytes
+from ambid.acquire.recorder.layout import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE, json_bytes
 from ambid.errors import DeviceError
 from ambid.record import read_record
 from ambid.track.blocks import Block

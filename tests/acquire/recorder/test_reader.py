@@ -6,9 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Event, JournalReader, Recorder, _writer, frames
-from ambid.acquire.recorder.frames import HEADER, Head, frame_bytes, preamble
-from ambid.acquire.recorder.header import json_bytes
+from ambid.acquire.recorder import Event, JournalReader, Recorder, _writer, layout
+from ambid.acquire.recorder.layout import HEADER, Head, frame_bytes, json_bytes, preamble
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block
 from tests.acquire.recorder.signals import ROWS, block, contents, header, same_bits, values_at
@@ -33,9 +32,9 @@ def data(tmp_path_factory):
 
 def places(data):
     """Where each frame begins, and its head."""
-    found, at = [], frames.PREAMBLE_SIZE
+    found, at = [], layout.PREAMBLE_SIZE
     while at < len(data):
-        head = frames.head_of(data[at : at + frames.HEAD_SIZE])
+        head = layout.head_of(data[at : at + layout.HEAD_SIZE])
         found.append((at, head))
         at += head.size
     return found
@@ -73,7 +72,7 @@ def test_wrong_bytes_cost_the_frames_that_they_are_in_and_no_other(tmp_path, dat
         ]
         blocks, events, damage = read(tmp_path / "a.journal", bytes(wrong))
         lost = [inside[k][1] for k in hit]
-        lost_blocks = sum(head.kind == frames.BLOCK for head in lost)
+        lost_blocks = sum(head.kind == layout.BLOCK for head in lost)
         assert damage.frames == len(lost), case
         assert damage.blocks == lost_blocks == BLOCKS - len(blocks), case
         assert len(events) == 2 - (len(lost) - lost_blocks), case
@@ -86,13 +85,13 @@ def test_bytes_that_are_missing_or_inserted_cost_one_place(tmp_path, data):
     middle = at + 30
     for wrong in (
         data[:middle] + data[middle + 9 :],
-        data[:middle] + frames.SYNC + b"more" + data[middle:],
-        data[: at + frames.HEAD_SIZE + 3] + data[at + frames.HEAD_SIZE + 4 :],
+        data[:middle] + layout.SYNC + b"more" + data[middle:],
+        data[: at + layout.HEAD_SIZE + 3] + data[at + layout.HEAD_SIZE + 4 :],
     ):
         _, _, damage = read(tmp_path / "a.journal", wrong)
         assert (damage.frames, damage.blocks, damage.places) == (1, 1, 1)
         assert damage.discarded_bytes == head.size + len(wrong) - len(data)
-    _, _, damage = read(tmp_path / "a.journal", data[:at] + b"between" + frames.SYNC + data[at:])
+    _, _, damage = read(tmp_path / "a.journal", data[:at] + b"between" + layout.SYNC + data[at:])
     assert (damage.frames, damage.places, damage.discarded_bytes) == (0, 1, 15)
 
 
@@ -107,9 +106,9 @@ def test_frames_that_are_gone_or_come_twice_are_counted(tmp_path, data):
 
 def test_a_frame_of_another_journal_is_no_part_of_this_one(tmp_path, data):
     other = journal_bytes(tmp_path, blocks=60, name="other.h5")
-    blocks, _, damage = read(tmp_path / "a.journal", data + other[frames.PREAMBLE_SIZE :])
+    blocks, _, damage = read(tmp_path / "a.journal", data + other[layout.PREAMBLE_SIZE :])
     assert len(blocks) == BLOCKS
-    assert damage.tail_bytes == len(other) - frames.PREAMBLE_SIZE
+    assert damage.tail_bytes == len(other) - layout.PREAMBLE_SIZE
 
 
 def test_the_header_comes_again_so_that_damage_at_the_beginning_costs_no_more(tmp_path, monkeypatch):
@@ -147,7 +146,7 @@ def test_a_disk_with_a_bad_sector_costs_what_was_in_it(tmp_path):
 
 
 def test_garbage_full_of_sync_words_is_passed_over(tmp_path, data):
-    blocks, _, damage = read(tmp_path / "a.journal", data + frames.SYNC * 20_000)
+    blocks, _, damage = read(tmp_path / "a.journal", data + layout.SYNC * 20_000)
     assert len(blocks) == BLOCKS
     assert damage.tail_bytes == 160_000
 

@@ -52,6 +52,6 @@ def open_device(
         if not name.strip():
             raise DeviceError(f"port {port!r} names no record. Give {REPLAY}FILE")
         return ReplayDevice(name, rig, pace=pace)
-    from ambid.acquire.devices.serial_device import SerialDevice
+    from ambid.acquire.devices.line_device import SerialDevice
 
     return SerialDevice(port, rig)

@@ -8,11 +8,11 @@ from types import MappingProxyType, TracebackType
 from typing import Literal, Self
 
 from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State
-from ambid.acquire.devices.excitation import counts_of
 from ambid.acquire.devices.frames import ROOM
 from ambid.acquire.devices.stream import SampleStream
 from ambid.acquire.link.controller import Controller
-from ambid.acquire.link.port import Port
+from ambid.acquire.link.port import Port, open_port
+from ambid.acquire.program import counts_of
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.table import table
 from ambid.acquire.settings import columns, controller_settings, in_si
@@ -294,3 +294,33 @@ class LineDevice(ABC):
                 self._last = self._counted(controller)
         finally:
             self._let_go()
+
+
+class SerialDevice(LineDevice):
+    """The controller behind a serial port, or a pseudo-terminal that acts as one.
+
+    Blocks hold counts. ``Block.time_s`` is sample number over rate, by the controller's clock; its drift against the
+    host's is in the counters.
+
+    `port`: such as ``/dev/ttyACM0`` or ``COM3``; `rig`: with ``[daq]`` and calibrations from counts; `baud`: bits per
+    second; default daq.baud; `answer_s`: how long to wait for an answer before a command is sent again, s; `room`:
+    samples that wait for a reader at most.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        rig: Rig,
+        *,
+        baud: int | None = None,
+        boot_s: float | None = None,
+        real: bool = True,
+        answer_s: float = 0.3,
+        room: int = ROOM,
+    ) -> None:
+        super().__init__(rig, kind="serial", where=port, real=real, answer_s=answer_s, room=room)
+        assert rig.daq is not None  # else the settings were refused
+        self._port, self._baud, self._boot_s = port, baud or rig.daq.baud, boot_s
+
+    def _open(self) -> Port:
+        return open_port(self._port, baud=self._baud, boot_s=self._boot_s)

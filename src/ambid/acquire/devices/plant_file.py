@@ -16,9 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from ambid.acquire.board import ADC_TOP
 from ambid.acquire.devices.benches import Bench, bench_of
-from ambid.acquire.scales import Scale, scale_of
+from ambid.acquire.scales import ADC_TOP, Scale, scale_of
 from ambid.acquire.settings import has_position
 from ambid.errors import DeviceError
 from ambid.physics.magnet import CoEnergy, DifferentialPair

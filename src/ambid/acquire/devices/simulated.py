@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquire.board import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, output_rates
 from ambid.acquire.default_daq import with_default_daq
 from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.benches import Bench, bench_of
-from ambid.acquire.devices.excitation import counts_of
 from ambid.acquire.devices.played import Pace, PlayedDevice
+from ambid.acquire.program import counts_of
 from ambid.acquire.protocol.table import table
-from ambid.acquire.scales import Scale, scale_of
+from ambid.acquire.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates, scale_of
 from ambid.acquire.settings import ControllerSettings, carried, columns, controller_settings, in_si
 from ambid.arrays import Array
 from ambid.errors import DeviceError

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from ambid.acquire.device import DeviceEvent, State
 from ambid.acquire.devices.frames import FrameQueue
-from ambid.acquire.link.drift import ClockDrift, Drift
+from ambid.acquire.link.reader import ClockDrift, Drift
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.samples import SampleCounters, SampleDecoder, Samples
 from ambid.acquire.protocol.table import table

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from ambid.acquire.recorder.convert import Recorded, read_acquisition, recorded_already, recorded_from
-from ambid.acquire.recorder.header import Event, JournalHeader, journal_path, record_path
-from ambid.acquire.recorder.reader import Damage, JournalReader
+from ambid.acquire.recorder.layout import Event, JournalHeader, journal_path, record_path
+from ambid.acquire.recorder.reader import Damage, JournalReader, Survey, survey
 from ambid.acquire.recorder.recorder import Recorder
-from ambid.acquire.recorder.survey import Survey, survey
 
 __all__ = [
     "Damage",

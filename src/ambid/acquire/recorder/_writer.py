@@ -11,8 +11,20 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ambid.acquire.recorder.disk import REMOVED, JournalFile, disk_error, free_bytes
-from ambid.acquire.recorder.frames import BLOCK, CLOSE, EVENT, HEADER, NO_SAMPLE, Head, frame_bytes, preamble
-from ambid.acquire.recorder.header import Event, JournalHeader, event_json, json_bytes
+from ambid.acquire.recorder.layout import (
+    BLOCK,
+    CLOSE,
+    EVENT,
+    HEADER,
+    NO_SAMPLE,
+    Event,
+    Head,
+    JournalHeader,
+    event_json,
+    frame_bytes,
+    json_bytes,
+    preamble,
+)
 from ambid.errors import DeviceError
 
 _EVENTS = 10_000  # that may wait

@@ -17,9 +17,8 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.acquire.recorder.disk import sync_folder
-from ambid.acquire.recorder.header import Event, JournalHeader
-from ambid.acquire.recorder.reader import JournalReader
-from ambid.acquire.recorder.survey import Survey, survey
+from ambid.acquire.recorder.layout import Event, JournalHeader
+from ambid.acquire.recorder.reader import JournalReader, Survey, survey
 from ambid.arrays import Array
 from ambid.errors import DeviceError, RecordError
 from ambid.record.chunks import check_chunks, write_chunks

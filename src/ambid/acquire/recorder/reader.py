@@ -9,15 +9,27 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ambid.acquire.recorder import frames
+import numpy as np
+
+from ambid.acquire.recorder import layout
 from ambid.acquire.recorder.disk import lock
-from ambid.acquire.recorder.frames import HEAD_SIZE, SYNC, Head, head_of, is_whole, unpacked_values, version_of
-from ambid.acquire.recorder.header import Event, JournalHeader, event_of
+from ambid.acquire.recorder.layout import (
+    HEAD_SIZE,
+    SYNC,
+    Event,
+    Head,
+    JournalHeader,
+    event_of,
+    head_of,
+    is_whole,
+    unpacked_values,
+    version_of,
+)
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block
 
@@ -92,7 +104,7 @@ class JournalReader:
         Returns in the order in which they were written.
         """
         damage, number, block = Damage(), 0, 0
-        end = frames.PREAMBLE_SIZE  # of what is accounted for
+        end = layout.PREAMBLE_SIZE  # of what is accounted for
         for at, head, data in self._frames(self._journal):
             if at > end:
                 damage.places += 1
@@ -103,24 +115,24 @@ class JournalReader:
                 continue
             damage.frames += head.frame - number
             damage.blocks += max(head.block - block, 0)
-            number, block = head.frame + 1, head.block + (head.kind == frames.BLOCK)
-            damage.closed = head.kind == frames.CLOSE
+            number, block = head.frame + 1, head.block + (head.kind == layout.BLOCK)
+            damage.closed = head.kind == layout.CLOSE
             yield from _item(head, data)
         damage.tail_bytes = max(self._size - end, 0)
         self.damage = damage
 
     def _identity(self) -> tuple[int, JournalHeader]:
         """Find a sound header, the first of which is right behind the preamble."""
-        version = version_of(self._window.take(0, frames.PREAMBLE_SIZE))
-        if version not in (None, frames.VERSION):
+        version = version_of(self._window.take(0, layout.PREAMBLE_SIZE))
+        if version not in (None, layout.VERSION):
             raise DeviceError(
-                f"journal {self.path} is of version {version}; this program reads {frames.VERSION}."
+                f"journal {self.path} is of version {version}; this program reads {layout.VERSION}."
                 " Recover it with the version that recorded it"
             )
         blocks = 0
         for _, head, data in self._frames(None):
-            blocks += head.kind == frames.BLOCK
-            if head.kind == frames.HEADER:
+            blocks += head.kind == layout.BLOCK
+            if head.kind == layout.HEADER:
                 return head.journal, JournalHeader.from_json(json.loads(_payload(head, data)))
         if not self._size:
             raise DeviceError(f"journal {self.path} is empty: it was cut off before anything was recorded. Remove it")
@@ -136,7 +148,7 @@ class JournalReader:
 
     def _frames(self, journal: int | None) -> Iterator[tuple[int, Head, bytes]]:
         """Yield place, head and bytes of every sound frame, of one journal if its number is given."""
-        at = frames.PREAMBLE_SIZE if self._size > frames.PREAMBLE_SIZE else 0
+        at = layout.PREAMBLE_SIZE if self._size > layout.PREAMBLE_SIZE else 0
         while True:
             head = head_of(self._window.take(at, HEAD_SIZE))
             sound = head is not None and journal in (None, head.journal)
@@ -156,9 +168,9 @@ class JournalReader:
 
 
 def _item(head: Head, data: bytes) -> Iterator[Block | Event]:
-    if head.kind == frames.BLOCK:
+    if head.kind == layout.BLOCK:
         yield Block(first=head.first, time_s=head.time_s, values=unpacked_values(_payload(head, data), head))
-    elif head.kind == frames.EVENT:
+    elif head.kind == layout.EVENT:
         yield event_of(_payload(head, data))
 
 
@@ -219,3 +231,53 @@ def _sectors(at: int, end: int) -> Iterator[int]:
     while at < end:
         yield at
         at += _SECTOR - at % _SECTOR
+
+
+@dataclass(slots=True, kw_only=True)
+class Survey:
+    """What a journal holds."""
+
+    blocks: int = 0  # blocks, and rows of them that have a place in the record
+    samples: int = 0
+    first: int = 0  # number of the first sample, and of the one behind the last
+    end: int = 0
+    start_s: float = 0.0  # time of the first sample, s
+    gaps: int = 0  # places where samples are missing, and how many
+    gap_samples: int = 0
+    misplaced: int = 0  # rows whose numbers were there before
+    # largest difference between a block's time and that of its number at the rate of the header, s
+    stamp_error_s: float = 0.0
+    events: list[Event] = field(default_factory=list)
+    damage: Damage = field(default_factory=Damage)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the record, those of NaN included."""
+        return self.end - self.first
+
+
+def survey(reader: JournalReader) -> Survey:
+    """Look through a journal."""
+    found = Survey()
+    rate = reader.header.rate_hz
+    for item in reader.items():
+        if isinstance(item, Event):
+            found.events.append(item)
+            continue
+        n = len(item.values)
+        if found.blocks == 0:
+            found.first = found.end = item.first
+            found.start_s = item.time_s if np.isfinite(item.time_s) else item.first / rate
+        found.blocks += 1
+        if item.first > found.end:
+            found.gaps += 1
+            found.gap_samples += item.first - found.end
+        old = min(max(found.end - item.first, 0), n)
+        found.misplaced += old
+        found.samples += n - old
+        found.end = max(found.end, item.first + n)
+        if not old and np.isfinite(item.time_s):
+            due = found.start_s + (item.first - found.first) / rate
+            found.stamp_error_s = max(found.stamp_error_s, abs(item.time_s - due))
+    found.damage = reader.damage
+    return found

@@ -18,8 +18,17 @@ from ambid.acquire.device import DeviceEvent
 from ambid.acquire.recorder._writer import Item, JournalWriter, WriteQueue
 from ambid.acquire.recorder.convert import Recorded, check_target, recorded_from
 from ambid.acquire.recorder.disk import JournalFile, disk_error, free_bytes
-from ambid.acquire.recorder.frames import BLOCK, EVENT, LARGEST, NO_SAMPLE, packed_values
-from ambid.acquire.recorder.header import Event, JournalHeader, event_json, journal_path
+from ambid.acquire.recorder.layout import (
+    BLOCK,
+    EVENT,
+    LARGEST,
+    NO_SAMPLE,
+    Event,
+    JournalHeader,
+    event_json,
+    journal_path,
+    packed_values,
+)
 from ambid.acquire.recorder.reader import JournalReader
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block

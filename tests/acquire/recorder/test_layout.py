@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import frames
-from ambid.acquire.recorder.frames import BLOCK, Head, frame_bytes, head_of, is_whole, packed_values, unpacked_values
+from ambid.acquire.recorder import layout
+from ambid.acquire.recorder.layout import BLOCK, Head, frame_bytes, head_of, is_whole, packed_values, unpacked_values
 from tests.acquire.recorder.signals import same_bits
 
 
@@ -38,26 +38,26 @@ def framed(values, **more):
 def test_values_take_the_narrowest_type_that_keeps_every_bit(values, name):
     values = np.array(values, dtype=float)
     code, payload = packed_values(values)
-    assert code == frames.TYPES[name][0]
+    assert code == layout.TYPES[name][0]
     head, data = framed(values)
     assert head_of(data) == head
     assert is_whole(data, head)
     assert len(data) == head.size
-    back = unpacked_values(data[frames.HEAD_SIZE : frames.HEAD_SIZE + head.length], head)
+    back = unpacked_values(data[layout.HEAD_SIZE : layout.HEAD_SIZE + head.length], head)
     assert same_bits(back, values)
-    assert len(payload) == values.size * frames.TYPES[name][1].itemsize
+    assert len(payload) == values.size * layout.TYPES[name][1].itemsize
 
 
 def test_a_declared_type_is_taken_where_it_keeps_every_bit():
-    assert packed_values(np.ones((2, 2)), "float64")[0] == frames.TYPES["float64"][0]
-    assert packed_values(np.ones((2, 2)), "int32")[0] == frames.TYPES["int32"][0]
-    assert packed_values(np.full((2, 2), 0.1), "int16")[0] == frames.TYPES["float64"][0]
+    assert packed_values(np.ones((2, 2)), "float64")[0] == layout.TYPES["float64"][0]
+    assert packed_values(np.ones((2, 2)), "int32")[0] == layout.TYPES["int32"][0]
+    assert packed_values(np.full((2, 2), 0.1), "int16")[0] == layout.TYPES["float64"][0]
 
 
 def test_values_that_do_not_lie_row_by_row_come_back_in_place():
     values = np.asfortranarray(np.arange(12.0).reshape(4, 3))[::2]
     head, data = framed(values)
-    assert same_bits(unpacked_values(data[frames.HEAD_SIZE : -4], head), values)
+    assert same_bits(unpacked_values(data[layout.HEAD_SIZE : -4], head), values)
 
 
 def test_no_wrong_bit_passes():
@@ -84,7 +84,7 @@ def test_a_head_that_contradicts_itself_is_none():
 
 
 def test_the_preamble_tells_the_version():
-    assert frames.version_of(frames.preamble()) == frames.VERSION
-    assert len(frames.preamble()) == frames.PREAMBLE_SIZE
-    assert frames.version_of(frames.preamble()[:-1]) is None
-    assert frames.version_of(b"X" + frames.preamble()[1:]) is None
+    assert layout.version_of(layout.preamble()) == layout.VERSION
+    assert len(layout.preamble()) == layout.PREAMBLE_SIZE
+    assert layout.version_of(layout.preamble()[:-1]) is None
+    assert layout.version_of(b"X" + layout.preamble()[1:]) is None
