@@ -7,7 +7,7 @@ by how much, so that cost and standard deviations stay honest (complex Wishart m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from ambid.blackbox.model import BlackBoxModel
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.parts import Check
+from ambid.estimation.search import Rows, search
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
@@ -74,6 +75,16 @@ class Lines:
         v = float(np.min(self.freedom))
         q = v - self.together
         return self.alike * (1.0 if np.isinf(v) else v**2 / (q**2 - 1.0))
+
+    def covariance(self, J: Array, n_seen: int) -> tuple[Array, float]:
+        """Return the covariance of what a Jacobian of `whitened` rows shows, and the condition of the scaled Jacobian.
+
+        `J`: (n_rows, n_vector); `n_seen`: directions that carry information, the strongest ones: zero along others.
+        """
+        norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
+        half = (vt[:n_seen].T / np.maximum(s[:n_seen], 1e-15 * s[0])) / norm[:, None]
+        return half @ half.T * self.widening, float(s[0] / s[n_seen - 1])
 
     def verdict(self, cost: float, n_estimated: int, n_extra: int = 0) -> Check:
         """Compare a cost with what noise alone would leave.
@@ -169,6 +180,17 @@ def check_lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
     )
 
 
+def search_lines(
+    residual: Callable[[Array], Array], slope: Callable[[Array], Array], start: Array
+) -> tuple[float, Array, bool]:
+    """Search the likelihood: half the least sum of squares, where it is, and whether the search converged.
+
+    `residual`, `slope`: whitened rows and their derivative at a vector, (n_rows,) and (n_rows, n_vector).
+    """
+    found = search(Rows(residual, slope), start, most=200, tolerance=1e-13, settled=1e-12)
+    return found.cost / 2, found.theta, found.converged
+
+
 def build_response_fit(
     name: str,
     frf: FrequencyResponse,
@@ -179,9 +201,7 @@ def build_response_fit(
     covariance: Array,
     cost: float,
     n_estimated: int,
-    offsets: Offsets,
     converged: bool = True,
-    best: bool = True,
     details: Mapping[str, object] | None = None,
     warnings: Sequence[str] = (),
 ) -> BlackBoxFit:
@@ -202,15 +222,14 @@ def build_response_fit(
     if not converged:
         found.insert(0, "the search did not converge: treat the numbers as a first guess")
     if not check.passed:
-        say = "standard deviations hold for noise alone" if best else "or only the start of a search: refine it"
-        found.insert(0, f"{name}: {check.detail}; {say}")
+        found.insert(0, f"{name}: {check.detail}; standard deviations hold for noise alone")
     return BlackBoxFit(
         structure=name,
         orders=dict(orders),
         model=model,
         covariance=covariance,
         n_estimated=n_estimated,
-        offsets=offsets,
+        offsets=Offsets(u=np.zeros(frf.n_inputs), y=np.zeros(frf.n_outputs)),
         noise_covariance=np.zeros((frf.n_outputs, frf.n_outputs)),
         inputs=frf.inputs,
         outputs=frf.outputs,

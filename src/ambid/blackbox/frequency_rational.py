@@ -1,13 +1,10 @@
 """Transfer functions from a frequency response by maximum likelihood, in s or in z.
 
 Minimises the sum of e^H C^-1 e with e = G - N/D exp(-j omega tau) by Levenberg-Marquardt with the exact Jacobian, from
-vector fitting and from iterated linear fits (Pintelon and Schoukens 2012, ch. 9; Sanathanan and Koerner 1963). N and D
-are searched in polynomials that are orthogonal on the lines (Forsythe 1957; Rolain et al. 1995; Brubeck, Nakatsukasa
-and Trefethen 2021), with one common factor left free, so that the search is well-conditioned at any order.
-
-Vector fitting relocates poles: G sigma = p with sigma = d + sum c_k/(s - a_k) and p alike is linear in c, d and the
-residues of p; the zeros of sigma are the next poles. Relaxed: sigma's real part sums to the number of lines instead of
-d = 1 (Gustavsen and Semlyen 1999; Gustavsen 2006; one QR for each entry: Deschrijver et al. 2008).
+iterated linear fits (Sanathanan and Koerner 1963; Pintelon and Schoukens 2012, ch. 9) that begin with D = 1 and with
+lightly damped poles over the band, the start of vector fitting (Gustavsen and Semlyen 1999). N and D are searched in
+polynomials that are orthogonal on the lines (Forsythe 1957; Rolain et al. 1995; Brubeck, Nakatsukasa and Trefethen
+2021), with one common factor left free, so that the search is well-conditioned at any order.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import Orders, check_order_names, compact_order, left_open, order_per_input, single_order
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines, search_lines
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
@@ -55,176 +51,8 @@ def orthogonal_polynomials(points: Complex, weight: Array, degree: int) -> tuple
     return q / weight[:, None], powers
 
 
-_STILL = 1e-10  # relative movement of the poles at which they stand
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoleResidueModel:
-    """G = D + sum_k residues[k] / (s - poles[k]), in s (rad/s) or z."""
-
-    poles: Complex  # (n,), complex, complex ones in neighbouring conjugate pairs
-    residues: Complex  # (n, n_outputs, n_inputs), complex
-    D: Array  # (n_outputs, n_inputs)
-    dt: float | None  # sampling interval in s; None for continuous time
-    iterations: int  # relocations that were made
-    converged: bool  # whether the poles stood still at the end
-    error: float  # root mean square of the weighted error
-
-    def frequency_response(self, omega: Array) -> Complex:
-        """Return G.
-
-        `omega`: (n_frequencies,), rad/s. Returns (n_frequencies, n_outputs, n_inputs), complex.
-        """
-        s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
-        return np.asarray(self.D + np.einsum("fk,kyu->fyu", 1.0 / (s[:, None] - self.poles), self.residues))
-
-
-def vector_fit(
-    omega: Array,
-    G: Complex,
-    n_poles: int,
-    *,
-    dt: float | None = None,
-    weight: Array | None = None,
-    feedthrough: bool = True,
-    start: Complex | None = None,
-    iterations: int = 40,
-) -> PoleResidueModel:
-    """Fit poles that all entries share, and their residues.
-
-    `omega`: (n_frequencies,), rad/s; `G`: (n_frequencies, n_outputs, n_inputs), complex; `dt`: sampling interval in s
-    for a model in z; None for one in s; `weight`: (n_frequencies, n_outputs, n_inputs), one over the standard deviation
-    of each entry; default 1; `feedthrough`: whether D is estimated; else 0; `start`: (n_poles,), complex, first poles,
-    conjugates side by side; default spread over the band, lightly damped; `iterations`: relocations at most. Returns
-    the best of all relocations.
-    """
-    n, m = omega.size, int(np.prod(G.shape[1:]))
-    if n_poles < 1 or 2 * n * m < n_poles * (m + 1) + m or n < 2:
-        raise EstimationError(f"{n_poles} poles from {n} lines: give at least 1 pole, and fewer than the lines show")
-    if not (np.all(np.isfinite(omega)) and np.all(np.isfinite(G))):
-        raise EstimationError("vector fitting got numbers that are not finite; leave those lines out")
-    size = float(np.median(omega)) if dt is None else 1.0  # poles of order one
-    points = np.asarray(1j * omega / size if dt is None else np.exp(1j * omega * dt), dtype=np.complex128)
-    flat = G.reshape(n, m)
-    w = np.ones((n, m)) if weight is None else np.asarray(weight, dtype=np.float64).reshape(n, m)
-    w = w / np.sqrt(np.mean(w**2 * np.abs(flat) ** 2) + 1e-300)
-    poles = _spread_poles(omega, n_poles, size, dt) if start is None else np.asarray(start, dtype=np.complex128) / size
-    best: tuple[float, Complex, Complex, Array] | None = None
-    done, still = 0, False
-    for done in range(1, iterations + 1):  # noqa: B007  (its last value is reported)
-        moved = _relocate(points, flat, w, poles, feedthrough)
-        change = np.max(
-            np.abs(np.sort_complex(moved) - np.sort_complex(poles)) / np.maximum(np.abs(moved).max(), 1e-300)
-        )
-        poles, still = moved, bool(change < _STILL)
-        error, residues, D = _fit_residues(points, flat, w, poles, feedthrough)
-        if best is None or error < best[0]:
-            best = (error, poles, residues, D)
-        if still:
-            break
-    if best is None or not np.isfinite(best[0]):
-        raise EstimationError("vector fitting found no finite poles; lower the number of poles, or check the lines")
-    return PoleResidueModel(
-        poles=best[1] * size,
-        residues=(best[2] * size).reshape(n_poles, *G.shape[1:]),
-        D=best[3].reshape(G.shape[1:]),
-        dt=dt,
-        iterations=done,
-        converged=still,
-        error=best[0],
-    )
-
-
-def _spread_poles(omega: Array, n_poles: int, size: float, dt: float | None) -> Complex:
-    """Lightly damped pairs over the band, and one real pole where their number is odd."""
-    used = omega[omega > 0]
-    centres = np.geomspace(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
-    centres = np.asarray(centres)[: n_poles // 2]
-    pairs = np.stack([centres * (-0.01 + 1j), centres * (-0.01 - 1j)], axis=1).ravel()
-    s = np.concatenate([pairs, [-np.sqrt(used[0] * used[-1])] * (n_poles % 2)]).astype(np.complex128)
-    return np.asarray(s / size if dt is None else np.exp(s * dt))
-
-
-def _basis(points: Complex, poles: Complex) -> tuple[Complex, NDArray[np.int_]]:
-    """Partial fractions with real coefficients, (n_frequencies, n_poles), and their kinds: 0 real, 1 and 2 a pair."""
-    phi = np.empty((points.size, poles.size), dtype=np.complex128)
-    kind = np.zeros(poles.size, dtype=np.int_)
-    k = 0
-    while k < poles.size:
-        a = poles[k]
-        if a.imag == 0:
-            phi[:, k] = 1.0 / (points - a)
-            k += 1
-        else:
-            up, down = 1.0 / (points - a), 1.0 / (points - np.conj(a))
-            phi[:, k], phi[:, k + 1] = up + down, 1j * (up - down)
-            kind[k : k + 2] = 1, 2
-            k += 2
-    return phi, kind
-
-
-def _relocate(points: Complex, flat: Complex, w: Array, poles: Complex, feedthrough: bool) -> Complex:
-    """One relocation: the zeros of sigma."""
-    phi, kind = _basis(points, poles)
-    n, m, order = points.size, flat.shape[1], poles.size
-    own = np.column_stack([phi, np.ones(n)]) if feedthrough else phi
-    sigma = np.column_stack([phi, np.ones(n)])
-    rows = []
-    for e in range(m):
-        block = np.column_stack([own * w[:, [e]], -sigma * (w[:, e] * flat[:, e])[:, None]])
-        r = np.asarray(np.linalg.qr(np.concatenate([block.real, block.imag]), mode="r"))
-        rows.append(r[own.shape[1] :, own.shape[1] :])
-    relax = np.real(np.sum(sigma, axis=0)) * (np.sqrt(np.mean([np.sum(np.abs(r) ** 2) for r in rows])) / n)
-    system = np.vstack([*rows, relax])
-    right = np.zeros(system.shape[0])
-    right[-1] = relax[-1]
-    norm = np.maximum(np.linalg.norm(system, axis=0), 1e-300)
-    x = np.linalg.lstsq(system / norm, right, rcond=None)[0] / norm
-    c, d = x[:order], x[order]
-    if abs(d) < 1e-8:
-        d = 1e-8 if d >= 0 else -1e-8
-    A, b = np.zeros((order, order)), np.ones(order)
-    for k in range(order):
-        if kind[k] == 0:
-            A[k, k] = poles[k].real
-        elif kind[k] == 1:
-            A[k : k + 2, k : k + 2] = [[poles[k].real, poles[k].imag], [-poles[k].imag, poles[k].real]]
-            b[k], b[k + 1] = 2.0, 0.0
-    found = np.linalg.eigvals(A - np.outer(b, c) / d).astype(np.complex128)
-    real = np.sort(found[np.abs(found.imag) <= 1e-12 * np.abs(found)].real)
-    upper = found[found.imag > 1e-12 * np.abs(found)]
-    upper = upper[np.argsort(upper.imag)]
-    return np.concatenate([np.stack([upper, upper.conj()], axis=1).ravel(), real.astype(np.complex128)])
-
-
-def _fit_residues(
-    points: Complex, flat: Complex, w: Array, poles: Complex, feedthrough: bool
-) -> tuple[float, Complex, Array]:
-    """Weighted error, residues (n_poles, m) and D (m,) for given poles."""
-    phi, kind = _basis(points, poles)
-    own = np.column_stack([phi, np.ones(points.size)]) if feedthrough else phi
-    m, squares = flat.shape[1], 0.0
-    x = np.empty((own.shape[1], m))
-    for e in range(m):
-        block = own * w[:, [e]]
-        a = np.concatenate([block.real, block.imag])
-        right = np.concatenate([(w[:, e] * flat[:, e]).real, (w[:, e] * flat[:, e]).imag])
-        norm = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
-        x[:, e] = np.linalg.lstsq(a / norm, right, rcond=None)[0] / norm
-        squares += float(np.sum((a @ x[:, e] - right) ** 2))
-    residues = np.zeros((poles.size, m), dtype=np.complex128)
-    for k in range(poles.size):
-        if kind[k] == 0:
-            residues[k] = x[k]
-        elif kind[k] == 1:
-            residues[k] = x[k] + 1j * x[k + 1]
-            residues[k + 1] = np.conj(residues[k])
-    D = x[-1] if feedthrough else np.zeros(m)
-    return float(np.sqrt(squares / flat.size)), residues, np.asarray(D)
-
-
 MAX_DELAY = 6  # samples, searched when the delay is "auto"
-_STARTING = 12  # iterated linear fits from each start
+_STARTING = 40  # iterated linear fits from each start
 _RACE = 3  # starts from which the likelihood is searched
 
 
@@ -271,7 +99,6 @@ def frf_ml(
     *,
     domain: Literal["s", "z"] | None = None,
     delay: float | Literal["auto"] = 0.0,
-    common: bool = True,
 ) -> BlackBoxFit:
     """Fit transfer functions to a frequency response by maximum likelihood.
 
@@ -286,8 +113,6 @@ def frf_ml(
         the hold's own response is taken out; what it folds down from above half the rate stays, and the check sees it.
     delay : float or "auto", s
         Of all inputs; "auto" estimates it (in whole samples for z).
-    common : bool
-        Whether all entries share one denominator.
 
     Returns
     -------
@@ -308,7 +133,7 @@ def frf_ml(
         raise EstimationError("a model in z wants an input that is held over a sample; this one is not. Use domain 's'")
     if delay != "auto" and not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct it")
-    form = _form(frf, orders, domain, common)
+    form = _form(frf, orders, domain)
     period = form.lines.dt
     if domain == "z" and delay != "auto" and abs(delay / period - round(delay / period)) > 1e-9:
         raise EstimationError(f"a delay of {delay} s is no whole number of samples of {period} s. Use domain 's'")
@@ -337,12 +162,12 @@ def _best_fit(
     return best
 
 
-def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"], common: bool) -> _Form:
+def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"]) -> _Form:
     """Check the orders and lay the coefficients out."""
     m = int(np.prod(np.shape(frf.G)[1:]))
     who, pair = "frf-ml", "input-output pair"
     check_order_names(who, orders, ("nb", "nf"), ("nf",))
-    shared = common and not (isinstance(orders["nf"], tuple) and len(orders["nf"]) > 1)
+    shared = not (isinstance(orders["nf"], tuple) and len(orders["nf"]) > 1)
     group = (0,) * m if shared else tuple(range(m))
     nf = (single_order(who, orders, "nf", 0),) if shared else order_per_input(who, orders, "nf", 0, m, of=pair)
     usual = tuple(max(nf[g], 1) for g in group)
@@ -376,23 +201,26 @@ def _starts(form: _Form, lag: float) -> list[tuple[float, _Form, Array, float]]:
     factor = form.extra * np.exp(-1j * form.lines.omega * lag)
     G = form.lines.G.reshape(form.lines.n_lines, -1) / factor[:, None]
     w = weight * np.abs(factor)[:, None]
-    for fitted in (True, False):
+    for damped in (True, False):
         dens = [np.ones(form.lines.n_lines, dtype=np.complex128) for _ in form.nf]
-        for g, n in enumerate(form.nf):
-            entries = [e for e, of in enumerate(form.group) if of == g]
-            if fitted and n:
-                try:
-                    vf = vector_fit(
-                        form.lines.omega, G[:, entries, None], n, dt=form.dt, weight=w[:, entries, None],
-                        feedthrough=any(form.nb[e] > n for e in entries), iterations=20,
-                    )  # fmt: skip
-                except (EstimationError, np.linalg.LinAlgError):
-                    continue
-                dens[g] = np.prod(form.variable[:, None] - vf.poles / form.size, axis=1)
+        for g, n in enumerate(form.nf if damped else ()):
+            if n:
+                poles = _spread_poles(form.lines.omega, n, form.size, form.dt)
+                dens[g] = np.prod(form.variable[:, None] - poles, axis=1)
         scored = _iterate(form, G, w, dens, lag)
         if scored is not None:
             out.append(scored)
     return out
+
+
+def _spread_poles(omega: Array, n_poles: int, size: float, dt: float | None) -> Complex:
+    """Lightly damped pairs over the band, and one real pole where their number is odd."""
+    used = omega[omega > 0]
+    centres = np.geomspace(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
+    centres = np.asarray(centres)[: n_poles // 2]
+    pairs = np.stack([centres * (-0.01 + 1j), centres * (-0.01 - 1j)], axis=1).ravel()
+    s = np.concatenate([pairs, [-np.sqrt(used[0] * used[-1])] * (n_poles % 2)]).astype(np.complex128)
+    return np.asarray(s / size if dt is None else np.exp(s * dt))
 
 
 def _iterate(
@@ -400,6 +228,7 @@ def _iterate(
 ) -> tuple[float, _Form, Array, float] | None:
     """Iterated linear fits from given denominators; the best of them, in polynomials made for it."""
     best: tuple[float, _Form, Array, float] | None = None
+    before = np.inf
     for _ in range(_STARTING):
         at = _with_basis(form, w, dens)
         vector = np.zeros(at.n_vector)
@@ -412,12 +241,10 @@ def _iterate(
                 vector[num[e]] = top
         cost = float(np.sum(_residual(at, vector, lag)[0] ** 2)) / 2
         if np.isfinite(cost) and (best is None or cost < best[0]):
-            better = best is None or cost < best[0] * (1 - 1e-6)
             best = (cost, at, vector, lag)
-            if not better:
-                break
-        elif best is not None and cost > 10 * best[0]:
+        if abs(cost - before) <= 1e-6 * cost:
             break
+        before = cost
         dens = [at.values[g] @ vector[den[g]] for g in range(len(at.nf))]
     return best
 
@@ -474,20 +301,7 @@ def _residual(at: _Form, vector: Array, lag: float, *, slope: bool = False) -> t
 
 def _search(at: _Form, vector: Array, lag: float) -> tuple[float, Array, bool]:
     """Levenberg-Marquardt; cost, vector, whether it converged."""
-    from scipy.optimize import least_squares
-
-    found = least_squares(
-        lambda v: _residual(at, v, lag)[0],
-        vector,
-        jac=lambda v: _residual(at, v, lag, slope=True)[1],
-        method="lm",
-        x_scale="jac",
-        xtol=1e-12,
-        ftol=1e-13,
-        gtol=1e-13,
-        max_nfev=200,
-    )
-    return float(found.cost), np.asarray(found.x), bool(found.status > 0)
+    return search_lines(lambda v: _residual(at, v, lag)[0], lambda v: _residual(at, v, lag, slope=True)[1], vector)
 
 
 def _result(
@@ -498,13 +312,8 @@ def _result(
     """Coefficients of powers, their covariance and what goes with them."""
     cost, at, vector, lag, converged = best
     J = _residual(at, vector, lag, slope=True)[1]
-    norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
-    used = at.n_estimated  # the common factors carry no information
-    half = (vt[:used].T / np.maximum(s[:used], 1e-15 * s[0])) / norm[:, None]
-    covariance = half @ half.T * at.lines.widening
+    covariance, condition = at.lines.covariance(J, at.n_estimated)  # the common factors carry no information
     model, M = _powers(at, vector, lag)
-    n_y, n_u = at.lines.G.shape[1:]
     delay = model.delay[0]
     spread = float(np.sqrt(covariance[-1, -1])) * at.lines.dt if at.delay_free else None
     return build_response_fit(
@@ -516,9 +325,8 @@ def _result(
         covariance=M @ covariance @ M.T,
         cost=cost,
         n_estimated=at.n_estimated,
-        offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
         converged=converged,
-        details={"domain": domain, "delay_s": delay, "delay_sd_s": spread, "condition": float(s[0] / s[used - 1])},
+        details={"domain": domain, "delay_s": delay, "delay_sd_s": spread, "condition": condition},
         warnings=_hold_warning(at),
     )
 

@@ -12,7 +12,6 @@ Ribarits 2004).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,8 +21,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import Orders, check_order_names, left_open, single_order
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines, search_lines
 from ambid.blackbox.state_space import StateSpaceModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
@@ -108,8 +106,6 @@ def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tup
 
     `feedthrough`: whether D is free.
     """
-    from scipy.optimize import least_squares
-
     here = _balance(model)
     free = _free(here, feedthrough)
 
@@ -124,11 +120,8 @@ def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tup
     def slope(v: Array) -> Array:
         return ln.whitened(at(v).frequency_response_derivative(ln.omega)[..., free])
 
-    found = least_squares(
-        residual, here.theta[free], jac=slope, method="lm", x_scale="jac", xtol=1e-11, ftol=1e-12, gtol=1e-11,
-        max_nfev=200,
-    )  # fmt: skip
-    return float(found.cost), at(found.x), bool(found.status > 0)
+    cost, v, converged = search_lines(residual, slope, here.theta[free])
+    return cost, at(v), converged
 
 
 def information(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[Array, float]:
@@ -138,31 +131,10 @@ def information(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[A
     """
     free = _free(model, feedthrough)
     J = ln.whitened(model.frequency_response_derivative(ln.omega)[..., free])
-    norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
-    used = int(np.count_nonzero(free)) - model.order**2
-    half = (vt[:used].T / np.maximum(s[:used], 1e-15 * s[0])) / norm[:, None]
+    own, condition = ln.covariance(J, int(np.count_nonzero(free)) - model.order**2)
     full = np.zeros((model.theta.size, model.theta.size))
-    full[np.ix_(free, free)] = half @ half.T * ln.widening
-    return full, float(s[0] / s[used - 1])
-
-
-def resample(ln: Lines, model: StateSpaceModel, again: Callable[[Complex], StateSpaceModel], count: int) -> Array:
-    """Return the scatter of an estimator's matrices over draws from the covariance of the response.
-
-    Draws are about the model's own response, with a fixed seed; each result is turned into the state of `model`.
-
-    `again`: estimates from a response, shape (n_frequencies, n_outputs, n_inputs). Returns (n_theta, n_theta).
-    """
-    rng = np.random.default_rng(1)
-    centre, factor = model.frequency_response(ln.omega), np.linalg.inv(ln.root)
-    draws = []
-    for _ in range(count):
-        z = rng.standard_normal((ln.n_lines, ln.entries, 2)) @ np.array([1.0, 1j]) / np.sqrt(2)
-        drawn = again(centre + (factor @ z[..., None])[..., 0].reshape(centre.shape))
-        draws.append(_align(drawn, model).theta)
-    scatter = np.stack(draws) - model.theta
-    return np.asarray(scatter.T @ scatter / count)
+    full[np.ix_(free, free)] = own
+    return full, condition
 
 
 def to_continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpaceModel, Array] | None:
@@ -217,21 +189,8 @@ def _balance(model: StateSpaceModel) -> StateSpaceModel:
     return _change_states(model, np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
 
 
-def _align(model: StateSpaceModel, like: StateSpaceModel) -> StateSpaceModel:
-    """A model in the state in which its observability matrix is nearest to another's."""
-    scale = max(float(np.max(np.abs(np.linalg.eigvals(like.A)))), 1e-300)
-
-    def observability(of: StateSpaceModel) -> Array:
-        rows = [of.C / np.maximum(np.linalg.norm(like.C, axis=1, keepdims=True), 1e-300)]
-        for _ in range(of.order):
-            rows.append(rows[-1] @ of.A / scale)
-        return np.vstack(rows)
-
-    T = np.linalg.lstsq(observability(model), observability(like), rcond=None)[0]
-    return _change_states(model, np.asarray(T, dtype=np.float64))
-
-
 _GRID = 9  # values of p that are tried
+_HIGHEST = 8  # order tried where it is to be chosen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -247,12 +206,9 @@ class _Asked:
     """What `frf_subspace` was asked for beside the order."""
 
     p: float | None
-    block_rows: int | None
     delay: float
     feedthrough: bool
     domain: Literal["s", "z"]
-    refine: bool
-    resamples: int
 
 
 def frf_subspace(
@@ -260,13 +216,9 @@ def frf_subspace(
     orders: Orders | Literal["auto"],
     *,
     p: float | None = None,
-    block_rows: int | None = None,
     delay: float = 0.0,
     feedthrough: bool = False,
     domain: Literal["s", "z"] = "s",
-    refine: bool = True,
-    max_order: int = 8,
-    resamples: int = 100,
 ) -> BlackBoxFit:
     """Identify a state space from a frequency response.
 
@@ -278,21 +230,12 @@ def frf_subspace(
         none does.
     p : float, optional, rad/s
         Of the Laguerre operator; default the one of least mean square error on a grid over the band.
-    block_rows : int, optional
-        Default 2 n + 2, as far as lines allow.
     delay : float, s
         Of all inputs, known; it is taken out, and stands in the details.
     feedthrough : bool
         Whether D is estimated; else 0. In z it is the direct path within a sample.
     domain : {"s", "z"}
         Of the result. z is for held inputs only.
-    refine : bool
-        Whether the likelihood is searched from the subspace estimate; standard deviations are then those of maximum
-        likelihood. If not, they are found by resampling.
-    max_order : int
-        Highest order tried by "auto".
-    resamples : int
-        Draws from the covariance of the response, with a fixed seed, where `refine` is false.
 
     Returns
     -------
@@ -305,32 +248,19 @@ def frf_subspace(
     EstimationError
         If orders, options or lines break a rule.
     """
-    n = _order(frf, orders, delay, domain, max_order)
-    asked = _Asked(
-        p=p, block_rows=block_rows, delay=delay, feedthrough=feedthrough, domain=domain, refine=refine,
-        resamples=resamples,
-    )  # fmt: skip
+    n = _order(frf, orders, delay, domain)
+    asked = _Asked(p=p, delay=delay, feedthrough=feedthrough, domain=domain)
     with one_thread():
         if n is None:
-            return _choose_order(frf, asked, max_order)
+            return _choose_order(frf, asked)
         return _of_order(frf, n, asked)
 
 
 def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
-    """One order: subspace, refinement or resampling, continuous form."""
-    n_y, n_u = frf.n_outputs, frf.n_inputs
+    """One order: subspace, refinement, continuous form."""
     ln, rows, best, n_estimated = _start(frf, n, asked)
-    feedthrough = asked.feedthrough
-    cost, model, converged = best.cost, best.model, True
-    if asked.refine:
-        cost, model, converged = refine_matrices(ln, model, feedthrough)
-        covariance, condition = information(ln, model, feedthrough)
-    else:
-
-        def again(response: Complex) -> StateSpaceModel:
-            return _trial(ln, response, n, rows, feedthrough, best.p).model
-
-        covariance, condition = resample(ln, model, again, asked.resamples) * ln.alike, None
+    cost, model, converged = refine_matrices(ln, best.model, asked.feedthrough)
+    covariance, condition = information(ln, model, asked.feedthrough)
     warnings = []
     if model.dt is not None and asked.domain == "s":
         found = to_continuous(model, covariance)
@@ -350,9 +280,7 @@ def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
         covariance=covariance,
         cost=cost,
         n_estimated=n_estimated,
-        offsets=Offsets(u=np.zeros(n_u), y=np.zeros(n_y)),
         converged=converged,
-        best=asked.refine,
         warnings=warnings,
         details={
             "p": best.p,
@@ -362,7 +290,7 @@ def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
             "condition_without": block_rows_condition(points, rows - 1),
             "condition_jacobian": condition,
             "delay_s": asked.delay,
-            "refined": asked.refine,
+            "refined": True,
             "subspace_cost": best.cost,
         },
     )
@@ -373,7 +301,6 @@ def _order(
     orders: Orders | Literal["auto"],
     delay: float,
     domain: str,
-    max_order: int,
 ) -> int | None:
     """Return the order, None where it is to be chosen; refuse what breaks a rule."""
     if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
@@ -390,15 +317,13 @@ def _order(
     check_order_names("frf-subspace", asked, ("n",))
     if not left_open(asked, "n"):
         return single_order("frf-subspace", asked, "n", 1)
-    if max_order < 1:
-        raise EstimationError(f"max_order is {max_order}; it must be at least 1. Raise it")
     return None
 
 
-def _choose_order(frf: FrequencyResponse, asked: _Asked, max_order: int) -> BlackBoxFit:
+def _choose_order(frf: FrequencyResponse, asked: _Asked) -> BlackBoxFit:
     """The lowest order that noise explains, else the one of least BIC."""
     m, tried, bic = 2 * frf.G.size, list[tuple[float, int]](), dict[str, float]()
-    for n in range(1, max_order + 1):
+    for n in range(1, _HIGHEST + 1):
         try:
             ln, _, trial, count = _start(frf, n, asked)
         except EstimationError:
@@ -421,7 +346,7 @@ def _start(frf: FrequencyResponse, n: int, asked: _Asked) -> tuple[Lines, int, _
     n_y, n_u = frf.n_outputs, frf.n_inputs
     n_estimated = n * (n_y + n_u) + (n_y * n_u if asked.feedthrough else 0)
     ln = _remove_delay(check_lines(frf, n_estimated), asked.delay)
-    rows = _block_rows(ln, n, asked.block_rows)
+    rows = _block_rows(ln, n)
     return ln, rows, _best_operator(ln, n, rows, asked.feedthrough, asked.p), n_estimated
 
 
@@ -430,18 +355,16 @@ def _remove_delay(ln: Lines, delay: float) -> Lines:
     return replace(ln, G=ln.G * np.exp(1j * ln.omega * delay)[:, None, None]) if delay else ln
 
 
-def _block_rows(ln: Lines, n: int, given: int | None) -> int:
-    """Rows enough for the order, and not more than the lines can tell apart."""
+def _block_rows(ln: Lines, n: int) -> int:
+    """Rows enough for the order, 2 n + 2 of them where the lines can tell so many apart."""
     n_y, n_u = ln.G.shape[1:]
-    least = n // n_y + 2
-    most = (2 * ln.n_lines * n_u) // (n_y + n_u)
-    rows = max(least, min(2 * n + 2, most // 2)) if given is None else given
-    if rows < least or rows > most:
+    least, most = n // n_y + 2, int(2 * ln.n_lines * n_u) // (n_y + n_u)
+    if least > most:
         raise EstimationError(
-            f"{rows} block rows for order {n} on {ln.n_lines} lines; it must be {least} to {most}. Give another "
-            "number, lower the order, or measure more lines"
+            f"order {n} wants {least} block rows, and {ln.n_lines} lines tell {most} apart. Lower the order, or "
+            "measure more lines"
         )
-    return rows
+    return int(max(least, min(2 * n + 2, most // 2)))
 
 
 def _points(ln: Lines) -> Complex:
@@ -452,14 +375,14 @@ def _points(ln: Lines) -> Complex:
 def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool, p: float | None) -> _Trial:
     """The p of least mean square error."""
     if p is not None:
-        return _trial(ln, ln.G, n, rows, feedthrough, p)
+        return _trial(ln, n, rows, feedthrough, p)
     omega = _points(ln).imag
     used = omega[omega > 0]
     grid = [best_conditioned(used, rows - 1), *np.geomspace(used[0], used[-1], _GRID + 2)[1:-1]]
     found = []
     for value in grid:
         try:
-            found.append(_trial(ln, ln.G, n, rows, feedthrough, float(value)))
+            found.append(_trial(ln, n, rows, feedthrough, float(value)))
         except np.linalg.LinAlgError:
             continue
     found = [t for t in found if np.isfinite(t.cost)]
@@ -468,11 +391,11 @@ def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool, p: float | N
     return min(found, key=lambda t: t.cost)
 
 
-def _trial(ln: Lines, G: Complex, n: int, rows: int, feedthrough: bool, p: float) -> _Trial:
+def _trial(ln: Lines, n: int, rows: int, feedthrough: bool, p: float) -> _Trial:
     """One subspace estimate: A and C from the column space, B and D from a linear fit."""
     points = _points(ln)
-    space, s = _column_space(ln, G, laguerre_operator(points.imag, p), n, rows)
-    n_y = G.shape[1]
+    space, s = _column_space(ln, laguerre_operator(points.imag, p), n, rows)
+    n_y = ln.G.shape[1]
     up, low = space[:-n_y], space[n_y:]
     A = np.asarray(p * np.linalg.lstsq(up - low, up + low, rcond=None)[0], dtype=np.float64)
     C = _output_matrix(A, space, p, n_y)
@@ -481,18 +404,18 @@ def _trial(ln: Lines, G: Complex, n: int, rows: int, feedthrough: bool, p: float
         dt, half = ln.dt, np.eye(n) - ln.dt / 2 * A
         A = np.asarray(np.linalg.solve(half, np.eye(n) + ln.dt / 2 * A), dtype=np.float64)
         C = np.asarray(np.linalg.solve(half.T, C.T).T, dtype=np.float64)
-    B, D, cost = _input_matrices(ln, G, A, C, feedthrough, dt)
+    B, D, cost = _input_matrices(ln, A, C, feedthrough, dt)
     model = StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((n, n_y)), dt=dt)
     return _Trial(model=model, cost=cost, p=p, singular_values=s)
 
 
-def _column_space(ln: Lines, G: Complex, w: Complex, n: int, rows: int) -> tuple[Array, Array]:
+def _column_space(ln: Lines, w: Complex, n: int, rows: int) -> tuple[Array, Array]:
     """Extended observability matrix (rows * n_outputs, n), and all singular values."""
-    n_f, n_y, n_u = G.shape
+    n_f, n_y, n_u = ln.G.shape
     output = np.sqrt(np.mean(ln.sd**2, axis=(0, 2)))  # outputs in units of their noise
     level = np.sqrt(np.mean((ln.sd / output[:, None]) ** 2, axis=(1, 2)))  # lines likewise
     powers = w[:, None] ** np.arange(rows)
-    scaled = G / output[:, None] / level[:, None, None]
+    scaled = ln.G / output[:, None] / level[:, None, None]
     Y = np.einsum("fk,fyu->kyfu", powers, scaled).reshape(rows * n_y, n_f * n_u)
     U = np.einsum("fk,vu,f->kvfu", powers, np.eye(n_u), 1.0 / level).reshape(rows * n_u, n_f * n_u)
     both = np.vstack([U, Y])
@@ -521,11 +444,9 @@ def _output_matrix(A: Array, space: Array, p: float, n_y: int) -> Array:
     return np.asarray(np.linalg.lstsq(wide.T, right.T, rcond=None)[0].T, dtype=np.float64)
 
 
-def _input_matrices(
-    ln: Lines, G: Complex, A: Array, C: Array, feedthrough: bool, dt: float | None
-) -> tuple[Array, Array, float]:
+def _input_matrices(ln: Lines, A: Array, C: Array, feedthrough: bool, dt: float | None) -> tuple[Array, Array, float]:
     """B and D by weighted linear least squares, and the cost."""
-    n, (n_f, n_y, n_u) = A.shape[0], G.shape
+    n, (n_f, n_y, n_u) = A.shape[0], ln.G.shape
     points = 1j * ln.omega if dt is None else np.exp(1j * ln.omega * dt)
     left = np.linalg.solve(
         np.swapaxes(points[:, None, None] * np.eye(n) - A, 1, 2),
@@ -535,7 +456,7 @@ def _input_matrices(
     if feedthrough:
         direct = np.einsum("yz,uv->yuzv", np.eye(n_y), np.eye(n_u)).reshape(n_y, n_u, n_y * n_u)
         columns = np.concatenate([columns, np.broadcast_to(direct, (n_f, *direct.shape))], axis=3)
-    a, b = ln.whitened(columns), ln.whitened(G)
+    a, b = ln.whitened(columns), ln.whitened(ln.G)
     norm = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     x = np.linalg.lstsq(a / norm, b, rcond=None)[0] / norm
     cost = float(np.sum((a @ x - b) ** 2)) / 2

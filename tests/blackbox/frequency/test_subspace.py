@@ -21,9 +21,10 @@ def test_exact_without_noise(name, hold):
     frf = replace(
         noisy(F, plant(name, F, hold=hold, delay=1), 1e-3, 1, hold=hold), G=plant(name, F, hold=hold, delay=1)
     )
-    fit = frf_subspace(frf, {"n": 3}, delay=1 / RATE, refine=False, resamples=2)
+    fit = frf_subspace(frf, {"n": 3}, delay=1 / RATE)
     np.testing.assert_allclose(np.sort_complex(fit.model.poles()), poles_of(name), rtol=1e-5, atol=1e-4)
     assert fit.model.dt is None
+    assert fit.details["subspace_cost"] < 1e-6  # before the search
     assert fit.details["singular_values"][3] < 1e-5
 
 
@@ -39,7 +40,7 @@ def test_four_by_four_of_order_eight():
     f = np.geomspace(5.0, 1000.0, 80)
     A, B, C = four_by_four()
     G = continuous(A, B, C, 2 * np.pi * f)
-    fit = frf_subspace(noisy(f, G, 0.01, 1), {"n": 8}, p=500.0, block_rows=8)
+    fit = frf_subspace(noisy(f, G, 0.01, 1), {"n": 8}, p=500.0)
     s = np.array(fit.details["singular_values"])
     assert s[7] > 10.0
     assert s[8] < 2.0  # the order is plain to see: noise alone is about 1
@@ -49,28 +50,26 @@ def test_four_by_four_of_order_eight():
     assert np.sqrt(np.mean(np.abs(error) ** 2 / np.abs(G) ** 2)) < 0.005
 
 
-@pytest.mark.parametrize(("refine", "runs"), [(True, 60), (False, 25)])
-def test_intervals_are_honest(refine, runs):
-    true, z, cost = poles_of("unstable-bearing"), [], []
+def test_intervals_are_honest():
+    runs, true, z, cost = 60, poles_of("unstable-bearing"), [], []
     f = np.linspace(5.0, 1000.0, 60)
     G = plant("unstable-bearing", f)
     for seed in range(runs):
-        fit = frf_subspace(noisy(f, G, 0.01, seed), {"n": 3}, p=250.0, refine=refine, resamples=60)
+        fit = frf_subspace(noisy(f, G, 0.01, seed), {"n": 3}, p=250.0)
         order = np.argsort(fit.model.poles())
         sd = np.sqrt(np.diagonal(pole_covariance(fit.model, fit.covariance), axis1=1, axis2=2))[order]
         error = fit.model.poles()[order] - true
         z.append([error[0].real / sd[0, 0], error[0].imag / sd[0, 1], error[2].real / sd[2, 0]])
         cost.append(fit.details["cost"] / fit.details["expected_cost"])
     z = np.array(z)
-    # the plain estimate has a bias of second order in the noise; the refined one none to speak of
-    assert np.all(np.abs(z.mean(axis=0)) < 3.3 / np.sqrt(runs) + (0.0 if refine else 0.6))
+    assert np.all(np.abs(z.mean(axis=0)) < 3.3 / np.sqrt(runs))
     assert np.all(np.sqrt(np.mean(z**2, axis=0)) < 1.35)
     assert np.all(np.sqrt(np.mean(z**2, axis=0)) > 0.65)
-    assert np.mean(cost) == pytest.approx(1.0, abs=0.05) if refine else np.mean(cost) > 1.0
+    assert np.mean(cost) == pytest.approx(1.0, abs=0.05)
 
 
 def test_the_operator_is_what_makes_it_work():
-    fit = frf_subspace(noisy(F, plant("unstable-bearing", F), 0.01, 2), {"n": 3}, block_rows=16)
+    fit = frf_subspace(noisy(F, plant("unstable-bearing", F), 0.01, 2), {"n": 7})
     assert fit.details["condition"] < 100.0
     assert fit.details["condition_without"] > 1e5
     assert F[0] * 2 * np.pi <= fit.details["p"] <= 20 * np.pi * F[-1]
@@ -78,7 +77,7 @@ def test_the_operator_is_what_makes_it_work():
 
 def test_order_by_itself():
     frf = noisy(F, plant("unstable-bearing", F), 0.01, 2)
-    fit = frf_subspace(frf, {"n": "auto"}, max_order=5)
+    fit = frf_subspace(frf, {"n": "auto"})
     assert fit.orders == {"n": 3}
     assert list(fit.details["bic_by_order"]) == ["1", "2", "3"]
 
@@ -140,10 +139,7 @@ def test_a_part_of_a_sample_under_a_hold_is_refused():
         ({"n": 3}, {"domain": "z"}, "held"),
         ({"n": 3}, {"delay": -1.0}, "delay"),
         ({"n": 3}, {"p": -5.0}, "positive"),
-        ({"n": 3}, {"block_rows": 2}, "block rows"),
-        ({"n": 3}, {"block_rows": 1000}, "block rows"),
         ({"n": 500}, {}, "too few"),
-        ("auto", {"max_order": 0}, "max_order"),
     ],
 )
 def test_what_breaks_a_rule_is_refused(orders, options, message):
