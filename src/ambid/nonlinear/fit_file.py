@@ -94,7 +94,7 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:read_model",
         "hammerstein": "ambid.nonlinear.hammerstein:read_model",
-        "lpv": "ambid.nonlinear.lpv.model:LpvModel.from_json",
+        "lpv": "ambid.nonlinear.lpv_model:LpvModel.from_json",
     }
 )
 """Who reads a model, ``module:function`` by `NonlinearModel.kind`; imported only when one of that kind is read."""

@@ -78,8 +78,8 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="lpv",
         summary="linear model whose coefficients follow a scheduling signal such as the set point; error model",
-        options="ambid.nonlinear.lpv.shape:LpvOptions",
-        home="ambid.nonlinear.lpv.estimate:lpv",
+        options="ambid.nonlinear.lpv:LpvSettings",
+        home="ambid.nonlinear.lpv:lpv",
         feedback="with noise model",
     ),
     NonlinearStructure(

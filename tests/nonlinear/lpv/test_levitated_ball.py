@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import io_data
-from ambid.nonlinear.lpv.estimate import lpv
+from ambid.nonlinear.lpv import lpv
 from ambid.physics.loop import placed_loop
 from ambid.physics.presets import preset
 from ambid.simulate import simulate

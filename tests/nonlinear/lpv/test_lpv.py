@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.nonlinear.lpv.estimate import lpv
+from ambid.nonlinear.lpv import lpv
 from ambid.validate.nonlinear import judge
 from tests.nonlinear.lpv.plants import damped, levitated, record, truth
 
@@ -173,21 +173,6 @@ def test_records_at_single_set_points_are_joined():
     assert any("set points" in w for w in one_more.warnings)
 
 
-def test_the_error_model_may_be_scheduled():
-    data = record(3, 4000)
-    rng = np.random.default_rng(30)
-    v, p = np.zeros(4000), data.u[:, 1]
-    for k in range(1, 4000):
-        v[k] = (0.9 - 0.8 * p[k]) * v[k - 1] + 0.1 * rng.standard_normal()
-    data = replace(data, y=record(3, 4000, noise=0.0).y + v[:, None])
-    fit = lpv([data], {**KNOWN, "error_order": 1, "error_degree": 1})
-    for q in (0.2, 0.8):
-        at = fit.model.at(q, fit.covariance)
-        assert abs(at.d[1] + 0.9 - 0.8 * q) < 4 * at.d_sd[1]
-    fixed = lpv([data], {**KNOWN, "error_order": 1})
-    assert fit.noise_covariance[0, 0] < 0.97 * fixed.noise_covariance[0, 0]
-
-
 def test_hats_follow_a_kink():
     def kinked(p):
         return np.array([-1.2 + 0 * p, 0.5 + 0 * p]), np.array([0.3 + np.maximum(p - 0.5, 0), 0 * p])
@@ -277,7 +262,6 @@ def test_a_scheduling_input_alone_is_told_of():
     ("settings", "what"),
     [
         ({"error_form": "white", "error_order": 5}, "error_form = white"),
-        ({"error_degree": 2, "error_order": 0}, "error_degree = 2"),
         ({"schedule": "gap"}, "an input, the output or level"),
         ({"schedule": "p", "time_constant": 0.1}, "time_constant"),
         ({"exciting": "yes"}, "exciting"),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.lpv.candidates import (
+from ambid.nonlinear.lpv import lpv
+from ambid.nonlinear.lpv_choice import (
     LpvProblem,
     carry_over,
     information,
@@ -14,12 +15,11 @@ from ambid.nonlinear.lpv.candidates import (
     slowest_that_does,
     time_constants,
 )
-from ambid.nonlinear.lpv.estimate import lpv
-from ambid.nonlinear.lpv.shape import LpvShape, Schedule, basis_values, beginning, errors, is_sound, part_of, settling
+from ambid.nonlinear.lpv_model import LpvShape, Schedule, basis_values, beginning, errors, part_of, settling
 from tests.nonlinear.lpv.plants import record
 
 
-def shape_of(form="output", ar=2, ma=1, degree=1, error_degree=0, basis="legendre", offset="scheduled"):
+def shape_of(form="output", ar=2, ma=1, degree=1, basis="legendre", offset="scheduled"):
     return LpvShape(
         columns=(0,),
         order=2,
@@ -28,7 +28,6 @@ def shape_of(form="output", ar=2, ma=1, degree=1, error_degree=0, basis="legendr
         ar=ar,
         ma=ma,
         degree=degree,
-        error_degree=error_degree,
         form=form,
         basis=basis,
         offset=offset,
@@ -55,9 +54,9 @@ def signals(n=60, seed=1):
 
 def by_hand(shape, theta, y, u, s):
     """The difference equations as `shape` writes them, with loops."""
-    phi, psi = (basis_values(s, k + 1, shape.basis) for k in (shape.degree, shape.error_degree))
+    phi = basis_values(s, shape.degree + 1, shape.basis)
     places = [theta[shape.place(k)] for k in range(len(shape.coefficients))]
-    c = [(phi if k < shape.n_process else psi)[:, : x.size] @ x for k, x in enumerate(places)]
+    c = [phi[:, : x.size] @ x if k < shape.n_process else np.full(s.size, x[0]) for k, x in enumerate(places)]
     a1, a2, b1, b2, offset, d1, d2, c1 = c
     x, e = y.copy(), np.zeros(y.size)
     for t in range(2, y.size):
@@ -71,10 +70,9 @@ def by_hand(shape, theta, y, u, s):
 
 @pytest.mark.parametrize("form", ["equation", "output"])
 @pytest.mark.parametrize("basis", ["legendre", "hats"])
-@pytest.mark.parametrize("error_degree", [0, 2])
 @pytest.mark.parametrize("offset", ["scheduled", "constant"])
-def test_innovations_are_those_of_the_equations(form, basis, error_degree, offset):
-    shape = shape_of(form, degree=2, error_degree=error_degree, basis=basis, offset=offset)
+def test_innovations_are_those_of_the_equations(form, basis, offset):
+    shape = shape_of(form, degree=2, basis=basis, offset=offset)
     assert shape.n_theta == len(shape.names) == theta_of(shape).size
     assert shape.place(shape.n_process - 1).stop == shape.n_process_theta
     y, u, s = signals()
@@ -89,10 +87,9 @@ def test_innovations_are_those_of_the_equations(form, basis, error_degree, offse
 
 @pytest.mark.parametrize("form", ["equation", "output"])
 @pytest.mark.parametrize(("ar", "ma"), [(0, 0), (2, 0), (0, 1), (2, 1)])
-@pytest.mark.parametrize("error_degree", [0, 1])
 @pytest.mark.parametrize("offset", ["scheduled", "constant"])
-def test_derivatives_are_exact(form, ar, ma, error_degree, offset):
-    shape = shape_of(form, ar=ar, ma=ma, degree=2, error_degree=error_degree, offset=offset)
+def test_derivatives_are_exact(form, ar, ma, offset):
+    shape = shape_of(form, ar=ar, ma=ma, degree=2, offset=offset)
     y, u, s = signals()
     part, theta = part_of(shape, y, u, s), theta_of(shape)
     start = 0.3 * np.arange(1.0, shape.n_start + 1)
@@ -112,7 +109,7 @@ def test_derivatives_are_exact(form, ar, ma, error_degree, offset):
 
 @pytest.mark.parametrize("form", ["equation", "output"])
 def test_predictions_from_an_estimated_beginning_have_exact_derivatives(form):
-    shape = shape_of(form, degree=2, error_degree=1)
+    shape = shape_of(form, degree=2)
     y, u, s = signals()
     part, theta = part_of(shape, y, u, s), theta_of(shape)
     lag = shape.lag + settling(shape)
@@ -173,12 +170,12 @@ def test_an_unstable_predictor_counts_as_infinitely_bad():
     for name, value in (("c1", 1.2), ("a2", 1.1)):
         worse = theta.copy()
         worse[shape.place(shape.coefficients.index(name)).start] = value
-        assert not is_sound(shape, worse)
+        assert not shape.is_sound(worse)
         assert problem.cost(worse) == np.inf
     equation = shape_of("equation")
     worse = theta_of(equation)
     worse[equation.place(1).start] = 1.1
-    assert is_sound(equation, worse)  # its predictor does not feed x back
+    assert equation.is_sound(worse)  # its predictor does not feed x back
 
 
 def test_the_free_run_follows_its_own_set_point():

@@ -6,42 +6,124 @@ the one-step errors -> Levenberg-Marquardt with exact derivatives. Starts come f
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, portions
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit, provenance
-from ambid.nonlinear.lpv.candidates import (
+from ambid.nonlinear.lpv_choice import (
+    DEGREES,
     Candidate,
     Fitting,
     by_degree,
     by_form,
     carry_over,
     choose_level,
-    least_squares,
-    other_degrees,
-    search_from,
+    error_orders,
     wanted_shapes,
 )
-from ambid.nonlinear.lpv.model import LpvModel, regressors
-from ambid.nonlinear.lpv.shape import LpvSettings, LpvShape, Schedule, looks_back, lpv_settings, schedule_over
+from ambid.nonlinear.lpv_model import BASES, LEVEL, LpvModel, LpvShape, Schedule, looks_back, regressors
 from ambid.nonlinear.records import scaled_records
+from ambid.nonlinear.settings import choice, number, read_settings, text, whole
 
 DIVERGED = "no one-step predictor that stays finite was found; lower degree, order or error_order, or check the columns"
 UNSTABLE = (
     "the output form cannot be fitted: its process part diverges over the records, as that of an unstable plant does. "
     "Say form = equation"
 )
+_CRITERION = "aicc"  # what chooses the degree
 _POINTS = 9  # of the table over the range of p
 _CLOSE = 2.0  # difference of Akaike's criterion that says nothing (Burnham and Anderson 2002, sec. 2.6)
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpvSettings:
+    """What an LPV fit may be given. None: to be chosen."""
+
+    schedule: str = text(
+        "scheduling signal: an input, the output, or level (set point: output, low-passed); level", LEVEL
+    )
+    time_constant: float | None = number(
+        "of the low-pass of level, in s; chosen, at least five of the plant's own", 0.0, 1e9
+    )
+    exciting: str = choice("yes where the scheduling input acts on the output as well; no", "no", "yes")
+    order: int = whole("of the system model; 2", 1, 10, 2)
+    nb: int | None = whole("coefficients of each input; order", 0, 50)
+    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
+    degree: int | None = whole("of the coefficients in the scheduling signal; chosen, up to 3", 0, 8)
+    basis: str = choice("legendre (polynomials) or hats (piecewise linear, degree pieces); legendre", *BASES)
+    form: str = choice(
+        "output (noise on the output) or equation (noise in it; unstable plants); chosen by bic",
+        *("auto", "equation", "output"),
+    )
+    error_order: int | None = whole("of the error model, 0 for white noise; 5", 0, 20)
+    error_form: str = choice("ar, ma, arma; chosen by bic", "auto", "white", "ar", "ma", "arma")
+    iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
+
+    @property
+    def orders(self) -> tuple[tuple[int, int], ...]:
+        """Orders of D and C to try."""
+        return error_orders(self.error_form, self.error_order or 0)
+
+
+def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule, tuple[int, ...]]:
+    """Check settings beside one of the records, and complete them; with schedule and inputs that excite."""
+    s = read_settings(LpvSettings, "lpv", given)
+    if first.n_outputs != 1:
+        raise EstimationError(
+            f"lpv takes one output, not {', '.join(first.outputs)}; fit them one after the other, with the same "
+            "schedule. Name one"
+        )
+    column = _schedule_column(s.schedule, first)
+    excites = s.exciting == "yes"
+    if excites and column < 0:
+        raise EstimationError(
+            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {s.schedule} is none. Leave "
+            "it out"
+        )
+    if s.time_constant and s.schedule != LEVEL:
+        raise EstimationError(
+            f"lpv: time_constant is that of schedule = level; with schedule = {s.schedule} the column is taken as it "
+            "is. Leave it out"
+        )
+    order = s.error_order
+    if order is None:
+        order = 0 if s.error_form == "white" else 5
+    if order > 0 and s.error_form == "white":
+        raise EstimationError(f"lpv: error_form = white has no coefficients, but error_order = {order}. Leave one out")
+    tau = s.time_constant if s.schedule == LEVEL else 0.0
+    s = replace(s, error_order=order, nb=s.order if s.nb is None else s.nb, time_constant=tau)
+    columns = tuple(k for k in range(first.n_inputs) if k != column or excites)
+    return s, Schedule(name=s.schedule, column=column), columns
+
+
+def _schedule_column(name: str, first: IOData) -> int:
+    """Return which input a schedule names; -1 where the scheduling signal is made of the output."""
+    columns = (*first.inputs, *first.outputs)
+    if name == LEVEL:
+        if LEVEL in columns:
+            raise EstimationError(
+                "lpv: schedule = level means the low-passed output, but there is a column of that name. Rename "
+                "the column"
+            )
+        return -1
+    if name not in columns:
+        raise EstimationError(
+            f"lpv: schedule is {name!r}; it must be an input, the output or level: {', '.join((*columns, LEVEL))}. "
+            f"Name the column as an input too; it does not excite unless exciting = yes.{nearest(name, list(columns))}"
+        )
+    return first.inputs.index(name) if name in first.inputs else -1
+
 
 # --- stages -----------------------------------------------------------------------------------------------------------
 
@@ -55,9 +137,9 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     """
     if not records:
         raise EstimationError("lpv: no record is given. Pass one at least")
-    s = lpv_settings(settings, records[0])
+    s, schedule, columns = lpv_settings(settings, records[0])
     began = perf_counter()
-    fitting = _begin(s, records)
+    fitting = _begin(s, records, schedule, columns)
     reason = ""
     try:
         reason = _identify(s, fitting, tick)
@@ -75,80 +157,75 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
         reason = DIVERGED
     if reason:
         return failed_fit("lpv", records, used, seed, reason, fitting.timing_s)
-    return finish(records, used, fitting, seed=seed)
+    return _finish(records, used, fitting, seed=seed)
 
 
-def _begin(s: LpvSettings, records: Sequence[IOData]) -> Fitting:
+def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, columns: tuple[int, ...]) -> Fitting:
     """A model by least squares: something to hand over when the very next thing is an interruption."""
-    tau = 0.0 if s.column >= 0 else (s.time_constant if s.time_constant is not None else 50.0 * records[0].dt)
-    last = Schedule(name=s.schedule, column=s.column, time_constant=tau, low=0.0, high=0.0).share(records[0].dt) == 1.0
+    assert s.nb is not None
+    assert s.error_order is not None
+    tau = 50.0 * records[0].dt if s.time_constant is None else s.time_constant
+    last = replace(schedule, time_constant=tau).share(records[0].dt) == 1.0
     shape = LpvShape(
-        columns=s.columns, order=s.order, nb=s.nb, nk=s.nk, ar=0, ma=0, degree=s.degree or 0,
-        error_degree=s.error_degree, form="equation", basis=s.basis, offset="constant" if last else "scheduled",
+        columns=columns, order=s.order, nb=s.nb, nk=s.nk, ar=0, ma=0, degree=s.degree or 0, form="equation",
+        basis=s.basis, offset="constant" if last else "scheduled",
     )  # fmt: skip
     first = shape.first + s.error_order
     for r, x in enumerate(records):  # before it is said that a scheduling column does not excite
         if (x.inputs, x.outputs) != (records[0].inputs, records[0].outputs):
             scaled_records("lpv", records, lag=first)
-        if r == 0 and s.column >= 0:
-            schedule_over(records, s.schedule, s.column, 0.0)
-    data = scaled_records("lpv", records, lag=max(first, min(looks_back(x) for x in wanted_shapes(s, shape))))
-    _long_enough(s, shape, sum(x.n_samples - first for x in records))
-    fitting = Fitting(
-        data=data,
-        records=records,
-        schedule=schedule_over(records, s.schedule, s.column, tau),
-        shape=shape,
-        theta=np.zeros(shape.n_theta),
-        first=first,
-    )
-    fitting.theta = least_squares(shape, fitting.parts(shape), first)[0]
-    return fitting
-
-
-def _long_enough(s: LpvSettings, shape: LpvShape, n: int) -> None:
-    """Refuse records that have no more samples than the numbers asked for: those fit anything."""
-    k = shape.n_theta + s.error_order * (s.error_degree + 1) * (2 if s.error_form == "arma" else 1)
-    if n <= k + 1:
+        if r == 0 and schedule.column >= 0:
+            schedule.over(records, 0.0)
+    least = min(looks_back(x) for x in wanted_shapes(shape, s.form, s.orders))
+    data = scaled_records("lpv", records, lag=max(first, least))
+    n, k = sum(x.n_samples - first for x in records), shape.n_theta + s.error_order * (1 + (s.error_form == "arma"))
+    if n <= k + 1:  # these fit anything
         raise EstimationError(
             f"lpv: {n} samples are left after lags for {k} numbers. Give longer records, or lower "
             f"{'order or error_order' if s.degree is None else 'degree, order or error_order'}"
         )
+    fitting = Fitting(
+        data=data, records=records, schedule=schedule.over(records, tau), shape=shape, theta=np.zeros(shape.n_theta),
+        first=first, most=s.iterations,
+    )  # fmt: skip
+    fitting.theta = fitting.by_equations(shape)
+    return fitting
 
 
 def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
     """Settings with nothing left open."""
     of = fitting.shape
     form = {(False, False): "white", (True, False): "ar", (False, True): "ma", (True, True): "arma"}
-    return {
-        **s.as_mapping(),
-        "degree": of.degree,
-        "time_constant": fitting.schedule.time_constant,
-        "error_order": max(of.ar, of.ma),
-        "form": of.form,
-        "error_form": form[of.ar > 0, of.ma > 0],
-    }
+    found = {
+        "degree": of.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(of.ar, of.ma),
+        "form": of.form, "error_form": form[of.ar > 0, of.ma > 0],
+    }  # fmt: skip
+    return {**asdict(s), **found}
 
 
 def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
     """Choose and fit; returns why there is no model, or nothing."""
     ticks = portions(tick, (1.0, 4.0, 10.0, 0.0 if s.degree is not None else 6.0, 10.0))
+    order = s.error_order or 0
     began = perf_counter()
     if ticks[0] is not None:
         ticks[0]("set point", 0.0)
     if s.time_constant is None:
-        tau = choose_level(s, fitting, ticks[0])
-        fitting.schedule = schedule_over(fitting.records, s.schedule, s.column, tau)
-        fitting.theta = least_squares(fitting.shape, fitting.parts(fitting.shape), fitting.first)[0]
+        fitting.schedule = choose_level(fitting, order, s.degree, ticks[0])
+        fitting.theta = fitting.by_equations(fitting.shape)
     fitting.timing_s["set point"], began = perf_counter() - began, perf_counter()
-    best = by_degree(s, fitting, ticks[1])
+    degrees = DEGREES if s.degree is None else (s.degree,)
+    best = by_degree(fitting, degrees, replace(fitting.shape, ar=order), _CRITERION, ticks[1])
     fitting.timing_s["degree"], began = perf_counter() - began, perf_counter()
-    best = other_degrees(s, fitting, by_form(s, fitting, best, ticks[2]), ticks[3])
+    best = by_form(fitting, wanted_shapes(best.shape, s.form, s.orders), best, ticks[2])
+    if s.degree is None and np.isfinite(best.cost):  # a wrong form or error model may have decided on the degree
+        others = [d for d in DEGREES if d != best.shape.degree]
+        best = by_degree(fitting, others, best, _CRITERION, ticks[3])
     fitting.timing_s["form"], began = perf_counter() - began, perf_counter()
     if not np.isfinite(best.cost):
         return UNSTABLE if s.form == "output" else DIVERGED
     fitting.shape, fitting.theta = best.shape, best.theta
-    search_from(fitting, best.shape, best.theta, s.iterations, ticks[4], "prediction errors", last=True)
+    fitting.search(best.shape, [best.theta], ticks[4], "prediction errors", last=True)
     fitting.timing_s["search"] = perf_counter() - began
     return ""
 
@@ -156,14 +233,23 @@ def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitting, *, seed: int) -> NonlinearFit:
+def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting, *, seed: int) -> NonlinearFit:
     """Return the fit of a model that runs; `used` are the settings."""
-    problem, theta = fitting.problem(fitting.shape), fitting.theta
+    problem, theta, of, d = fitting.problem(fitting.shape), fitting.theta, fitting.schedule, fitting.data
     noise = problem.cost(theta) / problem.freedom
     R = problem.triangle(theta)
     inverse, condition = information_inverse(R[:, :-1]) if np.all(np.isfinite(R)) else (None, np.inf)
-    model = _make_model(records, fitting)
-    warnings = [*fitting.warnings, *_caution(records, fitting)]
+    near = [
+        regressors(fitting.shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
+        for x, (y, u) in zip(records, d.parts, strict=True)
+    ]
+    model = LpvModel(
+        dt=records[0].dt, n_inputs=records[0].n_inputs, shape=fitting.shape, schedule=of, theta=theta,
+        u_level=d.u_level, u_scale=d.u_scale, y_level=d.y_level, y_scale=d.y_scale,
+        cloud=cloud_of(np.concatenate(near)),
+    )  # fmt: skip
+    model = model.with_theta(theta * model.unit)
+    warnings = [*fitting.warnings, *_cautions(records, fitting)]
     covariance = None
     if inverse is None:
         warnings.append(
@@ -172,14 +258,15 @@ def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitti
         )
     else:
         covariance = (noise * inverse + _disagreement(fitting)) * model.unit[:, None] * model.unit
+    column = records[0].outputs[0] if of.column < 0 else of.name
     return NonlinearFit(
         structure="lpv",
-        settings=dict(used),
+        settings=used,
         model=model,
         covariance=covariance,
         covariance_from="" if covariance is None else "information",
         n_estimated=int(theta.size),
-        noise_covariance=np.array([[noise * float(fitting.data.y_scale[0]) ** 2]]),
+        noise_covariance=np.array([[noise * float(d.y_scale[0]) ** 2]]),
         seed=seed,
         status=fitting.status,
         curves=tuple(fitting.curves),
@@ -187,42 +274,21 @@ def finish(records: Sequence[IOData], used: Mapping[str, object], fitting: Fitti
         timing_s=dict(fitting.timing_s),
         details={
             "schedule": {
-                "signal": fitting.schedule.name,
-                "low": fitting.schedule.low,
-                "high": fitting.schedule.high,
-                "time_constant_s": fitting.schedule.time_constant,
-                "unit": records[0].units[records[0].outputs[0] if model.schedule.column < 0 else fitting.schedule.name],
+                "signal": of.name,
+                "low": of.low,
+                "high": of.high,
+                "time_constant_s": of.time_constant,
+                "unit": records[0].units[column],
             },
             "condition": condition,
-            "frozen": frozen_table(model, covariance, records[0].inputs),
+            "frozen": _frozen_table(model, covariance, records[0].inputs),
             "tried": [x.summary() for x in fitting.tried],
         },
         **provenance(records),
     )
 
 
-def _make_model(records: Sequence[IOData], fitting: Fitting) -> LpvModel:
-    d, of = fitting.data, fitting.schedule
-    seen = [
-        regressors(fitting.shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
-        for x, (y, u) in zip(records, d.parts, strict=True)
-    ]
-    model = LpvModel(
-        dt=records[0].dt,
-        n_inputs=records[0].n_inputs,
-        shape=fitting.shape,
-        schedule=of,
-        theta=fitting.theta,
-        u_level=d.u_level,
-        u_scale=d.u_scale,
-        y_level=d.y_level,
-        y_scale=d.y_scale,
-        cloud=cloud_of(np.concatenate(seen)),
-    )
-    return model.with_theta(fitting.theta * model.unit)
-
-
-def frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:
+def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:
     """Return poles and gains over the range of the scheduling signal, by value of p.
 
     ``poles_rad_s`` has real and imaginary part and their standard deviations, ``dc_gain`` value and standard deviation
@@ -248,7 +314,7 @@ def _number(x: float) -> float | None:
     return float(x) if np.isfinite(x) else None
 
 
-def _caution(records: Sequence[IOData], fitting: Fitting) -> list[str]:
+def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
     found = []
     of = fitting.shape
     if of.columns and not (of.ar or of.ma) and not all(x.open_loop for x in records):
@@ -267,7 +333,13 @@ def _caution(records: Sequence[IOData], fitting: Fitting) -> list[str]:
             f"no coefficient depends on the scheduling signal {fitting.schedule.name!r} (degree 0"
             f"{'' if not fitting.tried or len(fitting.tried) < 2 else ', by the criterion'}): this is a linear model"
         )
-    return found + _close_calls(fitting)
+    close = [str(x.shape.degree) for x, worse in _other_degrees(fitting) if abs(worse) < _CLOSE]
+    if close:
+        found.append(
+            f"degree {of.degree} is a close call: degree {' and '.join(close)} would explain the data about as well. "
+            "The standard deviations count what these differ by. Name the degree if you know it"
+        )
+    return found
 
 
 def _other_degrees(fitting: Fitting) -> list[tuple[Candidate, float]]:
@@ -294,14 +366,3 @@ def _disagreement(fitting: Fitting) -> Array:
     total = 1.0 + sum(w for w, _ in found)
     out: Array = sum((w / total * np.outer(d, d) for w, d in found), np.zeros((theta.size, theta.size)))
     return out
-
-
-def _close_calls(fitting: Fitting) -> list[str]:
-    """Other degrees that the data hardly tell from the chosen one, everything else alike."""
-    close = [str(x.shape.degree) for x, worse in _other_degrees(fitting) if abs(worse) < _CLOSE]
-    if not close:
-        return []
-    return [
-        f"degree {fitting.shape.degree} is a close call: degree {' and '.join(close)} would explain the data about as "
-        "well. The standard deviations count what these differ by. Name the degree if you know it"
-    ]

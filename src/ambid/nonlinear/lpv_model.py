@@ -1,0 +1,619 @@
+"""The equations of an LPV model on scaled signals, its predictor, the model, and what it is where p stands still.
+
+p is a column among the inputs (its value now), the output (its last value), or ``level``: the set point, as a causal
+first-order low-pass of the output before the present sample. It is scaled to -1 ... 1 over the training data; a
+coefficient is a sum of Legendre polynomials of it, or of hats (piecewise linear).
+
+Equation form: A(q, p) y = B(q, p) u + c(p) + v; output form: A(q, p) x = B(q, p) u + c(p), y = x + v; both with the
+error model D(q) v = C(q) e. Coefficients at time t are functions of p(t), and stand before the shifted signals:
+(A y)(t) = y(t) + a_1(p(t)) y(t - 1) + ... (Toth 2010, sec. 3.1: static dependence, shifted form). Operators do not
+commute with p, so that this is another model than one with p(t - k).
+
+States of the output form and first innovations, w, are those that make the innovations of the first samples small:
+min |e(theta, w)|^2 + w' Lambda w, with Lambda from their own size beside the innovations'. e is linear in w. Without
+it, a zero of C near the unit circle keeps an error of these alive for its time constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.blackbox.roots import root_derivative, roots_of, stable
+from ambid.errors import EstimationError
+from ambid.nonlinear.cloud import Cloud
+from ambid.nonlinear.signals import finite, scaled, with_head
+
+Complex = NDArray[np.complex128]
+
+LEVEL = "level"
+BASES = ("legendre", "hats")
+_EACH = 4  # samples for each number that stands for what was before
+_STATES = 0.01  # variance of an innovation over that of what a state differs by
+_FAR = 1e6  # times the typical size of the output: a recursion that is beyond has diverged
+
+# --- schedule ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Schedule:
+    """A scheduling signal."""
+
+    name: str  # of the column; ``level`` for the set point
+    column: int  # which input it is; -1 where it is made of the output
+    # of the low-pass; 0 for the last value of the output itself. Without meaning for a column of the inputs.
+    time_constant: float = 0.0
+    low: float = 0.0  # range in training
+    high: float = 0.0
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range, SI."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half(self) -> float:
+        """Half the range, SI."""
+        return 0.5 * (self.high - self.low)
+
+    def share(self, dt: float) -> float:
+        """Return the weight of the newest output in the low-pass; 0 for a column of the inputs, which has none."""
+        if self.column >= 0:
+            return 0.0
+        return 1.0 if self.time_constant <= 0 else -math.expm1(-dt / self.time_constant)
+
+    def signal(self, u: Array, y: Array, dt: float) -> Array:
+        """Return the scheduling signal, (n_samples,), of inputs and outputs; all in SI.
+
+        The low-pass begins as the mean of all samples so far.
+        """
+        from scipy.signal import lfilter
+
+        if self.column >= 0:
+            return np.ascontiguousarray(u[:, self.column])
+        share, level = self.share(dt), np.empty(y.shape[0])
+        n = min(y.shape[0], max(int(1.0 / share), 1))
+        level[:n] = np.cumsum(y[:n, 0]) / np.arange(1.0, n + 1.0)
+        if n < y.shape[0]:
+            level[n:] = lfilter([share], [1.0, share - 1.0], y[n:, 0], zi=[(1.0 - share) * level[n - 1]])[0]
+        return np.concatenate([y[:1, 0], level[:-1]])
+
+    def over(self, records: Sequence[IOData], time_constant: float) -> Schedule:
+        """Return the schedule with a low-pass, and the range that it then has in the records."""
+        of = replace(self, time_constant=time_constant)
+        whole = np.concatenate([of.signal(x.u, x.y, x.dt)[1:] for x in records])
+        low, high = float(whole.min()), float(whole.max())
+        if not high - low > 1e-12 * max(abs(low), abs(high)):
+            raise EstimationError(
+                f"lpv: the scheduling signal {self.name!r} is constant at {low:g}; a model that is scheduled by it "
+                "cannot be told from a linear one. Give records at several set points, or fit a linear structure (bj, "
+                "ararmax)"
+            )
+        return replace(of, low=low, high=high)
+
+    def scaled(self, p: Array | float) -> Array:
+        """Return p as the functions of it take it, -1 to 1 in training."""
+        return np.asarray((np.asarray(p, dtype=np.float64) - self.middle) / self.half)
+
+
+def basis_values(s: Array, n: int, basis: str) -> Array:
+    """Return `n` functions (degree + 1) of the scaled scheduling signal, (n_samples, n)."""
+    from ambid.nonlinear.lpv_kernels import basis_rows
+
+    out = np.empty((s.size, n))
+    basis_rows(np.ascontiguousarray(s), BASES.index(basis), out)
+    return out
+
+
+# --- equations --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpvShape:
+    """Orders of an LPV model of one output."""
+
+    columns: tuple[int, ...]  # which inputs excite
+    order: int  # of A
+    nb: int  # coefficients of each input, and the smallest lag
+    nk: int
+    ar: int  # orders of D and C
+    ma: int
+    degree: int  # functions of p less one, in A, B, c
+    form: str  # whether v enters the difference equation or the output
+    basis: str
+    # whether c is a function of p. Where p is the last output itself c(p) says nothing that a_1(p) y(t - 1) does not.
+    offset: str = "scheduled"
+
+    @property
+    def first(self) -> int:
+        """Samples before the process part can be computed."""
+        return max(self.order, self.nk + self.nb - 1 if self.columns else 0, 1)
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return self.first + self.ar
+
+    @property
+    def n_process(self) -> int:
+        """Coefficients of A, B and the constant, each a function of p."""
+        return self.order + len(self.columns) * self.nb + 1
+
+    @property
+    def n_offset(self) -> int:
+        """Functions of p in the constant."""
+        return 1 if self.offset == "constant" else self.degree + 1
+
+    @property
+    def n_process_theta(self) -> int:
+        """Number of parameters of A, B and the constant, which are the first ones."""
+        return (self.n_process - 1) * (self.degree + 1) + self.n_offset
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters."""
+        return self.n_process_theta + self.ar + self.ma
+
+    @property
+    def n_states(self) -> int:
+        """States of the output form before a record."""
+        return self.order if self.form == "output" else 0
+
+    @property
+    def n_start(self) -> int:
+        """Numbers that stand for what was before a record: states of the output form, first innovations."""
+        return self.n_states + self.ma
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the coefficients, in the order of theta."""
+        out = [f"a{k + 1}" for k in range(self.order)]
+        for i in range(len(self.columns)):
+            out += [f"b{i + 1}_{self.nk + k}" if len(self.columns) > 1 else f"b{self.nk + k}" for k in range(self.nb)]
+        return (*out, "offset", *(f"d{k + 1}" for k in range(self.ar)), *(f"c{k + 1}" for k in range(self.ma)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters: coefficient and number of the function of p."""
+        places = [self.place(k) for k in range(len(self.coefficients))]
+        return tuple(
+            f"{x}[{j}]" for x, at in zip(self.coefficients, places, strict=True) for j in range(at.stop - at.start)
+        )
+
+    def place(self, coefficient: int) -> slice:
+        """Return where the parameters of a coefficient stand in theta, by its number in `coefficients`."""
+        K, last, over = self.degree + 1, self.n_process_theta, coefficient - self.n_process
+        if over < 0:
+            return slice(coefficient * K, min((coefficient + 1) * K, last))
+        return slice(last + over, last + over + 1)
+
+    def split(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """Return coefficients by function of p, of A (order, K) and of inputs and constant; and those of D and C."""
+        n, K = self.n_process_theta, self.degree + 1
+        by = np.append(theta[:n], np.zeros(self.n_process * K - n)).reshape(-1, K)
+        return by[: self.order], by[self.order :], theta[n : n + self.ar], theta[n + self.ar :]
+
+    def lagged_inputs(self, u: Array) -> Array:
+        """Return the scaled inputs that each sample depends on, zeros before the record, and a column of ones."""
+        n = u.shape[0]
+        out = np.zeros((n, len(self.columns) * self.nb + 1))
+        out[:, -1] = 1.0
+        for i, column in enumerate(self.columns):
+            for k in range(self.nb):
+                lag = self.nk + k
+                out[lag:, i * self.nb + k] = u[: max(n - lag, 0), column]
+        return out
+
+    def rows(self, part: Part, z: Array, first: int) -> Array:
+        """Return the regressors of A (past values of z), B and the constant from sample `first` on."""
+        n, phi = z.size, part.phi[first:]
+        by = [-z[first - k : n - k, None] * phi for k in range(1, self.order + 1)]
+        by += [part.W[first:, i, None] * phi for i in range(part.W.shape[1] - 1)]
+        return np.hstack([*by, phi[:, : self.n_offset]])
+
+    def is_stable(self, theta: Array) -> bool:
+        """Whether the frozen process part is stable over the range of p."""
+        s = np.linspace(-1.0, 1.0, 4 * self.degree + 1)
+        rows = basis_values(s, self.degree + 1, self.basis) @ self.split(theta)[0].T
+        return all(stable(np.concatenate([[1.0], row])) for row in rows)
+
+    def is_sound(self, theta: Array) -> bool:
+        """Whether the predictor is stable: C, and in the output form A over the range of p.
+
+        That a run stays finite does not say so: what was before the record is fitted as well, and can balance a mode
+        that grows.
+        """
+        if self.ma and not stable(np.concatenate([[1.0], self.split(theta)[3]])):
+            return False
+        return self.form == "equation" or self.is_stable(theta)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """One record, ready for a shape."""
+
+    y: Array  # (n_samples,), scaled
+    W: Array  # (n_samples, n_w), lagged inputs and ones
+    phi: Array  # functions of the scheduling signal
+
+    def head(self, n: int) -> Part:
+        """Return the first samples."""
+        return Part(y=self.y[:n], W=self.W[:n], phi=self.phi[:n])
+
+
+def part_of(shape: LpvShape, y: Array, u: Array, s: Array) -> Part:
+    """Prepare a scaled record."""
+    phi = basis_values(s, shape.degree + 1, shape.basis)
+    return Part(y=np.ascontiguousarray(y), W=shape.lagged_inputs(u), phi=phi)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Errors:
+    """A record run through a predictor."""
+
+    finite: bool  # whether nothing diverged; if not, the rest means nothing
+    # (n_samples,), scaled, process part, predictions and innovations, the first `lag` of which are not computed
+    x: Array
+    g: Array
+    e: Array
+    J: Array  # (n_samples, n_theta + n_start), or (0, 0), derivatives of the prediction
+
+
+def errors(shape: LpvShape, part: Part, theta: Array, start: Array | None = None, *, slopes: int = 0) -> Errors:
+    """Run a record through the predictor, from `start`, what was before it (zeros if left out).
+
+    `slopes`: derivatives: 0 for none, 1 for those by `start` alone, 2 for all.
+    """
+    y, m, lag, P = part.y, shape.first, shape.lag, shape.n_theta
+    n, n_x, n_p, ma = y.size, shape.n_states, shape.n_process_theta, shape.ma
+    start = np.zeros(shape.n_start) if start is None else start
+    if n <= lag:
+        return Errors(finite=True, x=y, g=np.zeros(n), e=np.zeros(n), J=np.zeros((n, P + shape.n_start)))
+    a, b, d, c = shape.split(theta)
+    own, x, g, e = -(part.phi[m:] @ a.T), y.copy(), np.zeros(n), np.zeros(n)
+    x[m - n_x : m] += start[:n_x][::-1]
+    if n_x:
+        _pass_on(x[:, None], own, np.sum(part.W[m:] * (part.phi[m:] @ b.T), axis=1)[:, None])
+    else:
+        x[m:] = shape.rows(part, y, m) @ theta[:n_p]
+    v = y - x
+    noise = np.concatenate([start[n_x:][::-1], np.empty(n - lag)])  # innovations from `ma` before the first on
+    past = sum((d[k] * _back(v, lag, k + 1) for k in range(shape.ar)), np.zeros(n - lag))
+    _pass_on(noise[:, None], -c[None], (v[lag:] + past)[:, None])
+    e[lag:], g[lag:] = noise[ma:], x[lag:] - past + sum(c[k] * _back(noise, ma, k + 1) for k in range(ma))
+    finite = bool(np.all(np.abs(x[m:]) < _FAR) and np.all(np.abs(noise) < _FAR))
+    if not slopes or not finite:
+        return Errors(finite=finite, x=x, g=g, e=e, J=np.zeros((0, 0)))
+    dx, dg = np.zeros((n, P + shape.n_start)), np.zeros((n - lag + ma, P + shape.n_start))
+    if slopes == 2:
+        dx[m:, :n_p] = shape.rows(part, x if n_x else y, m)
+    if n_x:
+        dx[m - 1 - np.arange(n_x), P + np.arange(n_x)] = 1.0
+        _pass_on(dx, own, dx[m:])
+    dg[ma - 1 - np.arange(ma), P + n_x + np.arange(ma)] = -1.0
+    dg[ma:] = sum((d[k] * _back(dx, lag, k + 1) for k in range(shape.ar)), dx[lag:])
+    if slopes == 2:
+        for k in range(shape.ar):
+            dg[ma:, n_p + k] = -_back(v, lag, k + 1)
+        for k in range(ma):
+            dg[ma:, n_p + shape.ar + k] = _back(noise, ma, k + 1)
+    _pass_on(dg, -c[None], dg[ma:])
+    return Errors(finite=True, x=x, g=g, e=e, J=np.concatenate([np.zeros((lag, dg.shape[1])), dg[ma:]]))
+
+
+def _back(z: Array, first: int, lag: int) -> Array:
+    """The values from sample `first` on, so many samples late."""
+    return z[first - lag : z.shape[0] - lag]
+
+
+def _pass_on(out: Array, gain: Array, rows: Array) -> None:
+    """Fill the last rows of `out` with some rows and what is passed on to each, by lag, from those before it."""
+    from ambid.nonlinear.lagged_kernels import propagate
+
+    first, lags = out.shape[0] - rows.shape[0], np.arange(1, gain.shape[1] + 1)
+    out[first:] = rows
+    if lags.size:
+        propagate(out[:, None], np.ascontiguousarray(gain)[:, None], np.zeros_like(lags), lags, first)
+
+
+# --- what was before a record -----------------------------------------------------------------------------------------
+
+
+def settling(shape: LpvShape) -> int:
+    """Return the samples, beyond those that a prediction looks back over, from which a beginning is estimated."""
+    return _EACH * shape.n_start
+
+
+def looks_back(shape: LpvShape) -> int:
+    """Return the samples of the past that a prediction needs, those of the beginning included."""
+    return shape.lag + settling(shape)
+
+
+def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False) -> tuple[Array, Array] | None:
+    """Estimate what was before a record, and its derivative by theta (zeros unless asked for).
+
+    None where the predictor diverges.
+    """
+    k, P = shape.n_start, shape.n_theta
+    last = looks_back(shape)
+    if not k or part.y.size < last:
+        return np.zeros(k), np.zeros((k, P))
+    head = part.head(last)
+    found = errors(shape, head, theta, slopes=1)
+    if not found.finite:
+        return None
+    e, J = found.e[shape.lag :], found.J[shape.lag :, P:]
+    weight = np.ones(k)
+    weight[: k - shape.ma] = _STATES
+    H = J.T @ J + np.diag(weight)
+    w = np.asarray(np.linalg.solve(H, J.T @ e), dtype=np.float64)
+    if not slopes:
+        return w, np.zeros((k, P))
+
+    def by_theta(start: Array) -> Array:
+        return errors(shape, head, theta, start, slopes=2).J[shape.lag :, :P]
+
+    at, right = by_theta(w), np.empty((k, P))
+    rest = e - J @ w
+    for i in range(k):  # J is linear in w too, so that a difference over any step is its derivative
+        right[i] = rest @ (by_theta(w + np.eye(k)[i]) - at)
+    return w, np.asarray(np.linalg.solve(H, right - J.T @ at), dtype=np.float64)
+
+
+# --- where p stands still ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frozen:
+    """The linear model y = (B/A) u + offset/A(1) + H e that stands still at one p; H = C/D or C/(D A).
+
+    With p made of the output it describes movements about the set point that are fast beside its low-pass.
+    """
+
+    p: float
+    dt: float
+    nk: int  # smallest lag of the inputs
+    a: Array  # (order + 1,), of q^0, q^-1, ...; the first is 1
+    b: Array  # (n_exciting, nb), SI, of q^-nk,
+    c: Array  # of the error model; the first is 1
+    d: Array
+    # (order,), complex, rad/s, log(z)/dt of the roots z of A, largest real part first; -inf for a root at 0
+    poles: Complex
+    dc_gain: Array  # (n_exciting,), SI, B(1)/A(1); negative behind an unstable pole
+    a_sd: Array | None = None  # standard deviations; None without a covariance
+    b_sd: Array | None = None
+    poles_sd: Complex | None = None  # (order,), complex, rad/s, or None, of real and imaginary part
+    dc_gain_sd: Array | None = None  # (n_exciting,), SI, or None
+
+    @property
+    def stable(self) -> bool:
+        """Whether all poles are in the left half plane."""
+        return bool(np.all(self.poles.real < 0))
+
+    def response(self, frequency: Array) -> Complex:
+        """Return the frequency response from each exciting input at frequencies in Hz, (n, n_exciting), SI."""
+        w = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) * self.dt)
+        below = np.polynomial.polynomial.polyval(w, self.a)
+        above = np.stack([w**self.nk * np.polynomial.polynomial.polyval(w, row) for row in self.b], axis=-1)
+        out: Complex = above / below[:, None]
+        return out
+
+
+# --- model ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LpvModel:
+    """A linear model of one output whose coefficients follow a scheduling signal.
+
+    What was before a record the predictor estimates from the first `lag` samples, see `beginning`. Implements
+    `ambid.nonlinear.model.NonlinearModel`.
+    """
+
+    dt: float  # s
+    n_inputs: int  # channels, with one that only schedules
+    shape: LpvShape
+    schedule: Schedule
+    # (n_theta,), SI, for signals in deviations from `*_level`; each coefficient's weights of the functions of p
+    theta: Array
+    u_level: Array  # (n_inputs,), SI
+    u_scale: Array
+    y_level: Array  # (1,), SI
+    y_scale: Array
+    cloud: Cloud  # of the training regressors and the scheduling signal
+
+    @property
+    def kind(self) -> str:
+        """Under which files know it."""
+        return "lpv"
+
+    @property
+    def n_outputs(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+        return looks_back(self.shape)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient and number of the function of p."""
+        return self.shape.names
+
+    @cached_property
+    def unit(self) -> Array:
+        """What a scaled parameter of 1 is in SI, shape (n_theta,)."""
+        of = self.shape
+        out, y = np.ones(of.n_theta), float(self.y_scale[0])
+        for i, column in enumerate(of.columns):
+            for k in range(of.nb):
+                out[of.place(of.order + i * of.nb + k)] = y / self.u_scale[column]
+        out[of.place(of.n_process - 1)] = y
+        return out
+
+    @property
+    def scaled_theta(self) -> Array:
+        """Parameters for scaled signals."""
+        return self.theta / self.unit
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other parameters."""
+        return replace(self, theta=theta)
+
+    def at(self, p: float, covariance: Array | None = None) -> Frozen:
+        """Return the linear model at one value of p, with standard deviations by the fit's `covariance`.
+
+        Outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs.
+        """
+        of, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
+        na, nb, m = of.order, of.nb, len(of.columns)
+        G = np.zeros((of.n_process - 1, of.n_theta))
+        for k in range(of.n_process - 1):
+            G[k, of.place(k)] = basis_values(s, of.degree + 1, of.basis)[0]
+        values, (_, _, d, c) = G @ self.theta, of.split(self.theta)
+        a, b = np.concatenate([[1.0], values[:na]]), values[na:].reshape(m, nb)
+        z = roots_of(a)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            poles = np.where(z == 0, -np.inf, np.log(np.where(z == 0, 1.0, z)) / self.dt)
+            gain = b.sum(axis=1) / a.sum()
+            slope = root_derivative(a, z)[:, 1:] / (z * self.dt)[:, None]
+        turn = np.lexsort((-poles.imag, -poles.real))
+        found = Frozen(
+            p=float(p), dt=self.dt, nk=of.nk, a=a, b=b, c=np.concatenate([[1.0], c]), d=np.concatenate([[1.0], d]),
+            poles=poles[turn], dc_gain=gain,
+        )  # fmt: skip
+        if covariance is None:
+            return found
+        P = G @ covariance @ G.T
+        by_gain = np.hstack([-gain[:, None].repeat(na, axis=1), np.eye(m).repeat(nb, axis=1)]) / a.sum()
+        sd = np.sqrt(np.maximum(np.diag(P), 0.0))
+        return replace(
+            found, a_sd=np.concatenate([[0.0], sd[:na]]), b_sd=sd[na:].reshape(m, nb),
+            poles_sd=(_spread(slope.real, P[:na, :na]) + 1j * _spread(slope.imag, P[:na, :na]))[turn],
+            dc_gain_sd=_spread(by_gain, P),
+        )  # fmt: skip
+
+    def predict(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.predict`; NaN everywhere if the predictor diverges."""
+        part = self._part(u, y)
+        start = beginning(self.shape, part, self.scaled_theta)
+        found = None if start is None else errors(self.shape, part, self.scaled_theta, start[0])
+        out = np.full((part.y.size, 1), np.nan)
+        if found is not None and found.finite:
+            out[self.lag :, 0] = found.g[self.lag :]
+        predicted: Array = self.y_level + self.y_scale * out
+        return predicted
+
+    def jacobian(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.jacobian`."""
+        part, P = self._part(u, y), self.theta.size
+        start = beginning(self.shape, part, self.scaled_theta, slopes=True)
+        found = None if start is None else errors(self.shape, part, self.scaled_theta, start[0], slopes=2)
+        J = np.full((part.y.size, P), np.nan)
+        if start is not None and found is not None and found.finite:
+            J = found.J[:, :P] + found.J[:, P:] @ start[1]
+        out = (J * (self.y_scale / self.unit))[:, None, :]
+        out[: self.lag] = 0.0
+        return np.asarray(out)
+
+    def simulate(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.simulate`."""
+        from ambid.nonlinear.lpv_kernels import free_run
+
+        whole, head = with_head(self, u, y)
+        ys, us = scaled(self, u, whole)
+        of, found, column = self.shape, np.ascontiguousarray(ys[:, 0]), self.schedule.column
+        s = np.zeros(found.size) if column < 0 else self.schedule.scaled(np.asarray(u, dtype=np.float64)[:, column])
+        level, size = float(self.y_level[0]), float(self.y_scale[0])
+        a, b, _, _ = of.split(self.scaled_theta)
+        free_run(
+            found, of.lagged_inputs(us), np.ascontiguousarray(s), BASES.index(of.basis), head, a, b,
+            self.schedule.share(self.dt), (self.schedule.middle - level) / size, self.schedule.half / size,
+        )  # fmt: skip
+        out: Array = self.y_level + self.y_scale * found[:, None]
+        out[:head] = whole[:head]
+        return out
+
+    def novelty(self, u: Array, y: Array) -> Array:
+        """As `NonlinearModel.novelty`: the largest of p's, over half its range, and of ellipsoid and hull of the cloud.
+
+        Holes of the cloud do not count: between set points an LPV model interpolates.
+        """
+        ys, us = scaled(self, u, y)
+        s = self.scheduling(u, y)
+        out = np.full(ys.shape[0], np.nan)
+        x = regressors(self.shape, ys[:, 0], us, s)
+        away = x[settling(self.shape) :] - self.cloud.mean
+        ellipsoid = np.linalg.norm(away @ self.cloud.whitening.T, axis=1)
+        hull = np.max(away @ self.cloud.faces.T, axis=1, initial=0.0)
+        out[self.lag :] = np.maximum(np.abs(s[self.lag :]), np.maximum(ellipsoid, hull))
+        return out
+
+    def scheduling(self, u: Array, y: Array) -> Array:
+        """Return the scheduling signal of a record in SI, scaled: -1 to 1 in training."""
+        p = self.schedule.signal(np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64), self.dt)
+        return self.schedule.scaled(p)
+
+    def _part(self, u: Array, y: Array) -> Part:
+        ys, us = scaled(self, u, y)
+        return part_of(self.shape, ys[:, 0], us, self.scheduling(u, y))
+
+    def as_json(self) -> dict[str, Any]:
+        """As `NonlinearModel.as_json`."""
+        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
+        return {
+            "dt_s": self.dt,
+            "n_inputs": self.n_inputs,
+            "shape": {**asdict(self.shape), "columns": list(self.shape.columns)},
+            "schedule": asdict(self.schedule),
+            **arrays,
+            "cloud": self.cloud.as_json(),
+        }
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back from what `as_json` made."""
+        try:
+            m, words = int(found["n_inputs"]), ("form", "basis", "offset")
+            sizes: dict[str, Any] = {k: int(v) for k, v in found["shape"].items() if k not in ("columns", *words)}
+            columns = tuple(int(k) for k in found["shape"]["columns"])
+            said: dict[str, Any] = {k: str(found["shape"][k]) for k in words}
+            shape = LpvShape(columns=columns, **sizes, **said)
+            schedule = Schedule(**found["schedule"])
+            known = {"basis": BASES, "form": ("equation", "output"), "offset": ("scheduled", "constant")}
+            if any(getattr(shape, k) not in v for k, v in known.items()) or not schedule.high > schedule.low:
+                raise ValueError("form, basis, offset or range of the schedule make no sense")
+            if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes.values()) < 0:
+                raise ValueError("columns or orders make no sense")
+            n = {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": 1, "y_scale": 1}
+            arrays: dict[str, Any] = {k: finite(found[k], size, k) for k, size in n.items()}
+            cloud = Cloud.from_json(found["cloud"], shape.n_process)
+            dt = float(found["dt_s"])
+            return cls(dt=dt, n_inputs=m, shape=shape, schedule=schedule, cloud=cloud, **arrays)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise EstimationError(f"no LPV model ({type(error).__name__}: {error}). Write the file again") from error
+
+
+def _spread(by: Array, P: Array) -> Array:
+    """Standard deviations of values with these slopes."""
+    found: Array = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by, P, by), 0.0))
+    return found
+
+
+def regressors(shape: LpvShape, y: Array, u: Array, s: Array) -> Array:
+    """Return what predictions depend on, from sample `lag` on: past outputs, inputs, scheduling signal; all scaled."""
+    n, lag = y.size, shape.lag
+    if n <= lag:
+        return np.empty((0, shape.n_process))
+    past = [y[lag - k : n - k] for k in range(1, shape.order + 1)]
+    return np.column_stack([*past, shape.lagged_inputs(u)[lag:, :-1], s[lag:]])
