@@ -9,6 +9,7 @@ stable plant from the part of the input that the reference makes (Van den Hof an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,7 @@ from ambid.blackbox.instruments import (
 )
 from ambid.blackbox.model import pole_covariance
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.polynomial_predictor import Layout, arx_layout
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
@@ -41,25 +43,6 @@ _NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
 _NO_AVERAGE = np.ones(1)
 _SETTLED = 1e-4  # change of the filtered output by a round, relative to the innovations
 _INSIDE = 0.9999  # radius to which poles on the unit circle are drawn
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ArxOrders:
-    """Orders of one output."""
-
-    na: int
-    nb: tuple[int, ...]  # for each input
-    nk: tuple[int, ...]
-
-    @property
-    def first(self) -> int:
-        """First sample whose lags are all in the record."""
-        return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients."""
-        return self.na + sum(self.nb)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,25 +55,25 @@ class Signals:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ArxEstimate:
-    """Outcome of one output."""
+    """Outcome of one output: A y = B u + constant + C w/D."""
 
-    A: Array  # (na + 1,)
-    B: tuple[Array, ...]  # for each input
-    constant: float  # of the equation, for the signals as given
-    noise: Autoregression  # of the equation error: A y = B u + constant + C w/D
-    C: Array  # (n + 1,), 1, or A with the poles outside the unit circle mirrored: noise that enters at the output
+    layout: Layout  # of A and B
+    # C is 1, or A with the poles outside the unit circle mirrored (noise that enters at the output); D of `noise`
+    polynomials: Polynomials
+    noise: Autoregression  # of the equation error
     solution: Solution  # last step; its unknowns are a_1 ..., b of every input, and the constant
-    innovations: Array  # (n_rows,), ending with the last sample
+
+    @property
+    def innovations(self) -> Array:
+        """What the last step leaves, (n_rows,), ending with the last sample."""
+        return self.solution.residual
 
 
-def regressors(signals: Signals, orders: ArxOrders, first: int) -> Array:
-    """Return -y(t-1) ... -y(t-na), u_i(t-nk) ..., 1 for t >= first, shape (n_samples - first, size + 1).
-
-    Returns (n_rows, n_coefficients + 1).
-    """
-    n = signals.y.size
-    columns = [-signals.y[first - k : n - k] for k in range(1, orders.na + 1)]
-    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+def regressors(signals: Signals, layout: Layout) -> Array:
+    """Return -y(t-1) ... -y(t-na), u_i(t-nk) ..., 1 from `first_row` on, shape (n_rows, n_coefficients + 1)."""
+    n, first = signals.y.size, layout.first_row
+    columns = [-signals.y[first - k : n - k] for k in range(1, layout.na + 1)]
+    for i, (nb, nk) in enumerate(zip(layout.nb, layout.nk, strict=True)):
         columns += [signals.u[first - k : n - k, i] for k in range(nk, nk + nb)]
     return np.stack([*columns, np.ones(n - first)], axis=1)
 
@@ -99,7 +82,7 @@ def instrumental_step(
     who: str,
     data: Signals,
     instruments: Signals,
-    orders: ArxOrders,
+    layout: Layout,
     noise: Autoregression = _NO_NOISE_MODEL,
     C: Array = _NO_AVERAGE,
 ) -> Solution:
@@ -107,11 +90,9 @@ def instrumental_step(
 
     `who`: method, for errors; `C`: (n + 1,).
     """
-    first, p = orders.first, noise.order
-    rows, Z, target = regressors(data, orders, first), regressors(instruments, orders, first), data.y[first:]
+    p = noise.order
+    rows, Z, target = regressors(data, layout), regressors(instruments, layout), data.y[layout.first_row :]
     if p or C.size > 1:
-        from scipy.signal import lfilter
-
         rows, Z, target = (lfilter(noise.D, C, x, axis=0)[p:] for x in (rows, Z, target))
     if C.size > 1:  # what the filter does not know of the time before the record fades with the plant's own poles
         free = _free(C, rows.shape[0])
@@ -119,25 +100,16 @@ def instrumental_step(
     return solve(Z, rows, target, who=who)
 
 
-def least_squares(who: str, data: Signals, orders: ArxOrders) -> Array:
+def least_squares(who: str, data: Signals, layout: Layout) -> Array:
     """Return the least-squares coefficients: instruments equal to regressors; biased by coloured noise.
 
     Returns (n_coefficients + 1,).
     """
-    return instrumental_step(who, data, data, orders).theta
-
-
-def equation_error(data: Signals, theta: Array, orders: ArxOrders) -> Array:
-    """Return A y - B u - constant from the first sample with all lags on.
-
-    `theta`: (n_coefficients + 1,). Returns (n_rows,).
-    """
-    first = orders.first
-    return np.asarray(data.y[first:] - regressors(data, orders, first) @ theta)
+    return instrumental_step(who, data, data, layout).theta
 
 
 def optimal_step(
-    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int
+    who: str, data: Signals, instruments: Signals, layout: Layout, theta: Array, highest: int
 ) -> ArxEstimate:
     """Model the noise of the equation at `theta` and make the filtered, optimal step (Ljung 1999, eq. 15.25-15.29).
 
@@ -147,42 +119,32 @@ def optimal_step(
 
     `theta`: (n_coefficients + 1,), consistent estimate from a step before; `highest`: highest order of the noise model.
     """
-    from scipy.signal import lfilter
-
-    error = equation_error(data, theta, orders)
+    error = data.y[layout.first_row :] - regressors(data, layout) @ theta
     noise, C = autoregression(error, highest), _NO_AVERAGE
-    mirrored = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSIDE)
+    mirrored = reflect(_polynomials(layout, theta).A, _INSIDE)
     outer = np.asarray(lfilter([1.0], mirrored, error))
     at_output = autoregression(project_out(_free(mirrored, outer.size), outer[:, None])[:, 0], highest)
     if _cost(at_output, error.size) < _cost(noise, error.size):
         noise, C = at_output, mirrored
-    solution = instrumental_step(who, data, instruments, orders, noise, C)
-    found = solution.theta
-    A = np.concatenate([[1.0], found[: orders.na]])
-    B, first = list[Array](), orders.na
-    for nb, nk in zip(orders.nb, orders.nk, strict=True):
-        B.append(np.concatenate([np.zeros(nk), found[first : first + nb]]))
-        first += nb
-    return ArxEstimate(
-        A=A,
-        B=tuple(B),
-        constant=float(found[-1]),
-        noise=noise,
-        C=C,
-        solution=solution,
-        innovations=solution.residual,
-    )
+    solution = instrumental_step(who, data, instruments, layout, noise, C)
+    found = replace(_polynomials(layout, solution.theta), C=C, D=noise.D)
+    return ArxEstimate(layout=layout, polynomials=found, noise=noise, solution=solution)
 
 
 def iterate_optimal(
-    who: str, data: Signals, instruments: Signals, orders: ArxOrders, theta: Array, highest: int, rounds: int
+    who: str,
+    data: Signals,
+    instruments: Callable[[Array], Signals],
+    layout: Layout,
+    theta: Array,
+    rounds: int,
 ) -> ArxEstimate:
-    """Repeat `optimal` until noise model and estimate agree.
+    """Repeat `optimal_step` until noise model and estimate agree.
 
-    `theta`: (n_coefficients + 1,); `rounds`: at most.
+    `instruments`: of an estimate; `theta`: (n_coefficients + 1,); `rounds`: at most.
     """
     for _ in range(rounds):
-        found = optimal_step(who, data, instruments, orders, theta, highest)
+        found = optimal_step(who, data, instruments(theta), layout, theta, layout.free.size + NOISE_ORDER)
         before, theta = theta, found.solution.theta
         moved = np.linalg.pinv(found.solution.inverse) @ (theta - before)
         if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
@@ -190,10 +152,15 @@ def iterate_optimal(
     return found
 
 
+def _polynomials(layout: Layout, theta: Array) -> Polynomials:
+    """A and B of a solution, whose last number is the constant."""
+    full = layout.start()
+    full[layout.free] = theta[:-1]
+    return layout.polynomials(full)
+
+
 def _free(C: Array, n: int) -> Array:
     """Free responses of 1/C, shape (n, order of C)."""
-    from scipy.signal import lfilter
-
     return np.asarray(lfilter([1.0], C, np.eye(n, C.size - 1), axis=0))
 
 
@@ -201,33 +168,19 @@ def _cost(noise: Autoregression, n: int) -> float:
     return float(n * np.log(noise.variance + 1e-300) + 2 * noise.order)
 
 
-def polynomials(found: ArxEstimate) -> Polynomials:
-    """Return A, B and, as the noise model, C/D."""
-    return Polynomials(A=found.A, B=found.B, C=found.C, D=found.noise.D, F=tuple(np.ones(1) for _ in found.B))
-
-
-def covariance(found: ArxEstimate, orders: ArxOrders) -> Array:
-    """Return the covariance of all coefficients of `polynomials`, leading ones and zeros included.
+def covariance(found: ArxEstimate) -> Array:
+    """Return the covariance of all coefficients, leading ones and zeros included.
 
     C follows from A and has zeros. The noise of the filtered equation is modelled once more, so that a noise model of
     too low an order costs efficiency but does not make the standard deviations too small.
-
-    Returns (n_theta, n_theta).
     """
-    rows = found.innovations.size
+    rows, layout, p = found.innovations.size, found.layout, found.polynomials
     left = autoregression(found.innovations, 10)
-    spare = rows / max(rows - orders.size - 1, 1)
-    inner = found.solution.covariance(left)[:-1, :-1] * spare
-    sizes = [found.A.size, *(b.size for b in found.B), found.C.size, found.noise.D.size, *(1 for _ in found.B)]
-    free = [slice(1, found.A.size)]
-    start = found.A.size
-    for b, nk in zip(found.B, orders.nk, strict=True):
-        free.append(slice(start + nk, start + b.size))
-        start += b.size
-    places = np.concatenate([np.arange(s.start, s.stop) for s in free])
-    out = np.zeros((sum(sizes), sum(sizes)))
-    out[np.ix_(places, places)] = inner
-    d = slice(start + found.C.size, start + found.C.size + found.noise.D.size)
+    spare = rows / max(rows - layout.free.size - 1, 1)
+    first = layout.places["C", None].start + p.C.size
+    d = slice(first, first + p.D.size)
+    out = np.zeros((d.stop + len(p.F),) * 2)
+    out[np.ix_(layout.free, layout.free)] = found.solution.covariance(left)[:-1, :-1] * spare
     out[d, d] = noise_covariance(found.noise, rows)
     return out
 
@@ -243,9 +196,9 @@ def operating_point(found: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd
     n_y = y_mean.size
     rows = np.zeros((n_y, n_y + u_mean.size))
     for o, f in enumerate(found):
-        rows[o, o] = f.A.sum() * y_sd[o]
-        rows[o, n_y:] = -np.array([b.sum() for b in f.B]) * u_sd
-    move = np.linalg.lstsq(rows, np.array([f.constant for f in found]), rcond=None)[0]
+        rows[o, o] = f.polynomials.A.sum() * y_sd[o]
+        rows[o, n_y:] = -np.array([b.sum() for b in f.polynomials.B]) * u_sd
+    move = np.linalg.lstsq(rows, np.array([f.solution.theta[-1] for f in found]), rcond=None)[0]
     return Offsets(u=u_mean + move[n_y:] * u_sd, y=y_mean + move[:n_y] * y_sd)
 
 
@@ -256,30 +209,25 @@ _ROUNDING = 1e-11
 _NOISE_ROUNDS = 30  # noise model and estimate in turn, at most
 
 
-def estimate_output(who: str, signals: Signals, clean: Signals, orders: ArxOrders) -> ArxEstimate:
+def estimate_output(who: str, signals: Signals, clean: Signals, layout: Layout) -> ArxEstimate:
     """Estimate one output with given instruments.
 
     `who`: method, for the error; `signals`, `clean`: as measured, and without what the noise does.
     """
-    highest = orders.size + NOISE_ORDER
-    best: ArxEstimate | None = None
-    for corner in _CORNERS if orders.na else _CORNERS[:1]:
-        C = np.asarray(np.poly(np.full(orders.na, np.exp(-corner)))) if np.isfinite(corner) else np.ones(1)
+    best, failed = list[ArxEstimate](), list[EstimationError]()
+    for corner in _CORNERS if layout.na else _CORNERS[:1]:
+        C = np.asarray(np.poly(np.full(layout.na, np.exp(-corner)))) if np.isfinite(corner) else _NO_AVERAGE
         try:
-            theta = instrumental_step(who, signals, clean, orders, C=C).theta
-            found = iterate_optimal(who, signals, clean, orders, theta, highest, _ROUGH)
-        except EstimationError:
-            continue
-        if best is None or found.noise.variance < best.noise.variance:
-            best = found
-    if best is None:
-        raise EstimationError(
-            f"{who}: the input or reference does not move every term of this model, so that its coefficients have no "
-            "single solution. Lower the orders, excite more frequencies, or give more independent references"
-        )
-    if is_exact(best, signals):
-        return best
-    return iterate_optimal(who, signals, clean, orders, best.solution.theta, highest, _NOISE_ROUNDS)
+            theta = instrumental_step(who, signals, clean, layout, C=C).theta
+            best.append(iterate_optimal(who, signals, lambda _: clean, layout, theta, _ROUGH))
+        except EstimationError as error:
+            failed.append(error)
+    if not best:
+        raise failed[-1]
+    found = min(best, key=lambda f: f.noise.variance)
+    if is_exact(found, signals):
+        return found
+    return iterate_optimal(who, signals, lambda _: clean, layout, found.solution.theta, _NOISE_ROUNDS)
 
 
 def is_exact(found: ArxEstimate, signals: Signals) -> bool:
@@ -318,19 +266,19 @@ def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
         _one_output(Signals(y=y, u=deviations.u), used, None if explained is None else explained[:, o])
         for o, y in enumerate(deviations.y.T)
     ]
-    return arx_fit("iv4", data, used, found, means, sds)
+    return arx_fit("iv4", data, found, means, sds)
 
 
-def arx_orders(who: str, data: IOData, orders: Orders) -> ArxOrders:
+def arx_orders(who: str, data: IOData, orders: Orders) -> Layout:
     """Check na, nb and nk, and that the record is long enough for them."""
     check_order_names(who, orders, ("na", "nb", "nk"), ("na", "nb"))
     n_u = data.n_inputs
-    used = ArxOrders(
-        na=single_order(who, orders, "na", 0),
-        nb=order_per_input(who, orders, "nb", 1, n_u),
-        nk=order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u),
+    used = arx_layout(
+        single_order(who, orders, "na", 0),
+        order_per_input(who, orders, "nb", 1, n_u),
+        order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u),
     )
-    check_length(who, data, data.n_samples - (used.first if n_u else 0), used.size + 1)
+    check_length(who, data, data.n_samples - used.first_row, used.free.size + 1)
     return used
 
 
@@ -348,30 +296,27 @@ def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Arra
 def arx_fit(
     who: str,
     data: IOData,
-    orders: ArxOrders,
     found: list[ArxEstimate],
     means: tuple[Array, Array],
     sds: tuple[Array, Array],
-    warnings: tuple[str, ...] = (),
 ) -> BlackBoxFit:
     """Put the estimates of all outputs together.
 
     `found`: for each output, of the data with the means off.
     """
-    from scipy.linalg import block_diag
-
+    layout = found[0].layout
     rows = min(f.innovations.size for f in found)
     e = np.stack([f.innovations[-rows:] for f in found], axis=1)
     return build_fit(
         who,
         data,
-        orders={"na": orders.na, "nb": orders.nb, "nk": orders.nk},
-        model=PolynomialModel(outputs=tuple(polynomials(f) for f in found), dt=data.dt),
-        covariance=block_diag(*[covariance(f, orders) for f in found]),
-        n_estimated=sum(orders.size + f.noise.order for f in found),
+        orders={"na": layout.na, "nb": layout.nb, "nk": layout.nk},
+        model=PolynomialModel(outputs=tuple(f.polynomials for f in found), dt=data.dt),
+        covariance=block_diag(*[covariance(f) for f in found]),
+        n_estimated=sum(layout.free.size + f.noise.order for f in found),
         offsets=operating_point(found, *means, *sds),
-        noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
-        warnings=(*warnings, *weak_instruments([f.solution for f in found], data.outputs)),
+        noise_covariance=e.T @ e / max(rows - layout.free.size - 1, 1),
+        warnings=weak_instruments([f.solution for f in found], data.outputs),
         details={
             "noise_order": [f.noise.order for f in found],
             "condition": [f.solution.condition for f in found],
@@ -380,21 +325,20 @@ def arx_fit(
     )
 
 
-def _one_output(signals: Signals, orders: ArxOrders, explained: Array | None) -> ArxEstimate:
+def _one_output(signals: Signals, layout: Layout, explained: Array | None) -> ArxEstimate:
     """Instruments from what the inputs explain of the output, then from the model itself, until it stands still."""
-    if explained is None:
-        start = least_squares("iv4", signals, orders)
-        clean = _simulate(signals, start, orders)
-    else:
-        clean = Signals(y=explained, u=signals.u)
-    found, highest = estimate_output("iv4", signals, clean, orders), orders.size + NOISE_ORDER
-    for _ in range(0 if is_exact(found, signals) else _ROUNDS):
-        before = found.solution.theta
-        found = optimal_step("iv4", signals, _simulate(signals, before, orders), orders, before, highest)
-        moved = np.linalg.pinv(found.solution.inverse) @ (found.solution.theta - before)
-        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
-            break
-    return found
+
+    def simulate(theta: Array) -> Signals:
+        """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
+        p = _polynomials(layout, theta)
+        A = reflect(p.A, _INSTRUMENT_RADIUS)
+        return replace(signals, y=sum(lfilter(b, A, u) for b, u in zip(p.B, signals.u.T, strict=True)))
+
+    clean = simulate(least_squares("iv4", signals, layout)) if explained is None else replace(signals, y=explained)
+    found = estimate_output("iv4", signals, clean, layout)
+    if is_exact(found, signals):
+        return found
+    return iterate_optimal("iv4", signals, simulate, layout, found.solution.theta, _ROUNDS)
 
 
 def _explained(deviations: IOData) -> Array | None:
@@ -405,18 +349,6 @@ def _explained(deviations: IOData) -> Array | None:
         return reference_part("iv4", alone).y
     except EstimationError:
         return None
-
-
-def _simulate(signals: Signals, theta: Array, orders: ArxOrders) -> Signals:
-    """Output of the model from the inputs alone; poles outside the unit circle are drawn inside."""
-    from scipy.signal import lfilter
-
-    A = reflect(np.concatenate([[1.0], theta[: orders.na]]), _INSTRUMENT_RADIUS)
-    y, first = np.zeros(signals.y.size), orders.na
-    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
-        y += lfilter(np.concatenate([np.zeros(nk), theta[first : first + nb]]), A, signals.u[:, i])
-        first += nb
-    return Signals(y=y, u=signals.u)
 
 
 def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -449,7 +381,7 @@ def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
         )
         for o in range(data.n_outputs)
     ]
-    return arx_fit("cliv", data, used, found, means, sds)
+    return arx_fit("cliv", data, found, means, sds)
 
 
 _COLUMNS = 400  # of the finite impulse response, all references together
@@ -501,7 +433,8 @@ def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
     n_u = data.n_inputs
     nb, nf = order_per_input(who, orders, "nb", 1, n_u), order_per_input(who, orders, "nf", 0, n_u)
     nk = order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u)
-    unknowns = sum(nb) + sum(nf)
+    layout = Layout(na=0, nb=nb, nc=0, nd=0, nf=nf, nk=nk)
+    unknowns = layout.free.size
     check_length(who, data, data.n_samples - max(nf), unknowns + 1)
     with one_thread():
         _refuse_unstable(data, nb, nf, nk)
@@ -513,10 +446,10 @@ def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
             raise EstimationError(_UNSTABLE.format(poles="the second stage found poles outside the unit circle"))
         mean = rest.u.mean(axis=0)
         found = [
-            _refine(p, clean - mean, rest.u - mean, rest.y[:, o] - second.offsets.y[o], nk)
+            _refine(layout, p, clean - mean, rest.u - mean, rest.y[:, o] - second.offsets.y[o])
             for o, p in enumerate(second.model.outputs)
         ]
-        blocks = [_stage_covariance(f, nk) for f in found]
+        blocks = [_stage_covariance(f, layout) for f in found]
     noise = np.stack([f.noise for f in found], axis=1)
     return build_fit(
         who,
@@ -584,7 +517,7 @@ def _first_stage(who: str, data: IOData) -> tuple[Array, int, tuple[str, ...]]:
     return basis @ (basis.T @ u) + mean, lags, warnings
 
 
-def _refine(p: Polynomials, clean: Array, u: Array, y: Array, nk: tuple[int, ...]) -> _Refined:
+def _refine(layout: Layout, p: Polynomials, clean: Array, u: Array, y: Array) -> _Refined:
     """Solve Z' (y - G u) = 0 with the measured input, Z the gradient by the clean one, from G of the second stage."""
     settled = False
     for _ in range(_STAGE_ROUNDS):
@@ -592,7 +525,7 @@ def _refine(p: Polynomials, clean: Array, u: Array, y: Array, nk: tuple[int, ...
         basis = span(pulses)
         raw = y - sum(lfilter(b, f, u[:, i]) for i, (b, f) in enumerate(zip(p.B, p.F, strict=True)))
         noise = raw - basis @ (basis.T @ raw)
-        instruments, rows = _gradient(p, clean, 0.0, nk), _gradient(p, u, noise, nk)
+        instruments, rows = _gradient(p, clean, 0.0, layout.nk), _gradient(p, u, noise, layout.nk)
         instruments -= basis @ (basis.T @ instruments)
         rows -= basis @ (basis.T @ rows)
         step = solve(instruments, rows, noise, who="two-stage")
@@ -601,7 +534,9 @@ def _refine(p: Polynomials, clean: Array, u: Array, y: Array, nk: tuple[int, ...
         here = _Refined(polynomials=p, noise=noise, constant=constant, step=step, settled=settled)
         if settled:
             return here
-        moved = _move(p, step.theta, nk)
+        theta = p.theta
+        theta[layout.free] += step.theta
+        moved = layout.polynomials(theta)
         if not all(stable(f) for f in moved.F):
             return here
         settled = bool(np.linalg.norm(instruments @ step.theta) <= _STAGE_SETTLED * np.linalg.norm(noise))
@@ -629,27 +564,12 @@ def _pulses(p: Polynomials, n: int) -> Array:
     )
 
 
-def _move(p: Polynomials, change: Array, nk: tuple[int, ...]) -> Polynomials:
-    B, F, first = list[Array](), list[Array](), 0
-    for b, k in zip(p.B, nk, strict=True):
-        B.append(np.concatenate([b[:k], b[k:] + change[first : first + b.size - k]]))
-        first += b.size - k
-    for f in p.F:
-        F.append(np.concatenate([f[:1], f[1:] + change[first : first + f.size - 1]]))
-        first += f.size - 1
-    return replace(p, B=tuple(B), F=tuple(F))
-
-
-def _stage_covariance(found: _Refined, nk: tuple[int, ...]) -> Array:
+def _stage_covariance(found: _Refined, layout: Layout) -> Array:
     """Covariance of all coefficients of one output, for noise of any colour."""
-    p, n = found.polynomials, found.noise.size
-    starts = np.cumsum([p.A.size, *(b.size for b in p.B), p.C.size, p.D.size, *(f.size for f in p.F)])
-    b_starts, f_starts = starts[: len(p.B)], starts[len(p.B) + 2 : -1]
-    places = [int(s) + k for s, b, d in zip(b_starts, p.B, nk, strict=True) for k in range(d, b.size)]
-    places += [int(s) + k for s, f in zip(f_starts, p.F, strict=True) for k in range(1, f.size)]
-    out = np.zeros((int(starts[-1]),) * 2)
+    n, size = found.noise.size, layout.free.size
+    out = np.zeros((layout.n_theta,) * 2)
     inner = found.step.covariance(autoregression(found.noise, NOISE_ORDER))
-    out[np.ix_(places, places)] = inner * (n / max(n - len(places) - 1, 1))
+    out[np.ix_(layout.free, layout.free)] = inner * (n / max(n - size - 1, 1))
     return out
 
 

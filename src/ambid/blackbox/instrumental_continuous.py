@@ -15,9 +15,8 @@ p^k/F(p) is state k of the companion form of F, exact for inputs held over a sam
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, left_open, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instrumental import ArxEstimate, ArxOrders, Signals, centre, estimate_output, operating_point
+from ambid.blackbox.instrumental import ArxEstimate, Signals, centre, estimate_output, operating_point
 from ambid.blackbox.instruments import (
-    Autoregression,
     Solution,
     autoregression,
     reference_part,
@@ -37,13 +35,12 @@ from ambid.blackbox.instruments import (
     span,
     weak_instruments,
 )
+from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.blackbox.response import Numbers, Offsets, Responses, companion, filter_states, free_response, responses
 from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.physics.discretise import zero_order_hold
-
-WHITE = Autoregression(D=np.ones(1), variance=1.0)
 
 _ROUGH, _FINE = 6, 60  # steps spent on a start, and on the best of them
 _HALVINGS = 6
@@ -54,62 +51,51 @@ _EXACT = 1e-13  # error relative to the output that counts as none
 _NOISE_ORDER = 20
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Chain:
-    """One denominator and the inputs that go through it, in p = s/w0."""
+    """One denominator and the inputs that go through it, in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
 
     inputs: tuple[int, ...]
-    nb: tuple[int, ...]  # numerator coefficients, p^0 ... p^(nb - 1), for each of these inputs.
-    den: Array  # (n + 1,), highest power first, monic
-    num: Array  # (n_inputs, n + 1), highest power first
-
-    @property
-    def degree(self) -> int:
-        """Degree of the denominator."""
-        return self.den.size - 1
+    degree: int  # n
+    nb: tuple[int, ...]  # numerator coefficients, p^0 ... p^(nb - 1), for each of these inputs
 
     @property
     def size(self) -> int:
         """Number of coefficients."""
         return self.degree + sum(self.nb)
 
-    @property
-    def theta(self) -> Array:
-        """Coefficients f_0 ... f_(n-1), then b_0 ... of each input."""
-        by_input = (num[self.degree + 1 - nb :][::-1] for num, nb in zip(self.num, self.nb, strict=True))
-        return np.concatenate([self.den[:0:-1], *by_input])
-
-    def moved(self, change: Array) -> Chain:
-        """Return the chain with its coefficients (f_0 ... f_(n-1), then b_0 ... of each input) changed.
-
-        `change`: (size,).
-        """
-        n, den, num = self.degree, self.den.copy(), self.num.copy()
-        den[:0:-1] += change[:n]
-        first = n
-        for i, nb in enumerate(self.nb):
-            num[i, n + 1 - nb :] += change[first : first + nb][::-1]
-            first += nb
-        return replace(self, den=den, num=num)
+    def split(self, theta: Array) -> tuple[Array, Array]:
+        """Return F, (n + 1,), and the numerators, (n_inputs, n + 1), highest power first."""
+        n, num = self.degree, np.zeros((len(self.nb), self.degree + 1))
+        for i, b in enumerate(np.split(theta[n:], np.cumsum(self.nb)[:-1])):
+            num[i, n + 1 - b.size :] = b[::-1]
+        return np.append(1.0, theta[:n][::-1]), num
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Setting:
-    """One output with the inputs, delays taken off."""
+    """One output with the inputs, delays taken off, and what its coefficients are."""
 
     y: Array  # (n_samples,)
     u: Array  # (n_samples, n_inputs)
     step: float  # sampling interval in units of 1/w0
+    chains: tuple[Chain, ...]
+
+    def parts(self) -> Iterator[tuple[Chain, slice]]:
+        """Yield each chain and the place of its coefficients."""
+        first = 0
+        for c in self.chains:
+            yield c, slice(first, first + c.size)
+            first += c.size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearised:
     """Error, instruments and regressors about one set of coefficients, offsets and free responses taken off."""
 
-    error: Array  # (n_samples,), filtered by the noise model
+    error: Array  # (n_samples,)
     Z: Array  # (n_samples, n_coefficients)
     Phi: Array
-    output_error: Array  # (n_samples,), not filtered
     constant: float  # estimated offset of the output
 
     @property
@@ -117,92 +103,78 @@ class Linearised:
         """Sum of squares of the error."""
         return float(self.error @ self.error)
 
+    def solve(self, rows: Array | None = None) -> Solution:
+        """Return the instrumental variable step, with `rows` in the place of the regressors."""
+        return solve(self.Z, self.Phi if rows is None else rows, self.error, who="srivc")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Found:
     """Outcome of a search."""
 
-    chains: tuple[Chain, ...]
+    setting: Setting
+    theta: Array  # (n_coefficients,)
     at: Linearised  # there
-    noise: Autoregression  # by which the error is filtered
     settled: bool
     steps: int
 
-    def solution(self) -> Solution:
-        """Return the instrumental variable step at the end, from which the covariance follows."""
-        return solve(self.at.Z, self.at.Phi, self.at.error, who="srivc")
 
-
-def linearise(setting: Setting, chains: Sequence[Chain], noise: Autoregression = WHITE) -> Linearised:
+def linearise(setting: Setting, theta: Array) -> Linearised:
     """Simulate, and set up one step."""
-    made = [responses(c.den, c.num, setting.step, setting.u[:, c.inputs]) for c in chains]
+    split = [(c, *c.split(theta[place])) for c, place in setting.parts()]
+    made = [responses(den, num, setting.step, setting.u[:, c.inputs]) for c, den, num in split]
     raw = setting.y - sum(m.y for m in made)
-    nuisance = _nuisance(setting, chains)
+    nuisance = _nuisance(setting, [den for _, den, _ in split])
     basis = span(nuisance)
     error = raw - basis @ (basis.T @ raw)
     size = np.linalg.norm(nuisance, axis=0)
     weights = np.linalg.lstsq(nuisance / size, raw, rcond=1e-8)[0] / size
-    Z_parts, Phi_parts, first = list[Array](), list[Array](), 1
-    for c, m in zip(chains, made, strict=True):
+    Z, Phi, first = list[Array](), list[Array](), 1
+    for (c, den, _), m in zip(split, made, strict=True):
         free = nuisance[:, first : first + c.degree] @ weights[first : first + c.degree]
         first += c.degree
-        Z_parts.append(_output_columns(c, m.of_output + filter_states(c.den, setting.step, free), m, setting.u))
-        Phi_parts.append(_output_columns(c, filter_states(c.den, setting.step, m.y + free + error), m, setting.u))
-    Z, Phi, constant = np.hstack(Z_parts), np.hstack(Phi_parts), float(weights[0])
-    all_columns = np.column_stack([error, Z, Phi])
-    if noise.order:
-        from scipy.signal import lfilter
-
-        p = noise.order
-        all_columns = lfilter(noise.D, [1.0], all_columns, axis=0)[p:]
-        basis = span(lfilter(noise.D, [1.0], nuisance, axis=0)[p:])
-    clean = all_columns - basis @ (basis.T @ all_columns)
-    n = Z.shape[1]
-    return Linearised(
-        error=clean[:, 0], Z=clean[:, 1 : n + 1], Phi=clean[:, n + 1 :], output_error=error, constant=constant
-    )
+        Z.append(_output_columns(c, den, m.of_output + filter_states(den, setting.step, free), m, setting.u))
+        Phi.append(_output_columns(c, den, filter_states(den, setting.step, m.y + free + error), m, setting.u))
+    both = np.hstack([*Z, *Phi])
+    both -= basis @ (basis.T @ both)
+    return Linearised(error=error, Z=both[:, : theta.size], Phi=both[:, theta.size :], constant=float(weights[0]))
 
 
-def refine(setting: Setting, chains: Sequence[Chain], steps: int, noise: Autoregression = WHITE) -> Found:
+def refine(setting: Setting, theta: Array, steps: int) -> Found:
     """Step until settled.
 
-    `chains`: start, stable; `steps`: at most.
+    `theta`: start, stable; `steps`: at most.
     """
-    now, at = tuple(chains), linearise(setting, chains, noise)
+    at = linearise(setting, theta)
     floor = (_EXACT * float(np.linalg.norm(setting.y))) ** 2
     for k in range(steps):
         if at.loss <= floor:
-            return Found(chains=now, at=at, noise=noise, settled=True, steps=k)
+            return Found(setting=setting, theta=theta, at=at, settled=True, steps=k)
         better = None
         for rows in (at.Phi, at.Z):
-            change = solve(at.Z, rows, at.error, who="srivc").theta
+            change = at.solve(rows).theta
             small = float(np.linalg.norm(at.Z @ change)) / np.sqrt(at.loss)
             if small <= _SETTLED:
-                return Found(chains=now, at=at, noise=noise, settled=True, steps=k)
-            better = _shorten(setting, now, at, change, noise)
+                return Found(setting=setting, theta=theta, at=at, settled=True, steps=k)
+            better = _shorten(setting, theta, at, change)
             if better is not None:
                 break
         if better is None:
-            return Found(chains=now, at=at, noise=noise, settled=small <= _NUMERIC, steps=k)
-        now, at = better
-    return Found(chains=now, at=at, noise=noise, settled=False, steps=steps)
+            return Found(setting=setting, theta=theta, at=at, settled=small <= _NUMERIC, steps=k)
+        theta, at = better
+    return Found(setting=setting, theta=theta, at=at, settled=False, steps=steps)
 
 
-def search(
-    y: Array, u: Array, dt: float, degrees: tuple[int, ...], nb: tuple[int, ...], *, common: bool, colour: bool
-) -> tuple[Found, float]:
+def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found, float]:
     """Start from several time scales and refine the best.
 
-    `y`: (n_samples,); `u`: (n_samples, n_inputs), delays taken off; `degrees`: of the denominators: one for each input,
-    or one where it is common; `nb`: numerator coefficients by input; `common`: whether all inputs share one
-    denominator; `colour`: whether the noise is modelled and the data filtered by that model. Returns w0 in rad/s.
+    `y`: (n_samples,); `u`: (n_samples, n_inputs), delays taken off. Returns w0 in rad/s.
     """
-    rough = []
+    rough = list[tuple[Found, float]]()
     for w0 in _time_scales(y.size, dt):
-        setting = Setting(y=y, u=u, step=w0 * dt)
+        setting = Setting(y=y, u=u, step=w0 * dt, chains=orders.chains)
         try:
-            start = _start_chains(setting, degrees, nb, common=common)
-            rough.append((refine(setting, start, _ROUGH), setting, w0))
+            rough.append((refine(setting, _start(setting), _ROUGH), w0))
         except (EstimationError, np.linalg.LinAlgError):
             continue
         rough.sort(key=lambda r: r[0].at.loss)
@@ -213,20 +185,8 @@ def search(
             "srivc: no stable continuous-time model fits this record. Check the orders and the sampling rate; for an "
             "unstable plant give the reference of its loop and use clsrivc"
         )
-    fine = [
-        (found if found.settled else refine(setting, found.chains, _FINE), setting, w0)
-        for found, setting, w0 in rough[:2]
-    ]
-    found, setting, w0 = min(fine, key=lambda r: r[0].at.loss)
-    if colour:
-        for _ in range(5):
-            noise = autoregression(found.at.output_error, _NOISE_ORDER)
-            if not noise.order:
-                break
-            before, found = found, refine(setting, found.chains, _FINE, noise)
-            if np.allclose(_theta(before.chains), _theta(found.chains), rtol=1e-7, atol=0):
-                break
-    return found, w0
+    fine = [(found if found.settled else refine(found.setting, found.theta, _FINE), w0) for found, w0 in rough[:2]]
+    return min(fine, key=lambda r: r[0].at.loss)
 
 
 def _time_scales(n: int, dt: float) -> Array:
@@ -235,81 +195,70 @@ def _time_scales(n: int, dt: float) -> Array:
     return grid[[4, 6, 2, 5, 3, 7, 1, 8, 0]]
 
 
-def _start_chains(
-    setting: Setting, degrees: tuple[int, ...], nb: tuple[int, ...], *, common: bool
-) -> tuple[Chain, ...]:
+def _start(setting: Setting) -> Array:
     """Least squares on signals through 1/(p + 1)^n (state variable filters), then each input by itself."""
-    n, n_u = max(degrees), setting.u.shape[1]
-    whole = _state_variable_filter(setting, n, nb if common else tuple(min(n + 1, max(nb)) for _ in nb))
-    if common or n_u == 1:
-        return (whole,)
-    whole = refine(setting, (whole,), _ROUGH).chains[0]
-    chains = []
-    for i in range(n_u):
-        part = responses(whole.den, whole.num[i : i + 1], setting.step, setting.u[:, i : i + 1]).y
-        alone = Setting(y=part, u=setting.u[:, i : i + 1], step=setting.step)
-        chain = refine(alone, (_state_variable_filter(alone, degrees[i], nb[i : i + 1]),), _ROUGH).chains[0]
-        chains.append(replace(chain, inputs=(i,)))
-    return tuple(chains)
+    chains = setting.chains
+    if len(chains) == 1:
+        return _state_variable_filter(setting)
+    n = max(c.degree for c in chains)
+    nb = tuple(min(n + 1, max(max(c.nb) for c in chains)) for _ in chains)
+    shared = replace(setting, chains=(Chain(inputs=tuple(range(len(chains))), degree=n, nb=nb),))
+    den, num = shared.chains[0].split(refine(shared, _state_variable_filter(shared), _ROUGH).theta)
+    out = []
+    for i, c in enumerate(chains):
+        u = setting.u[:, i : i + 1]
+        part = responses(den, num[i : i + 1], setting.step, u).y
+        alone = replace(setting, y=part, u=u, chains=(replace(c, inputs=(0,)),))
+        out.append(refine(alone, _state_variable_filter(alone), _ROUGH).theta)
+    return np.concatenate(out)
 
 
-def _state_variable_filter(setting: Setting, n: int, nb: tuple[int, ...]) -> Chain:
-    smooth = np.asarray(np.poly(-np.ones(n)), dtype=np.float64)
-    y, n_u = filter_states(smooth, setting.step, setting.y), setting.u.shape[1]
-    r = responses(smooth, np.zeros((n_u, n + 1)), setting.step, setting.u)
-    top = setting.y - y @ smooth[:0:-1]
-    blank = Chain(inputs=tuple(range(n_u)), nb=nb, den=smooth, num=np.zeros((n_u, n + 1)))
-    rows = _output_columns(blank, y, r, setting.u)
-    nuisance = span(_nuisance(setting, (blank,)))
-    rows, top = rows - nuisance @ (nuisance.T @ rows), top - nuisance @ (nuisance.T @ top)
-    found = solve(rows, rows, top, who="srivc").theta
-    change = found.copy()
-    change[:n] -= smooth[:0:-1]
-    return _mirror_poles(blank.moved(change))
+def _state_variable_filter(setting: Setting) -> Array:
+    (chain,), n_u = setting.chains, setting.u.shape[1]
+    smooth = np.asarray(np.poly(-np.ones(chain.degree)), dtype=np.float64)
+    y = filter_states(smooth, setting.step, setting.y)
+    r = responses(smooth, np.zeros((n_u, smooth.size)), setting.step, setting.u)
+    rows = np.column_stack([_output_columns(chain, smooth, y, r, setting.u), setting.y - y @ smooth[:0:-1]])
+    basis = span(_nuisance(setting, [smooth]))
+    rows -= basis @ (basis.T @ rows)
+    return _mirror_poles(setting, solve(rows[:, :-1], rows[:, :-1], rows[:, -1], who="srivc").theta)
 
 
-def _output_columns(chain: Chain, of_y: Array, made: Responses, u: Array) -> Array:
+def _output_columns(chain: Chain, den: Array, of_y: Array, made: Responses, u: Array) -> Array:
     """Derivatives of the simulated output: -p^k/F y, then p^k/F u of each input."""
     n = chain.degree
     columns = [-of_y]
     for i, nb in enumerate(chain.nb):
         columns.append(made.of_inputs[:, i, : min(nb, n)])
         if nb == n + 1:  # p^n/F u = u - sum of f_k p^k/F u
-            columns.append((u[:, chain.inputs[i]] - made.of_inputs[:, i] @ chain.den[:0:-1])[:, None])
+            columns.append((u[:, chain.inputs[i]] - made.of_inputs[:, i] @ den[:0:-1])[:, None])
     return np.hstack(columns)
 
 
-def _nuisance(setting: Setting, chains: Sequence[Chain]) -> Array:
+def _nuisance(setting: Setting, dens: list[Array]) -> Array:
     n = setting.y.size
-    return np.hstack([np.ones((n, 1)), *[free_response(c.den, setting.step, n) for c in chains]])
+    return np.hstack([np.ones((n, 1)), *[free_response(den, setting.step, n) for den in dens]])
 
 
-def _shorten(
-    setting: Setting, now: tuple[Chain, ...], at: Linearised, change: Array, noise: Autoregression
-) -> tuple[tuple[Chain, ...], Linearised] | None:
+def _shorten(setting: Setting, theta: Array, at: Linearised, change: Array) -> tuple[Array, Linearised] | None:
     """The longest of the step, its half, quarter ... that makes the error smaller; None if none does."""
     for k in range(_HALVINGS):
-        moved, first = list[Chain](), 0
-        for c in now:
-            moved.append(_mirror_poles(c.moved(0.5**k * change[first : first + c.size])))
-            first += c.size
-        new = linearise(setting, moved, noise)
+        moved = _mirror_poles(setting, theta + 0.5**k * change)
+        new = linearise(setting, moved)
         if new.loss < at.loss:
-            return tuple(moved), new
+            return moved, new
     return None
 
 
-def _mirror_poles(chain: Chain) -> Chain:
+def _mirror_poles(setting: Setting, theta: Array) -> Array:
     """Mirror poles of the right half plane: a simulated output must not run away. The error decides if it stays."""
-    roots = np.roots(chain.den)
-    if not np.all(np.isfinite(roots)) or np.max(roots.real) < 0:
-        return chain
-    roots = np.where(roots.real >= 0, -np.maximum(roots.real, 1e-9) + 1j * roots.imag, roots)
-    return replace(chain, den=np.asarray(np.poly(roots).real, dtype=np.float64))
-
-
-def _theta(chains: Sequence[Chain]) -> Array:
-    return np.concatenate([c.theta for c in chains])
+    out = theta.copy()
+    for c, place in setting.parts():
+        roots = np.roots(c.split(theta[place])[0])
+        if np.all(np.isfinite(roots)) and np.max(roots.real) >= 0:
+            roots = np.where(roots.real >= 0, -np.maximum(roots.real, 1e-9) + 1j * roots.imag, roots)
+            out[place.start : place.start + c.degree] = np.poly(roots).real[:0:-1]
+    return out
 
 
 _DELAYS = tuple(range(6))  # scanned where nk is not given
@@ -327,16 +276,19 @@ class TransferOrders:
     @property
     def size(self) -> int:
         """Number of coefficients of one output."""
-        return sum(self.nb) + (self.nf[0] if self.common else sum(self.nf))
+        return sum(c.size for c in self.chains)
+
+    @property
+    def chains(self) -> tuple[Chain, ...]:
+        """The denominators with their inputs."""
+        if self.common:
+            return (Chain(inputs=tuple(range(len(self.nb))), degree=self.nf[0], nb=self.nb),)
+        return tuple(
+            Chain(inputs=(i,), degree=f, nb=(b,)) for i, (f, b) in enumerate(zip(self.nf, self.nb, strict=True))
+        )
 
 
-def srivc(
-    data: IOData,
-    orders: Orders,
-    *,
-    noise: Literal["white", "coloured"] = "white",
-    delays: Sequence[int] = _DELAYS,
-) -> BlackBoxFit:
+def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate continuous-time transfer functions by refined instrumental variables; every output by itself.
 
     Parameters
@@ -346,12 +298,7 @@ def srivc(
     orders : Mapping[str, int or tuple of int]
         ``nb``: numerator coefficients (1: a constant), one or one for each input. ``nf``: denominator degree; one
         number for a denominator that all inputs share, a tuple for one of each input's own. ``nk``: delay in samples,
-        one or one for each input; left out: the one of `delays`, common to all inputs, that fits best.
-    noise : {"white", "coloured"}, optional
-        ``coloured`` also models the noise, as an autoregression of the sampled output error, and filters by it (RIVC):
-        sharper where the noise is far from white.
-    delays : sequence of int, optional
-        Delays to scan where nk is left out, in samples.
+        one or one for each input; left out: the one up to 5, common to all inputs, that fits best.
 
     Returns
     -------
@@ -363,15 +310,13 @@ def srivc(
     EstimationError
         If an order breaks a rule, the record is too short or does not excite the plant, or no stable model fits.
     """
-    if noise not in ("white", "coloured"):
-        raise EstimationError(f"srivc: noise {noise!r}; it must be 'white' or 'coloured'. Give one of them")
     used = transfer_orders("srivc", data, orders)
     deviations, means, _ = centre(data)
-    settings = [used.nk] if used.nk is not None else [(int(k),) * data.n_inputs for k in delays]
+    settings = [used.nk] if used.nk is not None else [(k,) * data.n_inputs for k in _DELAYS]
     first = max(max(k) for k in settings)
     check_length("srivc", data, data.n_samples - first, used.size + 1)
     with one_thread():
-        tried = [(_all_outputs(deviations, used, nk, first, colour=noise == "coloured"), nk) for nk in settings]
+        tried = [(_all_outputs(deviations, used, nk, first), nk) for nk in settings]
         found, nk = min(tried, key=lambda t: _loss(t[0], deviations))
         return _srivc_fit(data, used, nk, found, means)
 
@@ -393,26 +338,10 @@ def transfer_orders(who: str, data: IOData, orders: Orders) -> TransferOrders:
     return TransferOrders(nb=nb, nf=nf, nk=nk, common=not isinstance(orders["nf"], tuple) or n_u == 1)
 
 
-def _all_outputs(
-    data: IOData, orders: TransferOrders, nk: tuple[int, ...], first: int, *, colour: bool
-) -> list[tuple[Found, float]]:
+def _all_outputs(data: IOData, orders: TransferOrders, nk: tuple[int, ...], first: int) -> list[tuple[Found, float]]:
     n = data.n_samples
     u = np.stack([data.u[first - k : n - k, i] for i, k in enumerate(nk)], axis=1)
-    size = u.std(axis=0)
-    out = []
-    for o in range(data.n_outputs):
-        y = data.y[first:, o]
-        found, w0 = search(
-            y / y.std(),
-            u / size,
-            data.dt,
-            orders.nf[:1] if orders.common else orders.nf,
-            orders.nb,
-            common=orders.common,
-            colour=colour,
-        )
-        out.append((found, w0))
-    return out
+    return [search(y / y.std(), u / u.std(axis=0), data.dt, orders) for y in data.y[first:].T]
 
 
 def _loss(found: list[tuple[Found, float]], data: IOData) -> float:
@@ -426,25 +355,25 @@ def _srivc_fit(
     found: list[tuple[Found, float]],
     means: tuple[Array, ...],
 ) -> BlackBoxFit:
-    rows = min(f.at.output_error.size for f, _ in found)
+    rows = found[0][0].at.error.size
     y_size = data.y[-rows:].std(axis=0)
     first = data.n_samples - rows
     u_size = np.array([data.u[first - k : data.n_samples - k, i].std() for i, k in enumerate(nk)])
     scaled = []
     for (f, w0), size in zip(found, y_size, strict=True):
         error = f.at.error
-        inner = f.solution().covariance(autoregression(error, _NOISE_ORDER))
+        inner = f.at.solve().covariance(autoregression(error, _NOISE_ORDER))
         scaled.append(
             ScaledTransfer(
-                theta=_theta(f.chains),
+                theta=f.theta,
                 covariance=error.size / max(error.size - orders.size - 1, 1) * inner,
-                groups=tuple((c.degree, c.nb) for c in f.chains),
+                groups=tuple((c.degree, c.nb) for c in orders.chains),
                 w0=w0,
                 gain=size / u_size,
             )
         )
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))
-    e = np.stack([f.at.output_error[-rows:] * s for (f, _), s in zip(found, y_size, strict=True)], axis=1)
+    e = np.stack([f.at.error * s for (f, _), s in zip(found, y_size, strict=True)], axis=1)
     return build_fit(
         "srivc",
         data,
@@ -456,9 +385,9 @@ def _srivc_fit(
         noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
         status="converged" if all(f.settled for f, _ in found) else "stalled",
         details={
-            "condition": [f.solution().condition for f, _ in found],
+            "condition": [f.at.solve().condition for f, _ in found],
             "steps": [f.steps for f, _ in found],
-            "noise_order": [f.noise.order for f, _ in found],
+            "noise_order": [0] * len(found),
         },
     )
 
@@ -508,12 +437,8 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
         )
     n, nk = used.nf[0], used.nk or ()
     through = [b == n + 1 for b in used.nb]
-    sampled = ArxOrders(
-        na=n,
-        nb=tuple(n + t for t in through),
-        nk=tuple(k + (not t) for k, t in zip(nk, through, strict=True)),
-    )
-    check_length(who, data, data.n_samples - sampled.first, sampled.size + 1)
+    sampled = arx_layout(n, tuple(n + t for t in through), tuple(k + (not t) for k, t in zip(nk, through, strict=True)))
+    check_length(who, data, data.n_samples - sampled.first_row, sampled.free.size + 1)
     deviations, means, sds = centre(data)
     with one_thread():
         clean = reference_part(who, deviations)
@@ -522,7 +447,7 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
             own = Signals(y=deviations.y[:, o] / sds[1][o], u=deviations.u / sds[0])
             pure = Signals(y=clean.y[:, o] / sds[1][o], u=clean.u / sds[0])
             found.append(estimate_output("cliv", own, pure, sampled))
-        w0 = [_time_scale(f.A, data.dt) for f in found]
+        w0 = [_time_scale(f.polynomials.A, data.dt) for f in found]
         nearest = [_nearest(f, used, w * data.dt) for f, w in zip(found, w0, strict=True)]
     return _clsrivc_fit(data, used, found, nearest, w0, means, sds)
 
@@ -593,7 +518,7 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
             columns.append(sampled_coefficients(moved, n, nb, step).imag / _TINY)
         return np.asarray(root @ np.stack(columns, axis=1))
 
-    poles = _logarithms(found.A) / step
+    poles = _logarithms(found.polynomials.A) / step
     f = np.asarray(np.poly(poles).real, dtype=np.float64)[:0:-1]
     start = np.concatenate([f, np.zeros(sum(nb))])
     rows = slope(start)[:, n:]  # the numerators enter linearly

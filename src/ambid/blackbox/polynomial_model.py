@@ -58,6 +58,11 @@ class Polynomials:
         yield "D", None, self.D
         yield from (("F", i, p) for i, p in enumerate(self.F))
 
+    @property
+    def theta(self) -> Array:
+        """All coefficients in the order of `parts`, shape (n_theta,)."""
+        return np.concatenate([c for _, _, c in self.parts()])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PolynomialModel:
@@ -104,7 +109,7 @@ class PolynomialModel:
     @property
     def theta(self) -> Array:
         """All coefficients, leading ones and zeros included, in the order of `names`, shape (n_theta,)."""
-        return np.concatenate([c for p in self.outputs for _, _, c in p.parts()])
+        return np.concatenate([p.theta for p in self.outputs])
 
     def blocks(self) -> Iterator[tuple[int, str, int | None, slice]]:
         """Yield (output, letter, input or None, place in `theta`) of every polynomial."""

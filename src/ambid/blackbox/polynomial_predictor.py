@@ -108,6 +108,11 @@ class Layout:
         )
 
 
+def arx_layout(na: int, nb: tuple[int, ...], nk: tuple[int, ...], *, at_rest: bool = False) -> Layout:
+    """Return the layout of A y = B u + e."""
+    return Layout(na=na, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=nk, at_rest=at_rest)
+
+
 def _places(layout: Layout) -> dict[Key, slice]:
     sizes: list[tuple[Key, int]] = [(("A", None), layout.na + 1)]
     sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(layout.nb, layout.nk, strict=True))]

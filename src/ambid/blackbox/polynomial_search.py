@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from ambid.arrays import Array
-from ambid.blackbox.polynomial_predictor import Layout, Predictor, filter_signal, liveliest_part, predictor
+from ambid.blackbox.polynomial_predictor import Layout, Predictor, arx_layout, filter_signal, liveliest_part, predictor
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
 
@@ -289,10 +289,6 @@ def _pieces(n: int, history: int, most_rows: int | None) -> Iterator[slice]:
         yield slice(int(first), int(first) + _CHUNK + history)
 
 
-def _arx(na: int, nb: tuple[int, ...], nk: tuple[int, ...], *, at_rest: bool) -> Layout:
-    return Layout(na=na, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=nk, at_rest=at_rest)
-
-
 def _set(theta: Array, layout: Layout, letter: str, i: int | None, values: Array) -> None:
     theta[layout.places[letter, i]] = values
 
@@ -300,7 +296,7 @@ def _set(theta: Array, layout: Layout, letter: str, i: int | None, values: Array
 def _least_squares(layout: Layout, y: Array, u: Array) -> Array:
     """A and B as if the noise went through 1/A; C = D = 1."""
     na = max([layout.na, *layout.nf])
-    arx = _arx(na, layout.nb, layout.nk, at_rest=layout.at_rest)
+    arx = arx_layout(na, layout.nb, layout.nk, at_rest=layout.at_rest)
     found = arx_coefficients(arx, y, u)
     theta = layout.start()
     for i in range(layout.n_inputs):
@@ -319,7 +315,7 @@ def _long_order(layout: Layout, n_samples: int) -> int:
 
 def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
     n = _long_order(layout, y.size)
-    arx = _arx(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
+    arx = arx_layout(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
     found, R = _regression(arx, y, u, _ROWS)
     Q = tuple(found[arx.places["B", i]] for i in range(layout.n_inputs))
     return LongModel(P=found[arx.places["A", None]], Q=Q, nk=layout.nk, triangle=R)
@@ -384,7 +380,7 @@ def _long_innovations(layout: Layout, y: Array, u: Array) -> Array:
 def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     """ARMAX and ARMA: the long model's innovations as one more input."""
     e = _long_innovations(layout, y, u)
-    arx = _arx(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
+    arx = arx_layout(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
     found = arx_coefficients(arx, y, np.vstack([u, e]))
     theta = layout.start()
     if layout.na:
@@ -400,10 +396,10 @@ def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
     """C and D of the series v = (C/D) e."""
     n = max(1, min(10 + 2 * (layout.nc + layout.nd), v.size // 8))
     u = np.empty((0, v.size))
-    long = Layout(na=n, nb=(), nc=0, nd=0, nf=(), nk=())
+    long = arx_layout(n, (), ())
     e = filter_signal(_regression(long, v, u, _ROWS)[0][long.places["A", None]], np.ones(1), v)
     nb = (layout.nc,) if layout.nc else ()
-    arx = Layout(na=layout.nd, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=(1,) * len(nb))
+    arx = arx_layout(layout.nd, nb, (1,) * len(nb))
     found = arx_coefficients(arx, v, e[None, :] if nb else u)
     D = found[arx.places["A", None]]
     C = np.concatenate([[1.0], found[arx.places["B", 0]][1:]]) if nb else np.ones(1)
@@ -498,7 +494,7 @@ def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest:
     `y`, `u`: (n_samples,). Returns B and a stable F.
     """
     part, F = liveliest_part(u[None, :]), np.ones(1)
-    arx = _arx(nf, (nb,), (nk,), at_rest=at_rest and not part.start)
+    arx = arx_layout(nf, (nb,), (nk,), at_rest=at_rest and not part.start)
     y, u = y[part], u[part]
     for _ in range(_SM_ITERATIONS if nf else 1):
         one = np.ones(1)
@@ -576,7 +572,7 @@ def long_delays(name: str, y: Array, u: Array, least: int, *, at_rest: bool = Fa
     if history < 3 or largest < 5:
         raise EstimationError(f"{name}: {n} samples are too few to find the delay. Give nk")
     taps = largest + history
-    long = Layout(na=history, nb=(taps,) * n_u, nc=0, nd=0, nf=(0,) * n_u, nk=(least,) * n_u, at_rest=at_rest)
+    long = arx_layout(history, (taps,) * n_u, (least,) * n_u, at_rest=at_rest)
     p = predictor(long)
     R: Array = p.triangle(y, u, long.start(), np.zeros(p.n_nuisance))[p.n_nuisance :, p.n_nuisance :]
     rows = n - long.first_row

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.blackbox.instrumental import ArxOrders, Signals, iv4, least_squares
+from ambid.blackbox.instrumental import Signals, iv4, least_squares
 from ambid.blackbox.model import response_covariance
+from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, second_order
 
@@ -30,7 +31,7 @@ def test_consistent_under_coloured_noise_where_least_squares_is_not():
     def plain(seed):
         d = _record(np.random.default_rng(seed))
         s = Signals(y=d.y[:, 0] - d.y.mean(), u=d.u - d.u.mean())
-        return least_squares("arx", s, ArxOrders(na=2, nb=(2,), nk=(1,)))[:4] - TRUTH
+        return least_squares("arx", s, arx_layout(2, (2,), (1,)))[:4] - TRUTH
 
     biased = np.mean([plain(s) for s in range(20)], axis=0)
     assert np.max(np.abs(biased) / errors.std(axis=0)) > 2
