@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -106,18 +106,8 @@ class IOData:
         """
         if not 0 <= first < last <= self.n_samples:
             raise EstimationError(f"samples {first} to {last} of a record of {self.n_samples}; give a part inside it")
-        return IOData(
-            u=self.u[first:last],
-            y=self.y[first:last],
-            dt=self.dt,
-            inputs=self.inputs,
-            outputs=self.outputs,
-            units=self.units,
-            open_loop=self.open_loop,
-            reference=self.reference[first:last],
-            references=self.references,
-            record=self.record,
-        )
+        cut = {name: getattr(self, name)[first:last] for name in ("u", "y", "reference")}
+        return replace(self, **cut)
 
 
 def io_data(

@@ -15,24 +15,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, compact_order, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instruments import autoregression
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.polynomial_predictor import Layout, arx_layout
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.signals.delay import lagged_triangle
 
-Kernel = Literal["tc", "dc", "ss"]
+Kernel = Literal["tc", "dc"]
 
-SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2, "ss": 1}  # numbers beside the size
+SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2}  # numbers beside the size
 
 
 def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Array]]:
@@ -47,24 +49,17 @@ def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Arr
     if kernel == "tc":
         K = np.exp(log[0] * most)
         return K, [most * K]
-    if kernel == "dc":
-        K = np.exp(log[0] * both / 2 + log[1] * apart)
-        return K, [both / 2 * K, apart * K]
-    first, second = np.exp(log[0] * (both + most)) / 2, np.exp(log[0] * 3 * most) / 6
-    return first - second, [(both + most) * first - 3 * most * second]
+    K = np.exp(log[0] * both / 2 + log[1] * apart)
+    return K, [both / 2 * K, apart * K]
 
 
 def kernel_root(kernel: Kernel, n: int, shape: Array) -> Array:
-    """Return L with L L^T = K; exact for TC and DC, to rounding for SS.
+    """Return L with L L^T = K.
 
     `n`: taps. Returns (n, n).
     """
     i = np.arange(n)
     apart = np.abs(np.subtract.outer(i, i))
-    if kernel == "ss":  # smooth, so nearly singular: a trace of roughness on every tap makes it definite
-        alike = 1.5 * shape[0] ** (0.5 * apart) - 0.5 * shape[0] ** (1.5 * apart)
-        size = shape[0] ** (1.5 * (i + 1)) / np.sqrt(3.0)
-        return np.asarray(size[:, None] * np.linalg.cholesky(alike + 1e-10 * np.eye(n)))
     decay, rho = (shape[0], shape[1]) if kernel == "dc" else (shape[0], np.sqrt(shape[0]))
     lower = np.tril(rho**apart)
     lower[:, 1:] *= np.sqrt(max(1.0 - rho**2, 0.0))
@@ -108,7 +103,7 @@ def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int
     return Triangle(R=R[phi, phi], r=R[phi, y], left=R[y, y].T @ R[y, y], head=R[0], rows=rows - first)
 
 
-def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel]) -> Posterior:
+def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel] = tuple(SHAPES)) -> Posterior:
     """Choose sizes, shapes and the kernel by marginal likelihood.
 
     `output`: column of y; `kernels`: to choose from.
@@ -224,14 +219,14 @@ class PredictorTaps:
     within_sample: float
 
 
-def predictor_taps(data: IOData, lags: int, kernels: Sequence[Kernel]) -> PredictorTaps:
+def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
     """Estimate the taps of the predictor."""
     y_sd, u_sd = data.y.std(axis=0), data.u.std(axis=0)
     z = np.hstack([(data.y - data.y.mean(axis=0)) / y_sd, (data.u - data.u.mean(axis=0)) / u_sd])
     n_y = data.n_outputs
     whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
     t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
-    found = [posterior(t, o, (lags,) * z.shape[1], kernels) for o in range(n_y)]
+    found = [posterior(t, o, (lags,) * z.shape[1]) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T
     noise = (t.left + error.T @ error) / max(t.rows - 1 - float(np.mean([f.freedom for f in found])), 1.0)
@@ -305,7 +300,6 @@ def _slope(through: Array, G: Array, i: int, n_y: int, n_u: int, lags: int) -> A
     return out
 
 
-_ALL: tuple[Kernel, ...] = ("tc", "dc", "ss")
 _NOISE_ORDER = 20  # highest of the noise's autoregression
 _OLDER = 10  # lags beyond the taps that are looked at
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
@@ -349,38 +343,32 @@ class ImpulseResponse:
         return int(np.argmax(out)) if np.any(out) else None
 
 
-def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = _ALL, zero_delay: bool = True) -> BlackBoxFit:
+def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate a long FIR model with a fading prior; every output by itself.
 
-    `data`: without feedback; `kernels`: priors to choose from by marginal likelihood; `zero_delay`: whether a first tap
-    at delay 0 is allowed where nk is left out. Returns polynomialModel; the covariance is the posterior's.
-    `n_estimated` is the effective number of coefficients.
+    `data`: without feedback. Returns a PolynomialModel whose covariance is that of the posterior; `n_estimated` is the
+    effective number of coefficients.
     """
     check_order_names("rfir", orders, ("nb", "nk"), ("nb",))
     nb = order_per_input("rfir", orders, "nb", 1, data.n_inputs)
-    nk = order_per_input("rfir", {"nk": 0 if zero_delay else 1, **orders}, "nk", 0, data.n_inputs)
-    _check_kernels(kernels)
-    first = max((b + k - 1 for b, k in zip(nb, nk, strict=True)), default=0)
-    check_length("rfir", data, 4 * (data.n_samples - first), sum(nb) + 1)
+    nk = order_per_input("rfir", {"nk": 1, **orders}, "nk", 0, data.n_inputs)
+    layout = arx_layout(0, nb, nk)
+    check_length("rfir", data, 4 * (data.n_samples - layout.first_row), sum(nb) + 1)
     with one_thread():
-        found, (means, u_sd), (y_mean, y_sd) = _regress(data, nb, nk, first, kernels)
-    polynomials = [_polynomials(f, nb, nk, u_sd, sd) for f, sd in zip(found, y_sd, strict=True)]
-    model = PolynomialModel(outputs=tuple(polynomials), dt=data.dt)
-    covariance = np.zeros((model.theta.size, model.theta.size))
-    for o, f in enumerate(found):
-        places = []
-        for out, letter, i, place in model.blocks():
-            if out == o and letter == "B" and i is not None:
-                places.append(np.arange(place.start + nk[i], place.stop))
-        where = np.concatenate(places)
-        scale = np.concatenate([np.full(b, y_sd[o] / u_sd[i]) for i, b in enumerate(nb)])
-        covariance[np.ix_(where, where)] = f.covariance * np.outer(scale, scale)
+        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout)
+    theta, covariance = list[Array](), list[Array]()
+    for f, sd in zip(found, y_sd, strict=True):
+        scale = np.concatenate([np.full(b, sd / s) for b, s in zip(nb, u_sd, strict=True)])
+        theta.append(layout.start())
+        theta[-1][layout.free] = f.mean * scale
+        covariance.append(np.zeros((layout.n_theta,) * 2))
+        covariance[-1][np.ix_(layout.free, layout.free)] = f.covariance * np.outer(scale, scale)
     return build_fit(
         "rfir",
         data,
         orders={"nb": compact_order(nb), "nk": compact_order(nk)},
-        model=model,
-        covariance=covariance,
+        model=PolynomialModel(outputs=tuple(map(layout.polynomials, theta)), dt=data.dt),
+        covariance=block_diag(*covariance),
         n_estimated=int(np.ceil(sum(f.freedom for f in found))),
         offsets=Offsets(u=means, y=y_mean + y_sd * np.array([f.constant for f in found])),
         noise_covariance=np.diag([f.noise_variance * sd**2 for f, sd in zip(found, y_sd, strict=True)]),
@@ -393,13 +381,7 @@ def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = _ALL, zero
     )
 
 
-def impulse_response(
-    data: IOData,
-    n_taps: int,
-    *,
-    method: Literal["auto", "rfir", "rarx"] = "auto",
-    kernels: Sequence[Kernel] = ("tc", "dc"),
-) -> ImpulseResponse:
+def impulse_response(data: IOData, n_taps: int, *, method: Literal["auto", "rfir", "rarx"] = "auto") -> ImpulseResponse:
     """Estimate impulse responses with their spread.
 
     Parameters
@@ -410,7 +392,6 @@ def impulse_response(
     method : {"auto", "rfir", "rarx"}
         ``rfir`` in open loop, ``rarx`` where feedback may act (its first tap is zero: without a delay in the loop input
         and output cannot be told apart); "auto" goes by ``data.open_loop``.
-    kernels : sequence of {"tc", "dc", "ss"}
 
     Returns
     -------
@@ -425,76 +406,62 @@ def impulse_response(
         raise EstimationError(f"impulse response: method {method!r}; it is 'auto', 'rfir' or 'rarx'. Give one of them")
     if n_taps < 2:
         raise EstimationError(f"impulse response: {n_taps} tap(s); at least 2 make a response. Ask for more")
-    _check_kernels(kernels)
-    chosen = ("rfir" if data.open_loop else "rarx") if method == "auto" else method
-    if chosen == "rarx":
-        return _through_autoregression(data, n_taps, kernels)
-    fit = rfir(data, {"nb": n_taps, "nk": 0}, kernels=kernels)
-    model = fit.model
-    assert isinstance(model, PolynomialModel)
-    assert fit.covariance is not None
+    direct = method == "rfir" or (method == "auto" and data.open_loop)
     values = np.zeros((n_taps, data.n_outputs, data.n_inputs))
     covariance = np.zeros((data.n_outputs, data.n_inputs, n_taps, n_taps))
-    for o, letter, i, place in model.blocks():
-        if letter == "B" and i is not None:
-            values[:, o, i] = model.theta[place]
-            covariance[o, i] = fit.covariance[place, place]
+    noise_sd, kernels, warnings = (_direct if direct else _through_autoregression)(data, values, covariance)
     return ImpulseResponse(
         time_s=np.arange(n_taps, dtype=np.float64) * data.dt,
         values=values,
         covariance=covariance,
-        noise_sd=np.sqrt(np.diag(fit.noise_covariance)),
+        noise_sd=noise_sd,
         inputs=data.inputs,
         outputs=data.outputs,
         units=data.units,
-        kernels=tuple(str(k) for k in fit.details["kernel"]),  # type: ignore[attr-defined]
-        method="rfir",
-        warnings=fit.warnings,
+        kernels=kernels,
+        method="rfir" if direct else "rarx",
+        warnings=warnings,
     )
 
 
-def _through_autoregression(data: IOData, n_taps: int, kernels: Sequence[Kernel]) -> ImpulseResponse:
-    lags = n_taps - 1
-    n_y, n_u = data.n_outputs, data.n_inputs
+def _direct(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
+    """Fill in values and covariance; noise, kernels and warnings."""
+    fit = rfir(data, {"nb": values.shape[0], "nk": 0})
+    assert isinstance(fit.model, PolynomialModel)
+    assert fit.covariance is not None
+    for o, letter, i, place in fit.model.blocks():
+        if letter == "B" and i is not None:
+            values[:, o, i] = fit.model.theta[place]
+            covariance[o, i] = fit.covariance[place, place]
+    kernels = cast("list[str]", fit.details["kernel"])
+    return np.sqrt(np.diag(fit.noise_covariance)), tuple(kernels), fit.warnings
+
+
+def _through_autoregression(
+    data: IOData, values: Array, covariance: Array
+) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
+    """Fill in values and covariance; noise, kernels and warnings."""
+    lags, n_y, n_u = values.shape[0] - 1, data.n_outputs, data.n_inputs
     check_length("impulse response", data, 2 * (data.n_samples - lags), lags * (n_y + n_u) + 1)
     with one_thread():
-        taps = predictor_taps(data, lags, kernels)
-        values, covariance = responses(taps, n_y, n_u, lags)
+        taps = predictor_taps(data, lags)
+        found, spread = responses(taps, n_y, n_u, lags)
     scale = taps.y_sd[:, None] / taps.u_sd
-    full = np.zeros((n_taps, n_y, n_u))
-    full[1:] = values * scale
-    wide = np.zeros((n_y, n_u, n_taps, n_taps))
-    wide[:, :, 1:, 1:] = covariance * scale[:, :, None, None] ** 2
-    return ImpulseResponse(
-        time_s=np.arange(n_taps, dtype=np.float64) * data.dt,
-        values=full,
-        covariance=wide,
-        noise_sd=np.sqrt(np.diag(taps.noise)) * taps.y_sd,
-        inputs=data.inputs,
-        outputs=data.outputs,
-        units=data.units,
-        kernels=taps.kernels,
-        method="rarx",
-        warnings=() if taps.within_sample > _SEEN else (_WITHIN.format(p=taps.within_sample),),
-    )
+    values[1:] = found * scale
+    covariance[:, :, 1:, 1:] = spread * scale[:, :, None, None] ** 2
+    warnings = () if taps.within_sample > _SEEN else (_WITHIN.format(p=taps.within_sample),)
+    return np.sqrt(np.diag(taps.noise)) * taps.y_sd, taps.kernels, warnings
 
 
-def _check_kernels(kernels: Sequence[Kernel]) -> None:
-    wrong = [k for k in kernels if k not in _ALL]
-    if wrong or not kernels:
-        raise EstimationError(f"kernel {wrong[0] if wrong else 'none'!r} is not known; known: tc, dc, ss. Give some")
-
-
-def _regress(
-    data: IOData, nb: tuple[int, ...], nk: tuple[int, ...], first: int, kernels: Sequence[Kernel]
-) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
+def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
     """Scale, reduce to a triangle, and fit each output."""
     means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
     y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
     u, y = (data.u - means) / u_sd, (data.y - y_mean) / y_sd
-    lags = [(i, k) for i, (b, d) in enumerate(zip(nb, nk, strict=True)) for k in range(d, d + b)]
+    lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
+    nb, first = layout.nb, layout.first_row
     t = triangle([(u[:, i], k) for i, k in lags], y, first)
-    rough = [posterior(t, o, nb, kernels) for o in range(data.n_outputs)]
+    rough = [posterior(t, o, nb) for o in range(data.n_outputs)]
     found = [_whiten(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
     return found, (means, u_sd), (y_mean, y_sd)
 
@@ -550,20 +517,6 @@ def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple
                 full[k] = g
         out = out - oaconvolve(u[:, i], full)[: y.size]
     return np.asarray(out[first:])
-
-
-def _polynomials(f: Posterior, nb: tuple[int, ...], nk: tuple[int, ...], u_sd: Array, y_sd: float) -> Polynomials:
-    edges = np.cumsum([0, *nb])
-    one = np.ones(1)
-    return Polynomials(
-        A=one,
-        B=tuple(
-            np.concatenate([np.zeros(k), f.mean[edges[i] : edges[i + 1]] * y_sd / u_sd[i]]) for i, k in enumerate(nk)
-        ),
-        C=one,
-        D=one,
-        F=(one,) * len(nb),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

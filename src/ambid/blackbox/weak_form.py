@@ -33,7 +33,8 @@ from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
 from ambid.errors import EstimationError
-from ambid.estimation.linear import directions, one_thread
+from ambid.estimation.linear import directions, one_thread, triangle_of
+from ambid.estimation.search import search
 
 _OVERLAP = 7  # rows on half a support: closer ones say the same again, wider ones leave something out
 _SMOOTH = 13  # degree beyond the highest derivative: over 20 samples sums are then integrals to 1e-7
@@ -206,6 +207,7 @@ class Rows:
 
     def __init__(self, equation: Equation, bump: Bump) -> None:
         e = self.equation = equation
+        self._last: tuple[Array, State] | None = None
         self.bump, self.size = bump, e.n + sum(e.nb) + 1
         self.centres = bump.centres(e.y.size, max(e.nk) + 1)
         if self.centres.size < 2 * self.size + 10:
@@ -240,6 +242,11 @@ class Rows:
 
     def at(self, theta: Array) -> State:
         """Return whitened rows and regressors, the output freed from its estimated noise."""
+        if self._last is None or not np.array_equal(theta, self._last[0]):
+            self._last = (theta.copy(), self._evaluate(theta))
+        return self._last[1]
+
+    def _evaluate(self, theta: Array) -> State:
         from scipy.linalg import LinAlgError, cholesky_banded
         from scipy.linalg.lapack import dtbtrs
 
@@ -268,10 +275,14 @@ class Rows:
             slope[:, j] += moments @ a
         return State(r[:, 0], down(np.asfortranarray(slope / scale), "N"), float(r[:, 0] @ r[:, 0]))
 
-    def step(self, state: State) -> Array:
-        """Return the Gauss-Newton step."""
-        size = np.maximum(np.linalg.norm(state.Z, axis=0), 1e-300)
-        return np.asarray(np.linalg.lstsq(state.Z / size, -state.r, rcond=1e-13)[0] / size)
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squares of the whitened rows."""
+        return self.at(theta).cost
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of their slope and, its sign turned, the rows."""
+        state = self.at(theta)
+        return triangle_of([np.column_stack([state.Z, -state.r])])
 
     def _band(self, v: Array) -> Array:
         """Lower band of V V^T: every row has the same kernel, so each lag is one number."""
@@ -298,39 +309,21 @@ class Solution:
 def solve(equation: Equation, bump: Bump, start: Array | None = None) -> Solution:
     """Estimate the parameters with one test function, from ordinary least squares or from `start` where that is better.
 
-    Gauss-Newton: the regressors of a step are moments of the output freed from its estimated noise.
+    The regressors of a step are moments of the output freed from its estimated noise.
     """
     work = Rows(equation, bump)
-    theta = work.ordinary()
-    converged, state = False, work.at(theta)
-    if start is not None:
-        there = work.at(start)
-        if not state.cost <= there.cost:
-            theta, state = start, there
-    for _ in range(_ROUNDS):
-        step = work.step(state)
-        expected = float(np.sum((state.Z @ step) ** 2))
-        if expected <= _SETTLED * max(state.cost, 1e-300) / state.r.size:
-            converged = True
-            break
-        length, moved = 1.0, work.at(theta + step)
-        while moved.cost > state.cost and length > 1e-3:
-            length *= 0.5
-            moved = work.at(theta + length * step)
-        if moved.cost > state.cost:
-            converged = expected <= 1e-3 * state.cost / state.r.size
-            break
-        theta, state = theta + length * step, moved
-    scale2 = state.cost / max(state.r.size - theta.size, 1)
-    s = np.linalg.svd(state.Z / np.maximum(np.linalg.norm(state.Z, axis=0), 1e-300), compute_uv=False)
+    first = [work.ordinary(), *([] if start is None else [start])]
+    found = search(work, min(first, key=work.cost), most=_ROUNDS, tolerance=_SETTLED / work.centres.size)
+    state, theta = work.at(found.theta), found.theta
+    scale2, seen = state.cost / max(state.r.size - theta.size, 1), directions(state.Z)
     return Solution(
         theta=theta,
-        covariance=scale2 * directions(state.Z).inverse(),
+        covariance=scale2 * seen.inverse(),
         scale=float(np.sqrt(scale2)),
         half=bump.half,
         rows=state.r.size,
-        condition=float(s[0] / max(s[-1], 1e-300)),
-        converged=converged,
+        condition=seen.condition,
+        converged=found.converged,
     )
 
 

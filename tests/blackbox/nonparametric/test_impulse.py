@@ -52,7 +52,7 @@ def in_loop(n, seed, *, noise=0.5, told=False):
     return IOData(u=u[:, None], y=y[:, None], dt=0.1, inputs=("u0",), outputs=("y",), units={}, open_loop=told)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
+@pytest.mark.parametrize("kernel", ["tc", "dc"])
 def test_kernels_and_roots_agree(kernel):
     shape = np.array([0.8, 0.95])[: 2 if kernel == "dc" else 1]
     K, slopes = kernel_matrix(kernel, 30, shape)
@@ -65,7 +65,7 @@ def test_kernels_and_roots_agree(kernel):
         np.testing.assert_allclose(kernel_matrix(kernel, 30, complex_shape)[0].imag / 1e-30, slope, rtol=1e-12)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
+@pytest.mark.parametrize("kernel", ["tc", "dc"])
 def test_the_gradient_and_the_value_of_the_evidence_are_exact(kernel):
     data = record(400, 1, inputs=2)
     u, y = data.u - data.u.mean(axis=0), data.y[:, 0] - data.y.mean()
@@ -220,8 +220,6 @@ def test_what_breaks_a_rule_is_refused():
     data = record(300, 0)
     with pytest.raises(EstimationError, match="nb is missing"):
         rfir(data, {"nk": 1})
-    with pytest.raises(EstimationError, match="not known; known: tc, dc, ss"):
-        rfir(data, {"nb": 20}, kernels=("spline",))
     with pytest.raises(EstimationError, match="method"):
         impulse_response(data, 20, method="fir")
     with pytest.raises(EstimationError, match="at least 2"):
