@@ -17,6 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.linear import directions
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.blocks import UNITS, unit_values
@@ -37,15 +38,18 @@ from ambid.nonlinear.lagged_problem import (
     split,
 )
 from ambid.nonlinear.rbf_network import (
+    DESCENT,
+    GAUSS_NEWTON,
+    UNBOUNDED,
     RbfFunction,
     k_means,
     neighbour_widths,
     ols_order,
     rbf_problem,
     solve_weights,
+    train_by_sample,
     typical_size,
 )
-from ambid.nonlinear.rbf_recursive import DESCENT, GAUSS_NEWTON, Recursion, left_to_gain
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, whole
 
@@ -58,6 +62,7 @@ _AS_GOOD = 1.01
 _NEIGHBOURS = 2
 _MOST_ROWS = 4000  # on which units are placed
 _CANDIDATES = 200  # of the data that may become a centre
+_PASSES = 20  # of steepest descent over the records
 _NEAR = 1.0  # squared standard deviations from the optimum, of all that is trained together
 _HELD = 0.01  # part of the variance before the data that is left of a number of the linear part
 
@@ -85,13 +90,13 @@ class RbfSettings:
         "linear", "recursive", "descent",
     )  # fmt: skip
     trained: str = choice(
-        "weights, or all (centres, widths too; by Levenberg-Marquardt if training is linear); weights",
+        "weights, or all (centres, widths too, by Levenberg-Marquardt; with training=linear); weights",
         "weights", "all",
     )  # fmt: skip
     rate: float | None = number(
         "descent: of the steps, 0.02; recursive: least gain, 0 to count all samples alike", 0.0, 1e6
     )
-    bounded: int = whole("1 to bound the rate so that no sample's error grows, 0 as in the thesis; 1", 0, 1, 1)
+    bounded: int = whole("descent: 1 to bound the rate so that no sample's error grows, 0 as in the thesis; 1", 0, 1, 1)
     iterations: int = whole("of Levenberg-Marquardt, at most; 60", 1, 2000, 60)
     focus: str = choice(
         "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
@@ -100,11 +105,6 @@ class RbfSettings:
         "laplace, sandwich (errors not taken as white), none; auto: sandwich for simulation errors",
         "auto", "laplace", "sandwich", "none",
     )  # fmt: skip
-
-    @property
-    def passes(self) -> int:
-        """Of a recursive training over the records."""
-        return 20 if self.training == "descent" or self.trained == "all" else 1
 
 
 @dataclass(slots=True, kw_only=True)
@@ -163,6 +163,10 @@ def _check_consistent(s: RbfSettings) -> None:
         raise EstimationError(
             f"rbf: rate is {s.rate:g}; recursive training takes the least gain by it, which must be below 1. "
             "Say 0 to count all samples alike"
+        )
+    if s.training != "linear" and s.trained == "all":
+        raise EstimationError(
+            f"rbf: training = {s.training} goes for the output weights alone, but trained = all. Leave one out"
         )
     if s.training == "descent" and not (s.rate or 0.0) > 0.0:
         raise EstimationError("rbf: rate is 0, with which steepest descent does not move. Raise it")
@@ -412,21 +416,22 @@ def _tune(s: RbfSettings, data: Scaled, work: _Work, tick: Tick | None) -> None:
 
 def _recur(s: RbfSettings, data: Scaled, work: _Work, tick: Tick | None) -> None:
     """Train sample by sample, from weights of zero; beside steepest descent recursive Gauss-Newton is shown too."""
-    problem, function = work.problem(data.parts, work.theta), work.network
-    begin = np.concatenate([np.zeros(function.n_weights), work.start[function.n_weights :]])
-    methods = (DESCENT, GAUSS_NEWTON) if s.training == "descent" else (GAUSS_NEWTON,)
-    for k, (method, part) in enumerate(zip(methods, portions(tick, (1.0,) * len(methods)), strict=True)):
-        rate, bounded = (0.0, True) if k else (s.rate or 0.0, bool(s.bounded))
-        own = Recursion(problem, begin, method=method, rate=rate, bounded=bounded, passes=s.passes)
-        own.run(part)
-        work.curves.append(own.curve())
-        if not k:
-            work.theta = own.theta
-    left = left_to_gain(work.problem(data.parts, work.theta), work.theta)
+    problem = work.problem(data.parts, work.theta)
+    rate, method = s.rate or 0.0, GAUSS_NEWTON
+    if s.training == "descent":
+        method = DESCENT if s.bounded else UNBOUNDED
+    first, second = portions(tick, (1.0, float(method != GAUSS_NEWTON)))
+    theta, curve = train_by_sample(problem, work.theta, method, rate, 1 if method == GAUSS_NEWTON else _PASSES, first)
+    work.curves.append(curve)
+    if method != GAUSS_NEWTON:
+        work.curves.append(train_by_sample(problem, work.theta, GAUSS_NEWTON, 0.0, 1, second)[1])
+    work.theta = theta
+    R = work.problem(data.parts, theta).triangle(theta[problem.live])
+    left = directions(R[:, :-1]).explain(R[:, -1]) if np.all(np.isfinite(R)) else np.inf
     if not left < _NEAR:
         work.status, work.at_optimum = "stalled", False
         work.warnings.append(
-            f"{methods[0]} has not converged: a batch step would still lower the sum of squares by {left:.3g} times "
+            f"{method} has not converged: a batch step would still lower the sum of squares by {left:.3g} times "
             "the errors' variance, and so there are no standard deviations. Say training = linear"
         )
 

@@ -1,10 +1,20 @@
-"""The function of a network of radial basis functions, its problem, where units stand, and their output weights."""
+"""The function of a network of radial basis functions, its problem, where units stand, and their output weights.
+
+Weights follow from least squares, all at once or sample by sample. Recursive Gauss-Newton is
+R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e, with R kept as its triangle, to which blocks of rows are joined by
+orthogonal rotations; with mu = 1/(t + 1) and R_0 the prior's it is recursive least squares, and ends at the solution of
+all samples. Steepest descent is w <- w + rate phi e (thesis eq. 3.22, printed as W <- W eta e Phi', its plus sign
+lost). One sample's error after a step is (1 - rate |phi|^2) e, so that it grows where the rate is over 2/|phi|^2; a
+bounded rate is kept at 1/|phi|^2 at most, as in NLMS.
+"""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from time import perf_counter
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -13,7 +23,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.linear import triangle_of
+from ambid.estimation.progress import Tick
 from ambid.nonlinear.blocks import UNITS, Block, Linear, Radial, unit_values
+from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
 from ambid.nonlinear.records import Parts
@@ -24,6 +36,7 @@ _BLOCK = 4096
 _OPEN = 1e-4  # one over the standard deviation of the linear part and the constant before the data: next to no prior
 _GRID = 10.0 ** np.arange(-15.0, 4.0, 0.25)  # of sigma^2 / alpha^2, in squared singular values
 _BLIND = 1e-12  # part of the largest singular value of the linear part below which a direction is not there
+_CHUNKS = 8  # of a pass, after each of which the error is looked at
 _FLOOR = 1e-14  # least variance of errors, scaled
 
 
@@ -90,6 +103,20 @@ class RbfFunction(LaggedFunction):
         """Return what the units give for regressors `x`, shape (n, neurons)."""
         own = np.split(theta, self.edges[1:-1])[1]
         return unit_values(self.unit_name, self.units.squared(own, x @ self.metric.T))
+
+    def features(self, theta: Array, x: Array) -> Array:
+        """Return what weights multiply: regressors, if there is a linear part, one, and activations."""
+        return np.hstack([x[:, self.line.at], np.ones((x.shape[0], 1)), self.activations(theta, x)])
+
+    def matrix(self, theta: Array) -> Array:
+        """Return the weights, (n_outputs, n_features)."""
+        (L, c), W = self.line.parts(theta[: self.n_line]), theta[self.n_line : self.n_weights].reshape(self.p, -1)
+        return np.hstack([L, c[:, None], W])
+
+    def with_matrix(self, theta: Array, W: Array) -> Array:
+        """Return the parameters with other weights."""
+        d = self.line.width
+        return np.concatenate([W[:, :d].ravel(), W[:, d], W[:, d + 1 :].ravel(), theta[self.n_weights :]])
 
     def as_json(self) -> dict[str, Any]:
         """As `LaggedFunction.as_json`."""
@@ -211,13 +238,11 @@ def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior
     Thompson 1971; MacKay's evidence 1992), so that Laplace's covariance is honest.
     """
     n, p, h = y.shape[0], function.p, function.neurons
-    d = 1 + (x.shape[1] if function.linear else 0)
+    d = 1 + function.line.width
 
     def columns(k: int) -> Array:
-        part = x[k : k + _BLOCK]
-        known = [part] if function.linear else []
-        one, phi = np.ones((part.shape[0], 1)), function.activations(theta, part)
-        return np.hstack([*known, one, phi, y[k : k + _BLOCK]])
+        part = slice(k, k + _BLOCK)
+        return np.hstack([function.features(theta, x[part]), y[part]])
 
     R = np.zeros((d + h + p, d + h + p))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -236,7 +261,7 @@ def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior
         alpha[o] = np.sqrt(noise[o] / ratio)
         effective[o] = rank + np.sum(s**2 / (s**2 + ratio))
     line = np.linalg.lstsq(R[:, :d], R[:, d + h :] - R[:, d : d + h] @ w, rcond=_BLIND)[0]
-    found = np.concatenate([line[:-1].T.ravel(), line[-1], w.T.ravel(), theta[function.n_weights :]])
+    found = function.with_matrix(theta, np.concatenate([line, w]).T)
     return Weights(theta=found, noise=noise, prior=alpha, effective=effective)
 
 
@@ -274,3 +299,59 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
         best = grid[at]
         grid = np.geomspace(low, high, 21)
     return float(best), float(noise(np.array([best]))[0])
+
+
+# --- sample by sample -------------------------------------------------------------------------------------------------
+
+
+GAUSS_NEWTON = "recursive Gauss-Newton, bounded rate"
+DESCENT = "steepest descent, bounded rate"
+UNBOUNDED = "steepest descent, rate not bounded"
+
+
+def train_by_sample(
+    problem: LaggedProblem, theta: Array, method: str, rate: float, passes: int, tick: Tick | None
+) -> tuple[Array, LearningCurve]:
+    """Train the weights, from zero, by one of the recursions; `rate` is that of the descent, or the least gain mu."""
+    from ambid.nonlinear.rbf_kernels import descent_pass
+
+    of, rows = problem.function, problem.rows()
+    assert isinstance(of, RbfFunction)
+    y = np.concatenate([r.y for r in rows])
+    F = np.ascontiguousarray(of.features(theta, np.concatenate([r.x for r in rows])))
+    (N, d), W = F.shape, np.zeros((of.p, F.shape[1]))
+    edges = np.unique(np.linspace(0, N, _CHUNKS + 1).astype(np.int64)).tolist()
+    descent_pass(F[:0], y[:0], rate, 1, W)  # loads the compiled loop, which is no part of the training
+    scale = np.diag(problem.weight)
+    prior = [of.matrix(problem.precision)[o] / scale[o] for o in range(of.p)]
+    R = [np.hstack([np.diag(own), np.zeros((d, 1))]) for own in prior]
+    began, seconds, errors = perf_counter(), [0.0], [_rms(y)]
+    for k in range(passes):
+        for first, last in pairwise(edges):
+            part = slice(first, last)
+            if tick is not None:
+                tick(method, (k + first / N) / passes)
+            if method == GAUSS_NEWTON:
+                gain = np.maximum(1.0 / (k * N + np.arange(first, last) + 2.0), rate)
+                kept = np.cumprod((1.0 - gain)[::-1])[::-1]
+                weight = np.sqrt(gain * np.append(kept[1:], 1.0))[:, None]
+                for o in range(of.p):
+                    R[o] = triangle_of([np.sqrt(kept[0]) * R[o], weight * np.column_stack([F[part], y[part, o]])])
+                    W[o] = np.linalg.solve(R[o][:d, :d], R[o][:d, d])
+                at = -1
+            else:
+                at = int(descent_pass(F[part], y[part], rate, int(method == DESCENT), W))
+            if at >= 0 or not np.all(np.isfinite(W)):
+                raise FloatingPointError(
+                    f"{method} diverged in pass {k + 1} near sample {first + max(at, 0)}: say bounded = 1, or a lower "
+                    "rate"
+                )
+            seconds.append(perf_counter() - began)
+            with np.errstate(over="ignore"):
+                errors.append(_rms(y - F @ W.T))
+    curve = LearningCurve(method=method, seconds=np.array(seconds), training=np.array(errors))
+    return of.with_matrix(theta, W), curve
+
+
+def _rms(e: Array) -> float:
+    return float(np.sqrt(np.mean(e**2)))
