@@ -19,7 +19,7 @@ from ambid.report.fit_text import (
     setting_text,
     term_lines,
 )
-from ambid.report.nonlinear_figures import bars_of, columns_of, nonlinear_overview, traces_of
+from ambid.report.nonlinear_figures import bars_of, nonlinear_overview, traces_of
 from ambid.validate.nonlinear import judge
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
 
@@ -158,7 +158,6 @@ def test_six_of_many_records_are_drawn_and_the_second_one_too(fit: NonlinearFit)
     assert {f"{k}.csv" for k in range(6)} <= set(texts)
     assert "6.csv" not in texts
     assert "second record, not fitted: 8.csv" in texts
-    assert [columns_of(n) for n in (1, 2, 3, 4, 5, 7)] == [1, 2, 3, 2, 3, 3]
 
 
 def test_the_most_significant_coefficients_have_bars_of_their_95_percent_intervals(fit: NonlinearFit) -> None:

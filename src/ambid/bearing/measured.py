@@ -106,14 +106,14 @@ def _of_fit(fit: BlackBoxFit, frf: FrequencyResponse, frequency_hz: Array) -> Mo
         late = np.exp(-1j * omega * float(str(fit.details.get("delay_s", 0.0))))[:, None, None]
         if model.dt is None and held:
             G = _sampled(model, omega, fit.dt) * late
-            return _with_spread(fit.structure, frequency_hz, G, _differences(model, omega, fit) * late[..., None])
+            return _along(fit.structure, frequency_hz, G, _differences(model, omega, fit) * late[..., None])
         G, slope = model.frequency_response(omega) * late, model.frequency_response_derivative(omega) * late[..., None]
     else:
         G, slope = model.frequency_response(omega), model.frequency_response_derivative(omega)
         if model.dt is None and held:  # the hold's own response, which the fit takes out
             hold = (np.sinc(frequency_hz * fit.dt) * np.exp(-0.5j * omega * fit.dt))[:, None, None]
             G, slope = G * hold, slope * hold[..., None]
-    return _with_spread(fit.structure, frequency_hz, G, slope @ _root(fit.covariance, model.theta.size))
+    return with_spread(fit.structure, frequency_hz, G, slope, fit.covariance)
 
 
 def _of_estimate(estimate: FrequencyEstimate, frf: FrequencyResponse, frequency_hz: Array) -> ModelResponse:
@@ -125,12 +125,20 @@ def _of_estimate(estimate: FrequencyEstimate, frf: FrequencyResponse, frequency_
     )
     delay = estimate.delay.samples + estimate.delay.fraction
     G, slope = response(plant, estimate.values, names, at, channels, delay, moving=False)
-    return _with_spread(
-        f"physical parameters of {estimate.model}", frequency_hz, G, slope @ _root(estimate.covariance, len(names))
-    )
+    return with_spread(f"physical parameters of {estimate.model}", frequency_hz, G, slope, estimate.covariance)
 
 
-def _with_spread(source: str, frequency_hz: Array, G: Complex, spread: Complex) -> ModelResponse:
+def with_spread(
+    source: str, frequency_hz: Array, G: Complex, slope: Complex, covariance: Array | None
+) -> ModelResponse:
+    """Return a response (n_f, n_y, n_u) with its spread, from slopes (n_f, n_y, n_u, n) and a covariance (n, n).
+
+    Real and imaginary part of d(ln G) are the changes of the logarithm of the magnitude and of the phase.
+    """
+    return _along(source, frequency_hz, G, slope @ _root(covariance, slope.shape[-1]))
+
+
+def _along(source: str, frequency_hz: Array, G: Complex, spread: Complex) -> ModelResponse:
     """Standard deviations from independent directions, last axis of `spread`, each of one standard deviation."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = np.nan_to_num(spread / G[..., None])

@@ -1,8 +1,6 @@
 """What all figures are made of: pages, curves, bands, signals, residuals, Bode diagrams, poles with their regions.
 
-Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot: no window system, no global state. Spreads of
-responses and poles are by the delta method: real and imaginary part of d(ln G) are the changes of the logarithm of the
-magnitude and of the phase.
+Everything is drawn on `matplotlib.figure.Figure` objects, without pyplot: no window system, no global state.
 """
 
 from __future__ import annotations
@@ -16,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.report.numbers import prefixed
+from ambid.bearing.measured import ModelResponse
+from ambid.report.numbers import prefixed, response_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     Draw = Callable[[Figure | SubFigure], object]
 
 Complex = NDArray[np.complex128]
+Pair = tuple[int, int]  # output, input
 
 MEASURED, PREDICTED, BAND, BOUND = "#444444", "#0b6fb8", "#9ecae8", "#c0392b"
 NORMAL_95, NORMAL_99 = 1.959963984540054, 2.5758293035489004
@@ -33,7 +33,7 @@ _CHI2_95 = 5.991464547107979  # of two degrees of freedom
 _PIXELS = 1200  # samples from which a curve is drawn as the band of its extremes
 _ZOOM = 240  # samples of a close view
 _LAGS = 50
-_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
+MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
 
 
 def stacked(title: str, parts: Sequence[tuple[float, Draw]], width: float = 11.0) -> Figure:
@@ -109,90 +109,135 @@ def autocorrelation(e: Array, n_lags: int) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Traces:
-    """Outputs beside what a model says of them, SI."""
+    """Outputs of one record beside what a model says of them, SI."""
 
     time_s: Array  # (n_samples,), s
     names: tuple[str, ...]  # of the outputs
     units: tuple[str, ...]
-    measured: Array  # (n_samples, n_outputs), predicted one step ahead
+    measured: Array  # (n_samples, n_outputs), and predicted one step ahead; NaN for what is not predicted
     predicted: Array
-    simulated: Array | None  # (n_samples, n_outputs), or None
-    innovation_sd: Array  # (n_outputs,), as the model says
+    # of the errors, as the model says: (n_outputs,), or (n_samples, n_outputs) where it varies
+    sd: Array
+    simulated: Array | None = None  # (n_samples, n_outputs)
+    title: str = ""  # which record it is, where several are drawn
+    second: bool = False  # whether the fit has not seen it
 
 
 def signals_panel(figure: Figure | SubFigure, traces: Traces) -> None:
     """Measured against predicted: the whole record, and the stretch with the largest errors."""
     t = traces.time_s
     axes = figure.subplots(len(traces.names), 2, squeeze=False, width_ratios=(3, 2), sharex="col")
-    innovations = traces.measured - traces.predicted
-    first, last = worst_stretch(innovations)
-    for j, role in enumerate(traces.names):
-        whole, zoom = axes[j]
-        scale, unit = _axis_unit(traces, j, traces.measured[:, j])
-        y, p = traces.measured[:, j] / scale, traces.predicted[:, j] / scale
-        curve(whole, t, y, MEASURED, "measured")
-        curve(whole, t, p, PREDICTED, "predicted one step ahead")
-        zoom.plot(t[first:last], y[first:last], ".", color=MEASURED, markersize=3.5)
-        zoom.plot(t[first:last], p[first:last], "-", color=PREDICTED, linewidth=1.0)
+    first, last = worst_stretch(traces.measured - traces.predicted)
+    for j, (whole, zoom) in enumerate(axes):
+        scale = _outputs(whole, traces, j, simulation=False)
+        y, p = traces.measured[first:last, j] / scale, traces.predicted[first:last, j] / scale
+        zoom.plot(t[first:last], y, ".", color=MEASURED, markersize=3.5)
+        zoom.plot(t[first:last], p, "-", color=PREDICTED, linewidth=1.0)
         if traces.simulated is not None:
             simulated = traces.simulated[first:last, j] / scale
             zoom.plot(t[first:last], simulated, "--", color=BOUND, linewidth=0.9, label="simulated from the input")
         whole.axvspan(t[first], t[last - 1], color="#f3d9a4", zorder=0)
-        whole.set_ylabel(f"{role} [{unit}]")
         grid(whole, zoom)
-    axes[0, 0].set_title("measured and predicted", fontsize=10)
-    axes[0, 1].set_title("close view where the errors are largest", fontsize=10)
     axes[0, 0].legend(loc="upper right", fontsize=8, ncols=3, framealpha=0.85)
     if traces.simulated is not None:
         axes[0, 1].legend(loc="upper left", fontsize=8, framealpha=0.85)
-    axes[-1, 0].set_xlabel("time [s]")
-    axes[-1, 1].set_xlabel("time [s]")
+    _heads(axes, ("measured and predicted", "close view where the errors are largest"), ("time [s]", "time [s]"))
 
 
 def residuals_panel(figure: Figure | SubFigure, traces: Traces) -> None:
     """Innovations over time with 99 % bounds, and their autocorrelation."""
-    t = traces.time_s
     axes = figure.subplots(len(traces.names), 2, squeeze=False, width_ratios=(3, 2), sharex="col")
-    sds = traces.innovation_sd
-    for j, role in enumerate(traces.names):
-        over_time, over_lag = axes[j]
-        e = traces.measured[:, j] - traces.predicted[:, j]
-        scale, unit = _axis_unit(traces, j, 3 * sds[j : j + 1])
-        curve(over_time, t, e / scale, MEASURED, None)
-        bound = NORMAL_99 * sds[j]
-        for side in (-bound, bound):
-            over_time.axhline(side / scale, color=BOUND, linewidth=1.0, linestyle="--")
-        outside = 100 * float(np.mean(np.abs(e) > bound))
-        over_time.set_ylabel(f"{role} [{unit}]")
-        note(over_time, f"{outside:.2g} % outside (1 % expected)")
-        rho = autocorrelation(e, _LAGS)
-        limit = NORMAL_99 / np.sqrt(e.size)
-        over_lag.vlines(np.arange(1, rho.size), 0, rho[1:], color=MEASURED, linewidth=1.4)
-        over_lag.axhspan(-limit, limit, color=BAND, alpha=0.6, zorder=0)
-        over_lag.axhline(0, color=MEASURED, linewidth=0.6)
+    for j, (over_time, over_lag) in enumerate(axes):
+        _errors(over_time, traces, j, traces.names[j], " outside (1 % expected)")
+        rho = autocorrelation(traces.measured[:, j] - traces.predicted[:, j], _LAGS)
+        limit = NORMAL_99 / np.sqrt(traces.time_s.size)
+        stems(over_lag, np.arange(1, rho.size), rho[1:], np.full(rho.size - 1, limit))
         reach = max(3 * limit, 1.1 * float(np.max(np.abs(rho[1:]), initial=0.0)))
         over_lag.set_ylim(-reach, reach)
         grid(over_time, over_lag)
-    axes[0, 0].set_title("innovations (measured - predicted) with 99 % bounds", fontsize=10)
-    axes[0, 1].set_title("their autocorrelation with 99 % bounds of white noise", fontsize=10)
-    axes[-1, 0].set_xlabel("time [s]")
-    axes[-1, 1].set_xlabel("lag [samples]")
+    heads = (
+        "innovations (measured - predicted) with 99 % bounds",
+        "their autocorrelation with 99 % bounds of white noise",
+    )
+    _heads(axes, heads, ("time [s]", "lag [samples]"))
 
 
-def _axis_unit(traces: Traces, j: int, values: Array) -> tuple[float, str]:
-    return prefixed(float(np.max(np.abs(values))), traces.units[j])
+def records_panel(figure: Figure | SubFigure, found: Sequence[Traces]) -> None:
+    """Draw several records below each other: measured and predicted outputs, then their errors with 99 % bounds."""
+    n_y = len(found[0].names)
+    ratios = (3,) * n_y + (2,) * n_y
+    axes = figure.subplots(len(found), 2 * n_y, squeeze=False, sharex="row", width_ratios=ratios)
+    for row, traces in zip(axes, found, strict=True):
+        for j in range(n_y):
+            whole, errors = row[j], row[n_y + j]
+            if not np.any(np.isfinite(traces.predicted[:, j])):
+                mean = float(traces.measured[:, j].mean())
+                scale, unit = prefixed(abs(mean), traces.units[j])
+                words = f"held at {mean / scale:.4g} {unit}"
+                whole.text(0.5, 0.5, words, ha="center", va="center", fontsize=9, transform=whole.transAxes)
+                whole.axis("off")
+                errors.axis("off")
+                continue
+            _outputs(whole, traces, j)
+            _errors(errors, traces, j, "error", " outside")
+            grid(whole, errors)
+        row[0].set_title(traces.title, fontsize=9, loc="left")
+        for a in row:
+            a.tick_params(labelsize=8)
+            a.locator_params(axis="x", nbins=5)
+            if traces.second:
+                a.set_facecolor("#fbf7ee")
+    for a in axes[-1]:
+        a.set_xlabel("time [s]", fontsize=9)
+    named = {label: h for a in axes.flat for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(named.values()), list(named), loc="outside upper center", fontsize=8, ncols=4, frameon=False)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Response:
-    """Frequency response from one input to one output."""
+def _outputs(axes: Axes, traces: Traces, j: int, *, simulation: bool = True) -> float:
+    """Draw one output and return its scale; a free run that runs away gets half the measured span at most."""
+    scale, unit = prefixed(float(np.max(np.abs(traces.measured[:, j]))), traces.units[j])
+    y = traces.measured[:, j] / scale
+    curve(axes, traces.time_s, y, MEASURED, "measured")
+    curve(axes, traces.time_s, traces.predicted[:, j] / scale, PREDICTED, "predicted one step ahead")
+    if simulation and traces.simulated is not None:
+        free = traces.simulated[:, j] / scale
+        axes.plot(traces.time_s, free, "--", color=BOUND, linewidth=0.8, label="simulated from the input", zorder=1.5)
+        low, high = float(y.min()), float(y.max())
+        room = (high - low) or 1.0
+        least, largest = max(float(free.min()), low - room / 2), min(float(free.max()), high + room / 2)
+        axes.set_ylim(min(low, least) - 0.05 * room, max(high, largest) + 0.05 * room)
+    axes.set_ylabel(f"{traces.names[j]} [{unit}]")
+    return scale
 
-    source: str
-    output: str
-    frequency_hz: Array  # (n_frequencies,)
-    value: Complex  # (n_frequencies,), output unit per input unit
-    log_sd: Array  # (n_frequencies,), standard deviation of the natural logarithm of the magnitude
-    phase_sd: Array  # (n_frequencies,), rad
+
+def _errors(axes: Axes, traces: Traces, j: int, name: str, words: str) -> None:
+    """Draw the errors of one output with 99 % bounds, over their standard deviation where that varies."""
+    e, sd = traces.measured[:, j] - traces.predicted[:, j], traces.sd[..., j]
+    if sd.ndim:
+        e, bound, label = e / sd, NORMAL_99, f"{name} / sd"
+        reach = max(1.3 * NORMAL_99, float(np.nanquantile(np.abs(e), 0.999)))
+        axes.set_ylim(-1.15 * reach, 1.15 * reach)
+    else:
+        scale, unit = prefixed(3 * float(sd) if sd > 0 else float(np.max(np.abs(e))), traces.units[j])
+        e, bound, label = e / scale, NORMAL_99 * float(sd) / scale, f"{name} [{unit}]"
+    curve(axes, traces.time_s, e, MEASURED, None)
+    for side in (-bound, bound):
+        axes.axhline(side, color=BOUND, linewidth=1.0, linestyle="--")
+    note(axes, f"{100 * float(np.mean(np.abs(e[np.isfinite(e)]) > bound)):.2g} %{words}")
+    axes.set_ylabel(label)
+
+
+def stems(axes: Axes, lags: NDArray[np.int64], values: Array, limit: Array) -> None:
+    """Draw correlations over their lags, with the bounds that those of white noise keep."""
+    axes.vlines(lags, 0, values, color=MEASURED, linewidth=1.4)
+    axes.fill_between(lags, -limit, limit, color=BAND, alpha=0.6, linewidth=0, zorder=0)
+    axes.axhline(0, color=MEASURED, linewidth=0.6)
+
+
+def _heads(axes: NDArray[np.object_], above: Sequence[str], below: Sequence[str]) -> None:
+    for top, bottom, title, label in zip(axes[0], axes[-1], above, below, strict=True):
+        top.set_title(title, fontsize=10)
+        bottom.set_xlabel(label)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -214,81 +259,87 @@ def frequency_grid(poles: Complex | Array, lowest_hz: float, nyquist_hz: float, 
     return np.asarray(found[(found >= lowest_hz) & (found <= nyquist_hz)])
 
 
-def responses_with_spread(
-    frequency_hz: Array, G: Complex, slopes: Complex, covariance: Array, inputs: Sequence[str], outputs: Sequence[str]
-) -> tuple[Response, ...]:
-    """Return every pair of a response (n_f, n_y, n_u) with slopes (n_f, n_y, n_u, n), output by output."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = np.nan_to_num(slopes / G[..., None])
-    log_sd, phase_sd = (
-        np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", J, covariance, J), 0.0))
-        for J in (relative.real, relative.imag)
-    )
-    return tuple(
-        Response(
-            source=source,
-            output=output,
-            frequency_hz=frequency_hz,
-            value=G[:, o, i],
-            log_sd=log_sd[:, o, i],
-            phase_sd=phase_sd[:, o, i],
-        )
-        for o, output in enumerate(outputs)
-        for i, source in enumerate(inputs)
-    )
-
-
 def bode_panel(
-    figure: Figure | SubFigure, found: Sequence[Response], units: Mapping[str, str], asides: Mapping[str, str]
+    figure: Figure | SubFigure,
+    r: ModelResponse,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    units: Mapping[str, str],
+    asides: Mapping[str, str],
 ) -> None:
     """Draw magnitude and phase of the first pairs with 95 % bands; `asides` by input stand in the titles."""
-    shown = found[:_PAIRS]
-    axes = figure.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
-    for j, r in enumerate(shown):
-        magnitude, phase = axes[:, j]
-        magnitude_axis(magnitude, r)
-        phase_axis(phase, r)
-        magnitude.set_ylabel(f"magnitude [{units[r.output]}/{units[r.source]}]")
-        phase.set_xlabel("frequency [Hz]")
-        magnitude.set_title(f"{r.source} → {r.output}{asides.get(r.source, '')}", fontsize=10)
+    pairs = [(o, i) for o in range(len(outputs)) for i in range(len(inputs))]
+    axes = pair_axes(figure, pairs, inputs, outputs, units, asides)
+    for (magnitude, phase), pair in zip(axes, pairs, strict=False):
+        magnitude_axis(magnitude, r, pair)
+        phase_axis(phase, r, pair)
         magnitude.legend(loc="lower left", fontsize=8, framealpha=0.85)
+    if len(pairs) > len(axes):
+        figure.suptitle(f"{len(axes)} of {len(pairs)} pairs", fontsize=10)
+
+
+def pair_axes(
+    figure: Figure | SubFigure,
+    pairs: Sequence[Pair],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    units: Mapping[str, str],
+    asides: Mapping[str, str] | None = None,
+) -> list[tuple[Axes, Axes]]:
+    """Return the axes of magnitude and phase of the first pairs (output, input), with titles and units."""
+    shown = pairs[:MOST_PAIRS]
+    axes = figure.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
+    for (o, i), magnitude, phase in zip(shown, *axes, strict=True):
+        source, output = inputs[i], outputs[o]
+        magnitude.set_ylabel(f"magnitude [{response_unit(units, output, source)}]")
+        magnitude.set_title(f"{source} → {output}{(asides or {}).get(source, '')}", fontsize=10)
+        phase.set_xlabel("frequency [Hz]")
         grid(magnitude, phase)
     axes[1, 0].set_ylabel("phase [°]")
-    if len(found) > len(shown):
-        figure.suptitle(f"{len(shown)} of {len(found)} pairs", fontsize=10)
+    return list(zip(*axes, strict=True))
 
 
 def magnitude_axis(
     axes: Axes,
-    r: Response,
+    r: ModelResponse,
+    pair: Pair,
     *,
     label: str = "identified plant",
     band_label: str | None = None,
     colors: tuple[str, str] = (PREDICTED, BAND),
+    style: str = "-",
 ) -> None:
     """Draw the magnitude of a response with its 95 % band."""
-    size = np.abs(r.value)
-    spread = np.exp(np.minimum(NORMAL_95 * r.log_sd, 20.0))
+    size = np.abs(r.G[:, *pair])
+    spread = np.exp(np.minimum(NORMAL_95 * r.log_sd[:, *pair], 20.0))
     about = band_label or f"95 % band (median ± {100 * (float(np.median(spread)) - 1):.2g} %)"
     axes.fill_between(r.frequency_hz, size / spread, size * spread, color=colors[1], label=about, linewidth=0)
-    axes.loglog(r.frequency_hz, size, color=colors[0], linewidth=1.4, label=label)
+    axes.loglog(r.frequency_hz, size, color=colors[0], linewidth=1.4, label=label, linestyle=style)
     axes.set_xlim(r.frequency_hz[0], r.frequency_hz[-1])
     axes.set_ylim(0.5 * size.min(), 2 * size.max())
 
 
-def unwrapped(value: NDArray[np.complex128], near: float = 0.0) -> Array:
+def unwrapped(value: Complex, near: float = 0.0) -> Array:
     """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`."""
     angle = np.unwrap(np.angle(value))
     return np.asarray(angle - 2 * np.pi * np.round((angle[0] - near) / (2 * np.pi)))
 
 
-def phase_axis(axes: Axes, r: Response, *, near: float = 0.0, colors: tuple[str, str] = (PREDICTED, BAND)) -> None:
+def phase_axis(
+    axes: Axes,
+    r: ModelResponse,
+    pair: Pair,
+    *,
+    near: float = 0.0,
+    colors: tuple[str, str] = (PREDICTED, BAND),
+    style: str = "-",
+) -> None:
     """Draw the phase of a response with its 95 % band, begun within half a turn of `near` (rad)."""
-    angle = unwrapped(r.value, near)
-    spread = np.minimum(NORMAL_95 * r.phase_sd, np.pi)
+    angle = unwrapped(r.G[:, *pair], near)
+    spread = np.minimum(NORMAL_95 * r.phase_sd[:, *pair], np.pi)
     low, high = np.rad2deg(angle - spread), np.rad2deg(angle + spread)
     axes.fill_between(r.frequency_hz, low, high, color=colors[1], linewidth=0)
-    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=colors[0], linewidth=1.4)
+    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=colors[0], linewidth=1.4, linestyle=style)
     angle_ticks(axes, np.rad2deg(angle))
 
 

@@ -12,24 +12,19 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.magnet.problem import BearingRecord
 from ambid.bearing.magnet.result import Curve, Curves, NonlinearBearingEstimate
+from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
 from ambid.report.drawing import (
-    BOUND,
     MEASURED,
-    NORMAL_99,
-    PREDICTED,
     Pole,
-    Response,
     Traces,
     bode_panel,
-    curve,
     frequency_grid,
     grid,
-    note,
     poles_panel,
+    records_panel,
     residuals_panel,
-    responses_with_spread,
     signals_panel,
     single,
     stacked,
@@ -52,7 +47,7 @@ _LEVELS = 3  # currents or positions for which a curve is drawn
 _POINTS = 121
 _BEYOND = 0.1  # part of the usual range by which curves go beyond it
 _CLOUD = 1500  # points of a record in the map
-_ROW = 1.5  # height of a record, inches
+_ROW = 1.6  # height of a record, inches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +75,7 @@ class Evidence:
             measured=run.measured,
             predicted=run.predicted,
             simulated=run.simulated,
-            innovation_sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
+            sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
         )
 
     def drawings(self) -> dict[str, tuple[float, Draw]]:
@@ -96,25 +91,11 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BearingTrace:
-    """One record of a nonlinear bearing beside what the model says of it."""
-
-    name: str
-    held: bool  # whether the rotor was held, so that its position is not predicted
-    time_s: Array  # (n_used,), s
-    # (n_used, 2), position in m and current in A: measured, predicted from all samples before, and the standard
-    # deviation that the predictor expects of the difference; NaN for what is not predicted
-    measured: Array
-    predicted: Array
-    sd: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BearingEvidence:
     """What the figures of a nonlinear bearing show beside it."""
 
     estimate: NonlinearBearingEstimate
-    traces: tuple[BearingTrace, ...]  # one for each of its records
+    traces: tuple[Traces, ...]  # one for each of its records: position and current
 
     @property
     def title(self) -> str:
@@ -127,7 +108,7 @@ class BearingEvidence:
         return {
             "curves": (3.6, lambda place: _curves(place, self.estimate)),
             "map": (3.6, lambda place: _map(place, self)),
-            "records": (height, lambda place: _records(place, self.traces)),
+            "records": (height, lambda place: records_panel(place, self.traces)),
         }
 
 
@@ -139,9 +120,10 @@ def bearing_evidence(
     for name, (record, start_s) in zip(estimate.noise, records, strict=True):
         run = nonlinear_bearing.replay(estimate, record, noise_of=name)
         traces.append(
-            BearingTrace(
-                name=name,
-                held=record.held,
+            Traces(
+                title=name,
+                names=("position", "current"),
+                units=("m", "A"),
                 time_s=start_s + (run.first + np.arange(run.measured.shape[0])) / record.rate_hz,
                 measured=run.measured,
                 predicted=run.predicted,
@@ -164,7 +146,7 @@ def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
 # --- a linear plant -------------------------------------------------------------------------------------------------
 
 
-def responses(estimate: Estimate, *, n_frequencies: int = 600) -> tuple[Response, ...]:
+def responses(estimate: Estimate, *, n_frequencies: int = 600) -> ModelResponse:
     """Compute the frequency response of every pair with its spread, from 0.1 Hz to half the sampling rate.
 
     With Φ = (jω - A)⁻¹, G = C Φ B and dG = C Φ (dA Φ B + dB) + dC Φ B. The delay of the input is not in it.
@@ -181,7 +163,7 @@ def responses(estimate: Estimate, *, n_frequencies: int = 600) -> tuple[Response
     for k, name in enumerate(estimate.covariance_names):
         d = plant.derivative(estimate.values, name)
         slopes[..., k] = space.C @ resolvent @ (d.A @ states + d.B) + d.C @ states
-    return responses_with_spread(frequency, G, slopes, estimate.covariance, plant.inputs, plant.outputs)
+    return with_spread(estimate.model, frequency, G, slopes, estimate.covariance)
 
 
 def poles(estimate: Estimate) -> tuple[Pole, ...]:
@@ -213,7 +195,8 @@ def poles(estimate: Estimate) -> tuple[Pole, ...]:
 def _bode(figure: Figure | SubFigure, estimate: Estimate) -> None:
     late = {role: d.samples + d.fraction for role, d in estimate.delay.items()}
     asides = {role: f", without its delay of {x:.3g} samples" for role, x in late.items() if x}
-    bode_panel(figure, responses(estimate), model(estimate.model).units, asides)
+    plant = model(estimate.model)
+    bode_panel(figure, responses(estimate), plant.inputs, plant.outputs, plant.units, asides)
 
 
 def _poles(figure: Figure | SubFigure, estimate: Estimate) -> None:
@@ -286,8 +269,9 @@ def _map(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
         every = max(1, t.measured.shape[0] // _CLOUD)
         used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
         x, i = used[:, 0] / scale, used[:, 1]
-        where.plot(x, i, "." if not t.held else "|", color=f"C{k % 10}", markersize=2.5, alpha=0.5)
-        where.plot([], [], "o" if not t.held else "|", color=f"C{k % 10}", markersize=5, label=t.name)
+        held = not np.any(np.isfinite(t.predicted[:, 0]))
+        where.plot(x, i, "|" if held else ".", color=f"C{k % 10}", markersize=2.5, alpha=0.5)
+        where.plot([], [], "|" if held else "o", color=f"C{k % 10}", markersize=5, label=t.title)
     for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
         corners = np.vstack([hull, hull[:1]])
         where.plot(corners[:, 0] / scale, corners[:, 1], "-", color=MEASURED, linewidth=width)
@@ -318,52 +302,3 @@ def _balance(axes: Axes, e: NonlinearBearingEstimate, scale: float) -> None:
     force = e.curves(x.ravel(), i.ravel()).force.value.reshape(x.shape)
     axes.contour(x / scale, i, force + weight, levels=[0.0], colors="black", linewidths=1.4, linestyles="--")
     axes.plot([], [], "--", color="black", linewidth=1.4, label="carries the weight")
-
-
-def _records(figure: Figure | SubFigure, traces: Sequence[BearingTrace]) -> None:
-    """Each record: position and current, measured and predicted, and what the predictor missed."""
-    axes = figure.subplots(len(traces), 4, squeeze=False, sharex="row", width_ratios=(3, 3, 2, 2))
-    for row, t in zip(axes, traces, strict=True):
-        for c, unit in enumerate(("m", "A")):
-            whole, missed = row[c], row[2 + c]
-            if c == 0 and t.held:
-                x, shown = prefixed(abs(float(t.measured[:, 0].mean())), "m")
-                held = f"held at {float(t.measured[:, 0].mean()) / x:.4g} {shown}"
-                whole.text(0.5, 0.5, held, ha="center", va="center", fontsize=9, transform=whole.transAxes)
-                whole.axis("off")
-                missed.axis("off")
-                continue
-            _outputs(whole, t, c, unit)
-            _missed(missed, t, c)
-        row[0].set_title(t.name, fontsize=9, loc="left")
-        grid(*[a for a in row if a.axison])
-        for a in row:
-            a.tick_params(labelsize=7)
-            a.set_axisbelow(True)
-            a.locator_params(axis="x", nbins=5)
-    for a, title in zip(
-        axes[0], ("position", "current", "errors of position / sd", "errors of current / sd"), strict=True
-    ):
-        a.set_title(title, fontsize=9, loc="right" if a is axes[0][0] else "center")
-    for a in axes[-1]:
-        a.set_xlabel("time [s]", fontsize=8)
-    figure.suptitle(
-        "measured (grey), predicted one step ahead (blue), and what the predictor missed (99 % bounds)", fontsize=10
-    )
-
-
-def _outputs(axes: Axes, t: BearingTrace, c: int, unit: str) -> None:
-    scale, shown = prefixed(float(np.max(np.abs(t.measured[:, c]))), unit)
-    curve(axes, t.time_s, t.measured[:, c] / scale, MEASURED, None)
-    curve(axes, t.time_s, t.predicted[:, c] / scale, PREDICTED, None)
-    axes.set_ylabel(f"[{shown}]", fontsize=8)
-
-
-def _missed(axes: Axes, t: BearingTrace, c: int) -> None:
-    e = (t.measured[:, c] - t.predicted[:, c]) / t.sd[:, c]
-    curve(axes, t.time_s, e, MEASURED, None)
-    for side in (-NORMAL_99, NORMAL_99):
-        axes.axhline(side, color=BOUND, linewidth=0.8, linestyle="--")
-    reach = max(1.3 * NORMAL_99, float(np.nanquantile(np.abs(e), 0.999)))
-    axes.set_ylim(-1.15 * reach, 1.15 * reach)
-    note(axes, f"{100 * float(np.mean(np.abs(e[np.isfinite(e)]) > NORMAL_99)):.2g} % outside")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.measured import Measured, ModelResponse, model_responses
+from ambid.bearing.measured import Measured, ModelResponse, model_responses, with_spread
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import pole_covariance, zero_covariance
@@ -18,25 +18,25 @@ from ambid.report.drawing import (
     BAND,
     BOUND,
     MEASURED,
+    MOST_PAIRS,
     PREDICTED,
     Complex,
+    Pair,
     Pole,
-    Response,
     Traces,
     angle_ticks,
     bode_panel,
     frequency_grid,
-    grid,
     magnitude_axis,
+    pair_axes,
     phase_axis,
     poles_panel,
     residuals_panel,
-    responses_with_spread,
     signals_panel,
     stacked,
     unwrapped,
 )
-from ambid.report.fit_text import pole_lines, response_unit
+from ambid.report.fit_text import pole_lines
 from ambid.report.numbers import sized
 from ambid.validate.blackbox_predictor import innovations_form, plant_form
 from ambid.validate.stabilisation import ModePole, Stabilisation
@@ -47,9 +47,8 @@ if TYPE_CHECKING:
 
     from ambid.report.drawing import Draw
 
-_PAIRS = 6  # diagrams beside each other; of more pairs the first are drawn, and the title says so
 _NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
-_MODELS: tuple[tuple[str, str, Literal["-", "--"]], ...] = (
+_MODELS: tuple[tuple[str, str, str], ...] = (
     (PREDICTED, BAND, "-"),
     (BOUND, "#f1c4be", "--"),
 )  # line and band of the black-box fit and of the physical parameters
@@ -66,9 +65,9 @@ def fit_overview(fit: BlackBoxFit, data: IOData) -> Figure:
         (2.2 * n_y, lambda place: residuals_panel(place, traces)),
     ]
     if fit.inputs:
-        parts.append((4.6, lambda place: bode_panel(place, fit_responses(fit), fit.units, {})))
+        parts.append((4.6, lambda place: bode_panel(place, fit_response(fit), fit.inputs, fit.outputs, fit.units, {})))
     parts.append((3.6, lambda place: _poles(place, fit)))
-    pairs = min(_PAIRS, len(fit.inputs) * n_y)
+    pairs = min(MOST_PAIRS, len(fit.inputs) * n_y)
     return stacked(f"{fit.record.get('file') or 'record'}: {fit.structure}", parts, max(11.0, 3.3 * pairs))
 
 
@@ -81,11 +80,11 @@ def fit_traces(fit: BlackBoxFit, data: IOData) -> Traces:
         measured=data.y,
         predicted=one_step(innovations_form(fit), data.u, data.y, fit.offsets),
         simulated=simulation(plant_form(fit), data.u, data.y, fit.offsets),
-        innovation_sd=np.sqrt(np.diag(fit.noise_covariance)),
+        sd=np.sqrt(np.diag(fit.noise_covariance)),
     )
 
 
-def fit_responses(fit: BlackBoxFit) -> tuple[Response, ...]:
+def fit_response(fit: BlackBoxFit) -> ModelResponse:
     """Compute the frequency response of every pair with its spread, up to half the sampling rate."""
     nyquist = 0.5 / fit.dt
     lowest = max(1 / (int(str(fit.record["samples"])) * fit.dt), 1e-5 * nyquist)
@@ -94,10 +93,8 @@ def fit_responses(fit: BlackBoxFit) -> tuple[Response, ...]:
     frequency = frequency_grid(s, lowest, nyquist)
     omega = 2 * np.pi * frequency
     G = fit.model.frequency_response(omega)
-    slopes, covariance = np.zeros((*G.shape, 1), dtype=np.complex128), np.zeros((1, 1))
-    if fit.covariance is not None:
-        slopes, covariance = fit.model.frequency_response_derivative(omega), fit.covariance
-    return responses_with_spread(frequency, G, slopes, covariance, fit.inputs, fit.outputs)
+    slopes = np.zeros((*G.shape, 0)) if fit.covariance is None else fit.model.frequency_response_derivative(omega)
+    return with_spread(fit.structure, frequency, G, slopes.astype(np.complex128), fit.covariance)
 
 
 def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
@@ -140,47 +137,28 @@ def frf_figure(measured: Measured) -> Figure:
     from matplotlib.figure import Figure
 
     frf = measured.response
-    pairs = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)]
-    shown, f = pairs[:_PAIRS], frf.frequency_hz
+    pairs, f = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)], frf.frequency_hz
     models = model_responses(measured, np.geomspace(f[0], f[-1], _GRID)) if f.size > 1 else ()
-    page = Figure(figsize=(max(8.0, 5.5 * len(shown)), 7.0), layout="constrained")
-    axes = page.subplots(2, len(shown), squeeze=False, sharex=True, height_ratios=(3, 2))
-    for column, (j, k) in enumerate(shown):
-        magnitude, phase = axes[:, column]
-        of_pair = [_of_pair(m, j, k) for m in models]
-        _magnitude(magnitude, measured, of_pair, j, k)
-        _phase(phase, measured, of_pair, j, k)
-        magnitude.set_title(f"{frf.inputs[k]} → {frf.outputs[j]}", fontsize=10)
-        magnitude.set_ylabel(f"magnitude [{response_unit(frf.units, frf.outputs[j], frf.inputs[k])}]")
-        phase.set_xlabel("frequency [Hz]")
-        grid(magnitude, phase)
-    axes[1, 0].set_ylabel("phase [°]")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
+    page = Figure(figsize=(max(8.0, 5.5 * min(len(pairs), MOST_PAIRS)), 7.0), layout="constrained")
+    axes = pair_axes(page, pairs, frf.inputs, frf.outputs, frf.units)
+    for (magnitude, phase), pair in zip(axes, pairs, strict=False):
+        _magnitude(magnitude, measured, models, pair)
+        _phase(phase, measured, models, pair)
+    handles, labels = axes[0][0].get_legend_handles_labels()
     page.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), fontsize=9)
     name = measured.record.get("file") or "record"
-    some = f" ({len(shown)} of {len(pairs)} pairs)" if len(pairs) > len(shown) else ""
+    some = f" ({len(axes)} of {len(pairs)} pairs)" if len(pairs) > len(axes) else ""
     page.suptitle(f"{name}: frequency response, {frf.method}{some}", fontsize=12)
     return page
 
 
-def _of_pair(m: ModelResponse, j: int, k: int) -> Response:
-    return Response(
-        source=m.source,
-        output="",
-        frequency_hz=m.frequency_hz,
-        value=m.G[:, j, k],
-        log_sd=m.log_sd[:, j, k],
-        phase_sd=m.phase_sd[:, j, k],
-    )
-
-
-def _magnitude(axes: Axes, measured: Measured, models: Sequence[Response], j: int, k: int) -> None:
+def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
     """Measured lines with their band, the levels under them, the models over them."""
     frf = measured.response
-    f, size, radius = frf.frequency_hz, frf.magnitude[:, j, k], frf.confidence_radius()[:, j, k]
-    noise = None if frf.noise_sd is None else frf.noise_sd[:, j, k]
-    distortion = None if measured.distortion_sd is None else measured.distortion_sd[:, j, k]
-    levels = [(frf.sd[:, j, k], _NOISE, "sd of measured")] if distortion is None else []
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
+    noise = None if frf.noise_sd is None else frf.noise_sd[:, *pair]
+    distortion = None if measured.distortion_sd is None else measured.distortion_sd[:, *pair]
+    levels = [(frf.sd[:, *pair], _NOISE, "sd of measured")] if distortion is None else []
     levels += [(noise, _NOISE, "noise sd")] if distortion is not None and noise is not None else []
     levels += [(distortion, _DISTORTION, "distortion sd")] if distortion is not None else []
     drawn = [x[x > 0] for x, _, _ in levels if np.any(x > 0)]
@@ -188,8 +166,7 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[Response], j: in
     lower = np.maximum(size - radius, 0.1 * bottom)
     axes.fill_between(f, lower, size + radius, color=_RANGE, linewidth=0, label="measured, 95 %")
     for m, (line, band, style) in zip(models, _MODELS, strict=False):
-        magnitude_axis(axes, m, label=m.source, band_label=f"{m.source}, 95 %", colors=(line, band))
-        axes.lines[-1].set_linestyle(style)
+        magnitude_axis(axes, m, pair, label=m.source, band_label=f"{m.source}, 95 %", colors=(line, band), style=style)
     dot = _marker(f.size)
     axes.plot(f, size, ".", color=MEASURED, markersize=dot, label="measured", zorder=1.8)
     for x, color, label in levels:
@@ -202,29 +179,28 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[Response], j: in
     axes.set_ylim(bottom, 2.0 * float(np.max(size)))
 
 
-def _phase(axes: Axes, measured: Measured, models: Sequence[Response], j: int, k: int) -> None:
+def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
     """Phase, unwrapped beginning near zero; where |G| is lost in its sd the band is all angles."""
     frf = measured.response
-    f, size, radius = frf.frequency_hz, frf.magnitude[:, j, k], frf.confidence_radius()[:, j, k]
-    angle = np.rad2deg(_angle(frf.G[:, j, k], f, models))
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
+    angle = np.rad2deg(_angle(frf.G[:, *pair], f, models, pair))
     ratio = np.minimum(radius / np.maximum(size, 1e-300), 1.0)
     spread = np.where(ratio < 1, np.rad2deg(np.arcsin(ratio)), 180.0)
-    near = float(unwrapped(models[0].value)[0]) if models else 0.0  # a phase near ±180° begins on one side
+    near = float(unwrapped(models[0].G[:, *pair])[0]) if models else 0.0  # a phase near ±180° begins on one side
     for m, (line, band, style) in zip(models, _MODELS, strict=False):
-        phase_axis(axes, m, near=near, colors=(line, band))
-        axes.lines[-1].set_linestyle(style)
+        phase_axis(axes, m, pair, near=near, colors=(line, band), style=style)
     axes.fill_between(f, angle - spread, angle + spread, color=_RANGE, linewidth=0, zorder=0.5)
     axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
     axes.set_xscale("log")
-    lines = [np.rad2deg(unwrapped(m.value, near)) for m in models]
+    lines = [np.rad2deg(unwrapped(m.G[:, *pair], near)) for m in models]
     angle_ticks(axes, np.concatenate([angle[ratio < 0.5] if np.any(ratio < 0.5) else angle, *lines]))
 
 
-def _angle(G: Complex, f: Array, models: Sequence[Response]) -> Array:
+def _angle(G: Complex, f: Array, models: Sequence[ModelResponse], pair: Pair) -> Array:
     """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
     if not models:
         return unwrapped(G)
-    near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].value))
+    near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].G[:, *pair]))
     return np.asarray(near + np.angle(G * np.exp(-1j * near)))
 
 

@@ -18,7 +18,7 @@ from ambid.blackbox.structures import any_structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.report.estimate_text import frequency_lines
-from ambid.report.numbers import prefixed, quantity, sized
+from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.text import (
     WIDTH,
     Paint,
@@ -387,16 +387,6 @@ def pair_lines(measured: Measured, *, width: int = WIDTH) -> list[str]:
     about = "medians over the lines, of |G|"
     about += "; noise and distortion were not told apart" if distortion is None else ""
     return [*lines, *textwrap.wrap(f"({about})", width)]
-
-
-def response_unit(units: Any, output: str, source: str) -> str:
-    """Return the unit of a response, such as ``"m/V"``; a name that is missing has an unknown unit."""
-    above, below = str(units.get(output, UNKNOWN)), str(units.get(source, UNKNOWN))
-    if above == below:
-        return "1"
-    if below == "1":
-        return above
-    return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
 
 
 def _range(g: Array, unit: str) -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
@@ -18,15 +17,14 @@ from ambid.report.drawing import (
     BOUND,
     MEASURED,
     NORMAL_95,
-    NORMAL_99,
     PREDICTED,
     Traces,
-    curve,
     grid,
-    note,
+    records_panel,
     residuals_panel,
     signals_panel,
     stacked,
+    stems,
     worst_stretch,
 )
 from ambid.report.fit_text import is_weight
@@ -50,15 +48,6 @@ _LEAD = 500  # samples in which derivatives that are recursions settle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Panel:
-    """One record as it is drawn."""
-
-    title: str
-    traces: Traces
-    second: bool = False  # whether the fit has not seen it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bars:
     """Coefficients as they are drawn, the most significant first."""
 
@@ -76,8 +65,7 @@ def nonlinear_overview(fit: NonlinearFit, records: Sequence[IOData], second: IOD
     """
     if not records:
         raise EstimationError("there is no record to draw. Pass those that the fit was estimated from")
-    panels = _panels(fit, records, second)
-    parts = _signals(panels)
+    parts, several = _signals(fit, records, second), len(records) > 1 or second is not None
     bars = bars_of(fit)
     if bars is not None:
         parts.append((bars_height(bars), lambda place: bars_panel(place, bars)))
@@ -90,7 +78,7 @@ def nonlinear_overview(fit: NonlinearFit, records: Sequence[IOData], second: IOD
         parts.append((1.9 * rows + 0.4, lambda place: _correlations(place, shown)))
     if any(c.training.size for c in fit.curves):
         parts.append((3.0 + 0.1 * len(fit.curves), lambda place: _training(place, fit)))
-    return stacked(_title(fit, records, second), parts)
+    return stacked(_title(fit, records, second), parts, max(11.0, 4.5 * len(fit.outputs)) if several else 11.0)
 
 
 def _title(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> str:
@@ -105,27 +93,22 @@ def _name(data: IOData, k: int) -> str:
     return str(data.record.get("file") or f"record {k + 1}")
 
 
-def _panels(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[Panel]:
-    out = [Panel(title=_name(x, k), traces=traces_of(fit, x)) for k, x in enumerate(records[:_RECORDS])]
+def _signals(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[tuple[float, Draw]]:
+    """One record large, with a close view; several below each other."""
+    found = [traces_of(fit, x, _name(x, k)) for k, x in enumerate(records[:_RECORDS])]
     if second is not None:
         title = f"second record, not fitted: {second.record.get('file') or 'record'}"
-        out.append(Panel(title=title, traces=traces_of(fit, second), second=True))
-    return out
-
-
-def _signals(panels: list[Panel]) -> list[tuple[float, Draw]]:
-    """One record large, with a close view; several beside each other."""
-    n_y, only = len(panels[0].traces.names), panels[0].traces
-    if len(panels) == 1:
+        found.append(traces_of(fit, second, title, second=True))
+    n_y, only = len(fit.outputs), found[0]
+    if len(found) == 1:
         return [
             (2.3 * n_y, lambda place: signals_panel(place, only)),
             (2.2 * n_y, lambda place: residuals_panel(place, only)),
         ]
-    down = -(-len(panels) // columns_of(len(panels)))
-    return [(0.4 + (0.5 + 2.7 * n_y) * down, lambda place: records_panel(place, panels))]
+    return [(0.4 + 1.8 * len(found), lambda place: records_panel(place, found))]
 
 
-def traces_of(fit: NonlinearFit, data: IOData) -> Traces:
+def traces_of(fit: NonlinearFit, data: IOData, title: str = "", *, second: bool = False) -> Traces:
     """Run a record through a fit, without the samples at the start that are not predicted.
 
     Returns no simulation where it diverges, or without inputs.
@@ -134,13 +117,15 @@ def traces_of(fit: NonlinearFit, data: IOData) -> Traces:
     first = found.lag
     free = None if found.simulation is None or found.diverges_at is not None else data.y - found.simulation
     return Traces(
+        title=title,
+        second=second,
         time_s=np.arange(first, data.n_samples, dtype=np.float64) * data.dt,
         names=data.outputs,
         units=tuple(fit.units[o] for o in data.outputs),
         measured=data.y[first:],
         predicted=(data.y - found.one_step)[first:],
         simulated=None if free is None else free[first:],
-        innovation_sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
+        sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
     )
 
 
@@ -162,9 +147,7 @@ def _correlations(figure: Figure | SubFigure, shown: list[Correlation]) -> None:
     for a in axes.flat[len(shown) :]:
         a.axis("off")
     for a, c in zip(axes.flat, shown, strict=False):
-        a.fill_between(c.lags, -c.band, c.band, color=BAND, alpha=0.6, linewidth=0, zorder=0)
-        a.vlines(c.lags, 0, c.values, color=MEASURED, linewidth=1.4)
-        a.axhline(0, color=MEASURED, linewidth=0.6)
+        stems(a, c.lags, c.values, c.band)
         a.set_title(c.title, fontsize=9)
         a.tick_params(labelsize=8)
         grid(a)
@@ -214,66 +197,6 @@ def _scaled(axes: Axes, which: Literal["x", "y"], values: list[float]) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     axis.set_major_formatter(LogFormatterSciNotation() if wide else "{x:g}")
     axis.set_minor_formatter(NullFormatter())
-
-
-def records_panel(figure: Figure | SubFigure, panels: Sequence[Panel]) -> None:
-    """Draw several records beside each other, each output with its errors below."""
-    across = columns_of(len(panels))
-    n_y, down = len(panels[0].traces.names), -(-len(panels) // across)
-    axes = figure.subplots(2 * n_y * down, across, squeeze=False, height_ratios=(1.7, 1.0) * (n_y * down))
-    for k, panel in enumerate(panels):
-        row, column = divmod(k, across)
-        own = axes[2 * n_y * row : 2 * n_y * (row + 1), column]
-        _record(own, panel, with_names=column == 0)
-    for k in range(len(panels), across * down):
-        for a in axes[2 * n_y * (down - 1) :, k % across]:
-            a.axis("off")
-    named = {label: h for a in axes.flat for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
-    figure.legend(list(named.values()), list(named), loc="outside upper center", fontsize=8, ncols=4, frameon=False)
-
-
-def columns_of(n_panels: int) -> int:
-    """Return how many records stand beside each other."""
-    return n_panels if n_panels <= 3 else 2 if n_panels == 4 else 3
-
-
-def _record(axes: NDArray[np.object_], panel: Panel, *, with_names: bool) -> None:
-    traces, t = panel.traces, panel.traces.time_s
-    for j, name in enumerate(traces.names):
-        signals, errors = axes[2 * j], axes[2 * j + 1]
-        scale, unit = prefixed(float(np.max(np.abs(traces.measured[:, j]))), traces.units[j])
-        curve(signals, t, traces.measured[:, j] / scale, MEASURED, "measured")
-        curve(signals, t, traces.predicted[:, j] / scale, PREDICTED, "predicted one step ahead")
-        if traces.simulated is not None:
-            free = traces.simulated[:, j] / scale
-            signals.plot(t, free, "--", color=BOUND, linewidth=0.8, label="simulated from the input", zorder=1.5)
-            signals.set_ylim(*_limits(traces.measured[:, j] / scale, free))
-        sd = traces.innovation_sd[j]
-        e = traces.measured[:, j] - traces.predicted[:, j]
-        size, small = prefixed(3.0 * float(sd) if sd > 0 else float(np.max(np.abs(e))), traces.units[j])
-        curve(errors, t, e / size, PREDICTED, None)
-        for side in (-1, 1):
-            errors.axhline(side * NORMAL_99 * sd / size, color=BOUND, linewidth=0.9, linestyle="--")
-        note(errors, f"{100 * float(np.mean(np.abs(e) > NORMAL_99 * sd)):.2g} % outside")
-        signals.tick_params(labelbottom=False)
-        signals.sharex(errors)
-        signals.set_ylabel(f"{name} [{unit}]" if with_names else f"[{unit}]", fontsize=9)
-        errors.set_ylabel(f"error [{small}]" if with_names else f"[{small}]", fontsize=9)
-        grid(signals, errors)
-        for a in (signals, errors):
-            a.tick_params(labelsize=8)
-            if panel.second:
-                a.set_facecolor("#fbf7ee")
-    axes[0].set_title(panel.title, fontsize=9)
-    axes[-1].set_xlabel("time [s]", fontsize=9)
-
-
-def _limits(y: Array, free: Array) -> tuple[float, float]:
-    """Limits for both; a free run that runs away would hide all else, and gets half the measured span at most."""
-    low, high = float(np.min(y)), float(np.max(y))
-    room = (high - low) or 1.0
-    least, largest = max(float(np.min(free)), low - room / 2), min(float(np.max(free)), high + room / 2)
-    return min(low, least) - 0.05 * room, max(high, largest) + 0.05 * room
 
 
 def bars_of(fit: NonlinearFit) -> Bars | None:

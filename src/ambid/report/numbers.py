@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+from ambid.units import UNKNOWN
 
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
 _UNPREFIXED = ("1", "%", "rad", "deg", "rpm")
@@ -96,6 +99,16 @@ def sized(value: float, unit: str, digits: int = 3) -> str:
     """
     scale, shown = prefixed(float(f"{value:.{digits}g}"), unit)
     return f"{value / scale:.{digits}g} {shown}"
+
+
+def response_unit(units: Mapping[str, str], output: str, source: str) -> str:
+    """Return the unit of a response, such as ``"m/V"``; a name that is missing has an unknown unit."""
+    above, below = str(units.get(output, UNKNOWN)), str(units.get(source, UNKNOWN))
+    if above == below:
+        return "1"
+    if below == "1":
+        return above
+    return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
 
 
 def _fixed(x: float, decimals: int) -> str:
