@@ -95,7 +95,7 @@ def test_reweighting_beats_any_fixed_weighting(fit):
         moved = fit.vector + 0.3 * np.sqrt(np.diag(posterior(fit))) * rng.standard_normal(fit.problem.size)
         assert evaluate(fit.problem, moved)[0] > fit.criterion
     if n_y == 2:
-        once = search(fit.problem, fit.vector * 1.001, rounds=1)
+        once = search(fit.problem, fit.vector * 1.001, steps=1)
         assert fit.criterion <= once.criterion + 0.02
 
 
@@ -237,13 +237,13 @@ def test_a_predictor_that_is_found_only_once_at_a_point_ends_no_search(monkeypat
 
     monkeypatch.setattr(likelihood, "linearise", moody)
     problem, vector = problem_of(run("bearing", 300, 1))
-    assert search(problem, vector, rounds=1, evaluations=3).evaluations == 4
+    assert search(problem, vector, steps=3).evaluations == 4
 
 
 def test_too_few_evaluations_are_reported():
     problem, vector = problem_of(run("bearing", 1500, 1))
     vector[problem.slices["physical"]] *= 0.6
-    assert search(problem, vector, rounds=1, evaluations=2).status == "stalled"
+    assert search(problem, vector, steps=1).status == "stalled"
 
 
 def test_progress_can_interrupt():

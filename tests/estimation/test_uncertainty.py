@@ -24,7 +24,7 @@ def test_standard_deviations_are_the_cramer_rao_bound(name, names, n):
     problem, vector = problem_of(bench, estimated=names)
     fit = search(problem, vector)
     # at the truth, so that only the formula is compared, not where the noise has taken the estimate
-    known = uncertainty(search(problem, vector, rounds=0))
+    known = uncertainty(search(problem, vector, steps=0))
     bound = cramer_rao_sd(bench, names)
     got = np.sqrt(np.diag(known.fisher))
     np.testing.assert_allclose(got, bound, rtol=0.05)

@@ -99,7 +99,7 @@ def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
     problem, vector = candidate.problem, candidate.vector
     stretch = busiest(problem.u, _SHORT)
     part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-    fit = search(part, at_first_sample(part, vector), rounds=3, tick=tick)
+    fit = search(part, at_first_sample(part, vector), steps=20, tick=tick)
     moved = at_first_sample(problem, fit.vector)
     # noise levels move slowly on a logarithmic scale: look again where they stand best
     work = candidate.work.of(problem) if candidate.work else Workspace(problem)

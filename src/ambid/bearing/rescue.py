@@ -124,7 +124,7 @@ def rescued(
         interrupted = True
         candidates = [] if run.vector is None else candidates_at(cost, signals, [run.vector])
         if candidates:  # not a step further: what was found, with its information
-            after = search(candidates[0].problem, candidates[0].vector, rounds=0)
+            after = search(candidates[0].problem, candidates[0].vector, steps=0)
         if before is None and (after is None or after.status == "failed"):
             raise
     taken = _better(after, before)

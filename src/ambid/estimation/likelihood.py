@@ -1,7 +1,8 @@
 """Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2).
 
-The determinant of the innovation covariance is minimised as a sequence of weighted least-squares problems, each given
-to SciPy's trust-region optimiser with exact Jacobians; the weights are the innovation covariance of the last one.
+The determinant of the innovation covariance is minimised by Gauss-Newton steps in a trust region, with exact Jacobians
+weighted by the innovation covariance at the same vector. A trial step costs one run of the predictor; slopes are taken
+only where the criterion fell.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from ambid.estimation.search import Status
 from ambid.estimation.sensitivity import Workspace, innovations, linearise
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
-_ROUNDS = 20  # of reweighting by the innovation covariance
-_EVALUATIONS = 10  # of the residual in one round
-_SETTLED = 0.03  # Newton step of every physical parameter, in standard deviations, below which a search has converged
-_FLAT = 0.1  # fall of the criterion in one round below which a search has converged; a needless number earns one
+_STEPS = 200
+_NOTHING = 1e-12  # radius of the trust region below which no step is left
+_ROUNDING = 1e-15  # singular value, over the largest, below which there is nothing but rounding
+_SECULAR = 30  # Newton steps towards the damping that gives a step its length
+_SETTLED = 0.01  # Newton step of every physical parameter, in standard deviations, below which a search has converged
+_FLAT = 0.001  # fall of the criterion in one step below which a search has converged; a needless number earns one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -185,62 +188,138 @@ def search(
     problem: PredictorProblem,
     start: Array,
     *,
-    rounds: int = _ROUNDS,
-    evaluations: int = _EVALUATIONS,
+    steps: int = _STEPS,
     tick: Callable[[], None] | None = None,
     work: Workspace | None = None,
 ) -> Fit:
     """Minimise the likelihood criterion from `start`.
 
-    `start`: (size,); `rounds`, `evaluations`: bounds on reweightings, and on residual evaluations in each; `tick`:
-    called after each evaluation (progress, interruption); `work`: of this problem, or of one with the same data.
-    Returns with status ``"failed"`` where there is no predictor at `start`.
+    `start`: (size,); `steps`: steps tried at most; `tick`: called after each (progress, interruption); `work`: of this
+    problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor at `start`.
     """
-    from scipy.optimize import least_squares
-
     work = Workspace(problem) if work is None else work.of(problem)
-    vector = with_linear_part(problem, start, work)
-    value, covariance = evaluate(problem, vector, work)
-    if covariance is None:
-        return _failed(problem, start)
-    target = _Weighted(problem, work, tick)
-    status: Status = "stalled"
-    count = 1
-    for _ in range(rounds):
-        target.reweigh(weight_of(covariance))
-        if not np.all(np.isfinite(target.residual(vector))):  # innovations exist, their sensitivities overflow
-            return _failed(problem, start)
-        # the cost is about n_used * n_outputs / 2, and a change of 1/2 is one standard deviation
-        small = 4e-3 / (problem.n_used * problem.y.shape[1])
-        found = least_squares(
-            target.residual, vector, jac=target.jacobian, method="trf", x_scale="jac",
-            ftol=small, xtol=1e-12, gtol=1e-14, max_nfev=evaluations,
-        )  # fmt: skip
-        count += found.nfev
-        before, vector = value, found.x
-        J = target.jacobian(vector)
-        r, covariance = target.r, target.covariance
-        value = criterion(problem, vector, covariance)
-        # the covariance moved since r was weighted: that changes the step only to second order
-        if before - value < _FLAT and _step_left(J, r, problem.n_physical) < _SETTLED:
-            status = "converged"
-            break
-    at = linearise(problem, vector, weight_of(covariance), work)
+    at = _point(problem, with_linear_part(problem, start, work), work)
     if at is None:
         return _failed(problem, start)
-    r_prior, J_prior = prior_rows(problem, vector)
+    status: Status = "stalled"
+    region, fall = _Region(problem), np.inf
+    count = 1
+    for _ in range(steps):
+        step, promise = region.step(at)
+        value, covariance = evaluate(problem, at.vector + step, work)
+        count += 1
+        if tick is not None:
+            tick()
+        # the weighted sum of squares falls by less than the criterion, which is concave in the covariance
+        gain = at.fall(problem, at.vector + step, covariance)
+        better = _point(problem, at.vector + step, work, value, covariance) if gain > 0.0 else None
+        region.judge(gain / promise if better is not None else -1.0)
+        if better is not None:
+            at, fall = better, at.criterion - value
+        if (fall < _FLAT or promise < _FLAT) and _step_left(at.J, at.r, problem.n_physical) < _SETTLED:
+            status = "converged"
+            break
+        if region.radius < _NOTHING:
+            break
+    n = at.J.shape[0] - at.n_priors
     return Fit(
         problem=problem,
-        vector=vector,
-        covariance=covariance,
-        J=at.J,
-        J_prior=J_prior,
-        r_prior=r_prior,
-        criterion=value,
+        vector=at.vector,
+        covariance=at.covariance,
+        J=at.J[:n],
+        J_prior=at.J[n:],
+        r_prior=at.r[n:],
+        criterion=at.criterion,
         status=status,
         evaluations=count,
         work=work,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Point:
+    """Criterion and its slope at one vector, rows of the priors last."""
+
+    vector: Array  # (size,)
+    covariance: Array  # (n_outputs, n_outputs), innovation covariance, scaled
+    criterion: float
+    r: Array  # (n_rows,), weighted by the covariance here: the gradient of the criterion is 2 J^T r
+    J: Array  # (n_rows, size)
+    n_priors: int
+
+    def fall(self, problem: PredictorProblem, vector: Array, covariance: Array | None) -> float:
+        """Return by how much the sum of squares, weighted as here, falls to a vector with that covariance."""
+        if covariance is None:
+            return -np.inf
+        r, _ = prior_rows(problem, vector)
+        return float(self.r @ self.r - problem.n_used * np.trace(np.linalg.solve(self.covariance, covariance)) - r @ r)
+
+
+def _point(
+    problem: PredictorProblem,
+    vector: Array,
+    work: Workspace,
+    value: float = np.nan,
+    covariance: Array | None = None,
+) -> _Point | None:
+    """The point at a vector, None without a predictor or its slope; `value`, `covariance`: where they are known."""
+    if covariance is None:
+        value, covariance = evaluate(problem, vector, work)
+    at = None if covariance is None else linearise(problem, vector, weight_of(covariance), work)
+    if at is None or covariance is None:
+        return None
+    r, J = prior_rows(problem, vector)
+    return _Point(
+        vector=vector,
+        covariance=covariance,
+        criterion=value,
+        r=np.concatenate([at.r, r]),
+        J=np.vstack([at.J, J]),
+        n_priors=r.size,
+    )
+
+
+class _Region:
+    """Trust region of Gauss-Newton steps (Nocedal and Wright 2006, sec. 10.3).
+
+    Lengths are those of what acts nonlinearly, in its own unit: parts of a parameter, and logarithms of levels bend at
+    about the same length, whatever the data say of them. Offsets and initial state, which enter linearly, follow.
+    """
+
+    def __init__(self, problem: PredictorProblem) -> None:
+        self.linear = problem.slices["offset"].start
+        self.radius = 1.0
+        self.length, self.bound = 0.0, False  # of the last step, and whether it was cut
+
+    def step(self, at: _Point) -> tuple[Array, float]:
+        """Return the best step inside the region, and the fall of the sum of squares that it promises."""
+        n = self.linear
+        easy = directions(at.J[:, n:])
+        rows = np.column_stack([at.J[:, :n], at.r])
+        rows = rows - easy.U @ (easy.U.T @ rows)
+        U, s, Vt = np.linalg.svd(rows[:, :n], full_matrices=False)
+        seen = s > _ROUNDING * np.max(s, initial=0.0)
+        s, pull = s[seen], -(U.T @ rows[:, n])[seen]
+        damping, along = 0.0, pull / s
+        for _ in range(_SECULAR):  # Newton's method on 1 / length, which is nearly linear in the damping
+            self.length = float(np.linalg.norm(along))
+            if self.length <= 1.1 * self.radius:
+                break
+            slope = float(along**2 @ (1.0 / (s**2 + damping)))
+            damping += self.length**2 / slope * (self.length / self.radius - 1.0)
+            along = s * pull / (s**2 + damping)
+        self.bound = damping > 0.0
+        step = Vt[seen].T @ along
+        rest = easy.solve(-at.r - at.J[:, :n] @ step)
+        promise = float(2.0 * pull @ (s * along) - np.sum((s * along) ** 2)) + easy.explain(at.r)
+        return np.concatenate([step, rest]), promise
+
+    def judge(self, ratio: float) -> None:
+        """Move the bound by the ratio of the fall that came to the one that was promised."""
+        if ratio < 0.25:
+            self.radius = 0.25 * self.length
+        elif ratio > 0.75 and self.bound:
+            self.radius = 2.0 * self.length
 
 
 def _failed(problem: PredictorProblem, start: Array) -> Fit:
@@ -249,36 +328,3 @@ def _failed(problem: PredictorProblem, start: Array) -> Fit:
         problem=problem, vector=start, covariance=np.eye(n_y), J=np.zeros((problem.size + 1, problem.size)),
         J_prior=np.zeros((0, problem.size)), r_prior=np.zeros(0), criterion=np.inf, status="failed", evaluations=1,
     )  # fmt: skip
-
-
-class _Weighted:
-    """Residual and Jacobian as SciPy's optimiser asks for them: one evaluation serves both."""
-
-    def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
-        self.problem, self.work, self.tick = problem, work, tick
-        self.weight = np.eye(problem.y.shape[1])
-        self.at = np.full(self.problem.size, np.nan)
-        self.r, self.J, self.covariance = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
-
-    def reweigh(self, weight: Array) -> None:
-        self.weight = weight
-        self.at = np.full(self.problem.size, np.nan)
-
-    def residual(self, vector: Array) -> Array:
-        if np.array_equal(self.at, vector):  # once more would begin from another gain, and may find no predictor
-            return self.r
-        prior, J_prior = prior_rows(self.problem, vector)
-        result = linearise(self.problem, vector, self.weight, self.work)
-        if self.tick is not None:
-            self.tick()
-        if result is None:  # infinite: the trust region shrinks
-            return np.full(self.problem.size + 1 + prior.size, np.inf)
-        self.at = vector.copy()
-        self.r, self.J = np.concatenate([result.r, prior]), np.vstack([result.J, J_prior])
-        self.covariance = result.covariance
-        return self.r
-
-    def jacobian(self, vector: Array) -> Array:
-        if not np.array_equal(self.at, vector):
-            self.residual(vector)
-        return self.J

@@ -204,7 +204,7 @@ def agreement(fit: Fit) -> Agreement:
     for stride in _STRIDES:
         sparse = replace(problem, stride=stride, noise="given", gain=_sparse_gain(fit, stride))
         start = carry(fit, sparse)
-        again = search(sparse, start, rounds=6, work=workspace_near(fit, sparse))
+        again = search(sparse, start, steps=60, work=workspace_near(fit, sparse))
         if again.status != "converged":
             continue
         spread = directions(np.vstack([again.J, again.J_prior])).inverse()[:n, :n]
