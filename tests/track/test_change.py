@@ -42,7 +42,7 @@ def test_whitened_windows_are_standard_normal_whatever_the_filter_knew():
         window = merge([evidence(J, truth, k, rng) for k in (2, 3)])
         M, X = np.empty((5, 5)), np.empty((5, 6))
         before = np.column_stack([f.P, f.q])
-        whiten(np.column_stack([window.J, window.r]), before, np.zeros(5), M, X)
+        whiten(np.column_stack([window.J, window.r]), before, np.zeros(5), 1, M, X)
         assert np.allclose(np.tril(M) @ np.tril(M).T, np.eye(5) + window.J @ f.P @ window.J.T)
         values.append(X[:, 5])
     assert stats.kstest(np.ravel(values), "norm").pvalue > 0.01

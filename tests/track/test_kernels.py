@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.recursive.square_root import covariance_of, factors_of
 from ambid.track import rpem_kernels as kernels
-from ambid.track.supervise_kernels import gather
+from ambid.track.evidence import Evidence, EvidenceSum
 
 P = 7
 
@@ -20,11 +21,16 @@ def block(rng, p=P):
     return np.triu(rng.normal(size=(p, p))), rng.normal(size=p), rng.normal(size=p)
 
 
-def absorbed(S, q, J, r, at, active, noise=1.0, positive=None):
-    q, S = q.copy(), S.copy()
+def evidence(J, r, at):
+    names = tuple("abcdefg")
+    return Evidence(names=names, at=at, J=J, r=r, rest=1.0, n_samples=9, n_outputs=1, first=0, last=9)
+
+
+def absorbed(covariance, q, J, r, at, active, noise=1.0, positive=None):
+    q, F = q.copy(), factors_of(covariance)
     positive = np.zeros(q.size, dtype=bool) if positive is None else positive
-    misfit, part = kernels.absorb(q, S, J, r, at, active, positive, noise)
-    return q, S, misfit, part
+    misfit, part = kernels.absorb(q, F, J, r, at, active, positive, noise, np.empty((q.size + 2, q.size)))
+    return q, covariance_of(F), misfit, part
 
 
 @pytest.mark.parametrize("held", [(), (2,), (0, 3, 4), tuple(range(P - 1))])
@@ -34,18 +40,17 @@ def test_absorb_is_josephs_formula_with_schmidts_gain(held, noise):
     covariance, q = spd(rng), rng.normal(size=P)
     J, r, at = block(rng)
     active = ~np.isin(np.arange(P), held)
-    found, S, misfit, part = absorbed(np.linalg.cholesky(covariance), q, J, r, at, active, noise)
+    found, after, misfit, part = absorbed(covariance, q, J, r, at, active, noise)
     rho = r + J @ (q - at)
     V = noise * np.eye(P) + J @ covariance @ J.T
     K = covariance @ J.T @ np.linalg.inv(V)
     K[~active] = 0.0
     left = np.eye(P) - K @ J
     np.testing.assert_allclose(found, q - K @ rho, rtol=1e-11)
-    np.testing.assert_allclose(S @ S.T, left @ covariance @ left.T + noise * K @ K.T, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(after, left @ covariance @ left.T + noise * K @ K.T, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(found[~active], q[~active])
     assert misfit == pytest.approx(rho @ np.linalg.solve(V, rho))
     assert part == 1.0
-    assert np.all(np.diag(S) > 0)
 
 
 def test_a_positive_number_loses_at_most_half_and_the_covariance_is_that_of_the_shorter_gain():
@@ -54,70 +59,61 @@ def test_a_positive_number_loses_at_most_half_and_the_covariance_is_that_of_the_
     J, r, at = np.eye(P), np.zeros(P), np.ones(P)
     r[2] = 50.0
     positive = np.arange(P) == 2
-    found, S, _, part = absorbed(np.linalg.cholesky(covariance), q, J, r, at, np.ones(P, dtype=bool), 1.0, positive)
-    free = absorbed(np.linalg.cholesky(covariance), q, J, r, at, np.ones(P, dtype=bool))[0]
+    found, after, _, part = absorbed(covariance, q, J, r, at, np.ones(P, dtype=bool), 1.0, positive)
+    free = absorbed(covariance, q, J, r, at, np.ones(P, dtype=bool))[0]
     assert free[2] < 0.0
     assert found[2] == pytest.approx(0.5)
     np.testing.assert_allclose(found - q, part * (free - q), rtol=1e-12)
     K = part * covariance @ np.linalg.inv(np.eye(P) + covariance)
     left = np.eye(P) - K
-    np.testing.assert_allclose(S @ S.T, left @ covariance @ left.T + K @ K.T, rtol=1e-9)
+    np.testing.assert_allclose(after, left @ covariance @ left.T + K @ K.T, rtol=1e-9)
 
 
-def test_spread_lets_active_numbers_walk():
+def test_walk_lets_active_numbers_walk():
     rng = np.random.default_rng(4)
-    covariance, variance, active = spd(rng), rng.uniform(size=P), rng.uniform(size=P) > 0.4
-    S = np.linalg.cholesky(covariance)
-    kernels.spread(S, variance, active, 0.3)
-    np.testing.assert_allclose(S @ S.T, covariance + np.diag(0.3 * variance * active), rtol=1e-12, atol=1e-14)
-    np.testing.assert_array_equal(S, np.tril(S))
-
-
-def test_lower_keeps_the_product():
-    W = np.random.default_rng(5).normal(size=(P, 3 * P))
-    found = W.copy()
-    kernels.lower(found)
-    np.testing.assert_allclose(found @ found.T, W @ W.T, rtol=1e-12)
-    np.testing.assert_array_equal(found[:, :P], np.tril(found[:, :P]))
-    np.testing.assert_array_equal(found[:, P:], 0.0)
-    assert np.all(np.diag(found) >= 0.0)
+    covariance, rates, active = spd(rng), rng.uniform(size=P), rng.uniform(size=P) > 0.4
+    F = factors_of(covariance)
+    kernels.walk(F, rates, active, 0.3, np.empty(P))
+    np.testing.assert_allclose(covariance_of(F), covariance + np.diag(0.3 * rates * active), rtol=1e-12, atol=1e-14)
 
 
 def test_fold_keeps_the_normal_equations():
     rng = np.random.default_rng(6)
     R, rows = np.triu(rng.normal(size=(P, P))), rng.normal(size=(P, 40))
     found = R.copy()
-    kernels.fold(found, rows.copy(), 23)
+    kernels.fold(found, rows.copy(), 23, 23)
     np.testing.assert_allclose(found.T @ found, R.T @ R + rows[:, :23] @ rows[:, :23].T, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(found, np.triu(found), atol=1e-12)
 
 
-def test_gather_moves_blocks_to_one_point():
+def test_a_sum_of_evidence_moves_blocks_to_one_point():
     rng = np.random.default_rng(7)
-    point, q, other = rng.normal(size=P), rng.normal(size=P), rng.normal(size=P)
-    T, scratch, row = np.zeros((P, P + 1)), np.empty((P, P + 1)), np.empty(P + 1)
-    more = 0.0
+    q, other, total, more = rng.normal(size=P), rng.normal(size=P), EvidenceSum(P), 0.0
+    total.clear(rng.normal(size=P))
     for _ in range(3):
         J, r, at = block(rng)
-        assert gather(J, r, at, T, point, scratch, row)
+        assert total.add(evidence(J, r, at))
         more += np.sum((r + J @ (q - at)) ** 2) - np.sum((r + J @ (other - at)) ** 2)
-    left, right = (np.sum((T @ np.append(x - point, 1.0)) ** 2) for x in (q, other))
-    assert left - right == pytest.approx(more)
-    before = T.copy()
-    assert not gather(J, np.full(P, np.nan), at, T, point, scratch, row)
-    assert np.array_equal(T, before)
+    for _ in range(2):
+        left, right = (np.sum((total.T @ np.append(x - total.at, 1.0)) ** 2) for x in (q, other))
+        assert left - right == pytest.approx(more)
+        total.move(rng.normal(size=P))
+    before = total.T.copy()
+    assert not total.add(evidence(J, np.full(P, np.nan), at))
+    assert np.array_equal(total.T, before)
+    assert total.blocks == 3
 
 
 def test_far_is_what_it_says():
     rng = np.random.default_rng(8)
     J, q, at = np.triu(rng.normal(size=(P, P))), rng.normal(size=P), rng.normal(size=P)
-    S, never = np.linalg.cholesky(spd(rng)), np.full(P, np.inf)
-    length, sd = np.sum((J @ (q - at)) ** 2), np.sqrt(np.sum(S**2, axis=1))
-    assert not kernels.far(q, at, J, S, never, 1.01 * length)
-    assert kernels.far(q, at, J, S, never, 0.99 * length)
+    covariance, never = spd(rng), np.full(P, np.inf)
+    F, length, sd = factors_of(covariance), np.sum((J @ (q - at)) ** 2), np.sqrt(np.diag(covariance))
+    assert not kernels.far(q, at, J, F, never, 1.01 * length)
+    assert kernels.far(q, at, J, F, never, 0.99 * length)
     just = (q - at) ** 2 / sd
-    assert not kernels.far(q, at, J, S, 1.01 * just, np.inf)
-    assert kernels.far(q, at, J, S, np.where(np.arange(P) == 4, 0.99, 1.01) * just, np.inf)
+    assert not kernels.far(q, at, J, F, 1.01 * just, np.inf)
+    assert kernels.far(q, at, J, F, np.where(np.arange(P) == 4, 0.99, 1.01) * just, np.inf)
 
 
 def likelihood(J, r, at, q, covariance, variance, noise):

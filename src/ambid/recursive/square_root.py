@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 
@@ -29,16 +32,19 @@ def factors_of(P: Array) -> Array:
 
 def covariance_of(F: Array) -> Array:
     """Return the covariance U D Uᵀ, symmetric to the last bit."""
-    half = root_of_factors(F)
-    return np.asarray(half @ half.T)
+    half = root_of_factors(F).T
+    return np.asarray(half.T @ half)
 
 
 def root_of_factors(F: Array) -> Array:
     """Return the triangular root U √D."""
-    d = np.diag(F)
-    U = np.tril(F, -1).T
-    np.fill_diagonal(U, 1.0)
-    return np.asarray(U * np.sqrt(d))
+    below, unit = _unit_triangle(F.shape[0])
+    return np.asarray((np.where(below, F, unit) * np.sqrt(F.diagonal())[:, None]).T)
+
+
+@cache
+def _unit_triangle(n: int) -> tuple[NDArray[np.bool_], Array]:
+    return np.tri(n, k=-1, dtype=np.bool_), np.eye(n)
 
 
 def root_of(P: Array, floor: float = 0.0) -> Array:

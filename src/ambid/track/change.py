@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.track.evidence import Evidence
+from ambid.track.supervise_kernels import watch
 
 _FEWEST = 4  # blocks of the longest window, at least
 # Alarms in a quiet hour over tests in that hour times the tail of one test: neighbouring windows and hypotheses share
@@ -109,8 +110,6 @@ class ChangeDetector:
         settle_s: float = 0.0,
         margin: float = 9.2,
     ) -> None:
-        from ambid.track.supervise_kernels import watch
-
         self.names = tuple(names)
         self.hypotheses = self.names if hypotheses is None else tuple(hypotheses)
         for name in self.hypotheses:
@@ -120,7 +119,7 @@ class ChangeDetector:
             raise EstimationError(
                 "block_s and false_alarms_per_hour are positive, overdispersion at least 1. Mend them"
             )
-        self._watch, self._margin = watch, margin
+        self._margin = margin
         p, tests, longest = len(self.names), len(self.hypotheses) + 2, max(_FEWEST, round(longest_s / block_s))
         levels = 1 + max(int(math.log2(longest / 3)), 0)
         lengths = [1, 2, 3, 4] + [m << level for level in range(1, levels) for m in (3, 4)]
@@ -130,15 +129,15 @@ class ChangeDetector:
         self._marks = _marks(tests, p, min(false_alarms_per_hour / hourly, 0.01))
         self.threshold = float(self._marks[0, 0])
         self._tested = np.array([self.names.index(h) for h in self.hypotheses], dtype=np.int64)
-        self._inlet = np.zeros((2 * p + 2, max(p, 3) + 1))
         self._bases, self._notes = np.zeros((levels, 4, p, p + 1)), np.zeros((levels, 4, 4))
-        self._counts = np.zeros(levels + 1, dtype=np.int64)
+        self._counts, self._blocks, self._point = np.zeros(levels, dtype=np.int64), 0, np.zeros(p)
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
-        self._rows = np.zeros((5, max(p + 1, tests, 10)))
-        self.drift = np.zeros(p) if drift is None else drift
+        self._drift = np.zeros(p)
+        self.drift = self._drift if drift is None else drift
         self._state = np.array([math.log(overdispersion), 0.0, _GAIN, _NOISE_GAIN, float(longest), 1.0])
-        self._scratch, self._result = np.zeros((4, p, p + 1)), np.zeros(10 + tests)
+        self._scratch = np.zeros((p, p + 1)), np.zeros((p + 1, p)), np.zeros((p, p)), np.zeros((p, p + 1))
+        self._now, self._found, self._result = np.zeros(tests), np.zeros(10), np.zeros(10 + tests)
         self._settle, self._seen, self._from = round(settle_s / block_s), 0, -1
 
     @property
@@ -147,11 +146,11 @@ class ChangeDetector:
 
     @property
     def drift(self) -> Array:  # noqa: D102
-        return self._rows[0, : len(self.names)].copy()
+        return self._drift.copy()
 
     @drift.setter
     def drift(self, value: ArrayLike) -> None:
-        self._rows[0, : len(self.names)] = value
+        self._drift[:] = value
 
     @property
     def noise(self) -> float:  # noqa: D102
@@ -169,36 +168,40 @@ class ChangeDetector:
         """
         if evidence.first < self._from:
             return None
-        p, inlet = len(self.names), self._inlet
+        p = len(self.names)
         if evidence.r.size != p:
             raise EstimationError(
                 f"the evidence has {evidence.r.size} numbers; the detector watches {p}. Give the same"
             )
-        inlet[:p, :p], inlet[:p, p] = evidence.J, evidence.r
-        inlet[p : 2 * p, :p], inlet[p : 2 * p, p] = covariance, estimate
-        inlet[2 * p, :p] = evidence.at
-        inlet[2 * p + 1, :3] = evidence.rest, evidence.freedom, evidence.first
-        if self._seen <= self._settle:
-            self._learn_fast()
-        result = self._result
-        self._watch(
-            inlet, self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._tested,
-            self._rows, self._state, self._scratch, result,
-        )  # fmt: skip
-        if result[0] == 0.0:
-            return None
-        if result[0] < 0.0:
+        if not self._blocks:
+            self._point = evidence.at
+        slot = self._counts[0] % 4
+        base, before = self._bases[0, slot], self._history[self._blocks % len(self._history)]
+        base[:, :p], base[:, p] = evidence.J, evidence.residual(self._point)
+        before[:, :p], before[:, p] = covariance, estimate - self._point
+        note = self._notes[0, slot]
+        note[:] = evidence.rest, evidence.freedom, evidence.first, self._blocks
+        if not math.isfinite(base.sum() + before.sum() + note[0]):
             raise EstimationError(
                 f"a number of the block at sample {evidence.first} is not finite. Leave the block out"
             )
-        return self._alarm(evidence.last)
+        self._counts[0] += 1
+        self._blocks += 1
+        if self._seen <= self._settle:
+            self._learn_fast()
+        result = self._result
+        watch(
+            self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._tested,
+            self._drift, self._state, self._scratch, self._now, self._found, result,
+        )  # fmt: skip
+        return self._alarm(evidence.last) if result[0] else None
 
     def restart(self, from_sample: int) -> None:
         """Forget all windows, as after a change that was handled; what was learned of quiet times stays.
 
         `from_sample`: blocks that begin before it are not looked at.
         """
-        self._counts[:] = 0
+        self._counts[:], self._blocks = 0, 0
         self._state[1] = 0.0
         self._from = from_sample
 

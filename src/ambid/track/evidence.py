@@ -8,9 +8,8 @@ unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length o
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +19,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.track.numbers import TrackedNumbers
+from ambid.track.rpem_kernels import advance, fold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,6 +171,41 @@ class Evidence:
         return float(self.rest + left @ left)
 
 
+class EvidenceSum:
+    """Evidence of several blocks folded into one triangle at one point.
+
+    `T`: (p, p + 1), [J r]; `at`: (p,), the point; `rest`, `freedom`, `blocks`: sums.
+    """
+
+    __slots__ = ("T", "_rows", "at", "blocks", "freedom", "rest")
+
+    def __init__(self, p: int) -> None:
+        self.T, self._rows = np.zeros((p, p + 1)), np.zeros((p + 1, p))
+        self.clear(np.zeros(p))
+
+    def clear(self, at: Array) -> None:
+        """Begin anew at a point."""
+        self.T[:] = 0.0
+        self.at, self.rest, self.freedom, self.blocks = at, 0.0, 0, 0
+
+    def move(self, at: Array) -> None:
+        """Go to another point."""
+        self.T[:, -1] += self.T[:, :-1] @ (at - self.at)
+        self.at = at
+
+    def add(self, evidence: Evidence) -> bool:
+        """Take in a block; do nothing and return False if it is not finite."""
+        rows = self._rows
+        rows[:-1], rows[-1] = evidence.J.T, evidence.residual(self.at)
+        if not math.isfinite(rows[-1].sum()):
+            return False
+        fold(self.T, rows, self.at.size, 1)
+        self.rest += evidence.rest
+        self.freedom += evidence.freedom
+        self.blocks += 1
+        return True
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearisation:
     """x+ = M [x; inputs at their lags; y; 1; unbalance forcing], and dM/dq."""
@@ -229,12 +264,9 @@ class EvidenceStream:
     """
 
     def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
-        from ambid.track.rpem_kernels import advance
-
         problem, p = numbers.problem, numbers.start.size
         n, n_u, n_y = len(problem.model.states), len(problem.model.inputs), len(problem.model.outputs)
         self.numbers, self.at, self.sample = numbers, at, 0
-        self._advance: Callable[..., int] = advance
         self._scale = np.stack([numbers.point, np.concatenate([problem.scales.input, problem.scales.output])])
         # a lag before now belongs to delays below zero, which no predictor has: its columns are zero
         self._lags = np.array([max(problem.delay + lag, 0) for lag in problem.lags], dtype=np.int64)
@@ -246,13 +278,13 @@ class EvidenceStream:
         self._counts[4] = block
         self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
         self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(numbers.innovation_covariance)))
-        self._fresh = True
+        self._H, self._fresh = self._W @ at.C, True
         self.latest: Evidence | None = None
 
     def relinearise(self, at: Linearisation) -> None:
         """Go on with the predictor of another point; the state moves along to first order."""
         self._x += self._s @ (at.at - self.at.at)
-        self.at = at
+        self.at, self._H = at, self._W @ at.C
 
     def restart(self, sample: int) -> None:
         """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is
@@ -285,8 +317,8 @@ class EvidenceStream:
             self._begin(u, y)
         errors = np.empty_like(y)
         forcing = self._nothing_like(y.shape[0]) if samples.forcing is None else samples.forcing
-        used = self._advance(
-            u, y, forcing, self.at.M, self.at.D, self.at.C, self._W, self._scale, self._lags, self._history,
+        used = advance(
+            u, y, forcing, self.at.M, self.at.D, self.at.C, self._H, self._W, self._scale, self._lags, self._history,
             self._x, self._s, self._rows, self._triangle, self._counts, errors,
         )  # fmt: skip
         self.sample += used
@@ -297,11 +329,10 @@ class EvidenceStream:
 
         `block`: samples of the blocks to come. Returns none where nothing but settling has happened.
         """
-        from ambid.track.rpem_kernels import fold
-
         found = None
         if self._counts[2]:
-            fold(self._triangle, self._rows, int(self._counts[1]))
+            n = int(self._counts[1])
+            fold(self._triangle, self._rows, n, n)
             self._counts[1] = 0
             found = self._evidence()
         self._counts[4] = block
@@ -352,12 +383,3 @@ class EvidenceStream:
         for name in ("_history", "_x", "_s", "_rows", "_triangle", "_counts", "_scale"):
             setattr(other, name, getattr(self, name).copy())
         return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k != "_advance"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from ambid.track.rpem_kernels import advance
-
-        self.__dict__.update(state)
-        self._advance = advance

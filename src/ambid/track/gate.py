@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dposv
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Event
-from ambid.track.evidence import Evidence
+from ambid.track.evidence import Evidence, EvidenceSum
+
+_REGULAR = 1e-10  # of a correlation matrix: what keeps one without an inverse regular
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,22 +107,18 @@ class Gate:
     ) -> None:
         from scipy.special import chdtri, ndtri
 
-        from ambid.track.supervise_kernels import gather, weigh
-
         if not (kept >= 2 and 1 <= blocks <= longest and probation >= 0 and 0 < level < 0.5 and 0 < back < 0.5):
             raise EstimationError("gate: kept >= 2, 1 <= blocks <= longest, levels between 0 and 0.5. Mend them")
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
-        self._gather, self._weigh = gather, weigh
         self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation
         p = len(self.names)
-        self._sides, self._out = np.zeros((2 * p + 1, p)), np.zeros(5 + p)
-        self._scratch = (np.zeros((p, p)), np.zeros((p, p + 1)), np.zeros((p, p + 1)))
+        self._unit = np.eye(p)
         self._z, self._z_back, self._misfit = float(-ndtri(level)), float(-ndtri(back)), float(chdtri(p, level))
         values, P = self._checked(start, covariance)
         self._history: deque[Accepted] = deque([Accepted(values=values, covariance=P, t=t, why="at the start")], kept)
         self._candidate: Accepted | None = None
-        self._trial, self._watched = _Sum(p), _Sum(p)
+        self._trial, self._watched = EvidenceSum(p), EvidenceSum(p)
         self._before: Accepted | None = None  # numbers on trial against the present ones
         self._next = 0
 
@@ -176,7 +175,7 @@ class Gate:
             return back
         if self._candidate is None:
             return None
-        if not self._trial.add(evidence, self._gather) or self._trial.blocks < self._blocks:
+        if not self._trial.add(evidence) or self._trial.blocks < self._blocks:
             return None
         new, old = self._candidate, self.accepted
         seen = self.last = self._compare(self._trial, new, old)
@@ -234,7 +233,7 @@ class Gate:
         """Go back if the earlier numbers predict better than chance allows; looked at each time the blocks double."""
         if self._before is None:
             return None
-        self._watched.add(evidence, self._gather)
+        self._watched.add(evidence)
         n = self._watched.blocks
         if n < self._next and n < self._probation:
             return None
@@ -247,21 +246,20 @@ class Gate:
             self._before = None
         return None
 
-    def _compare(self, data: _Sum, new: Accepted, old: Accepted) -> Comparison:
+    def _compare(self, data: EvidenceSum, new: Accepted, old: Accepted) -> Comparison:
         """Compare two sets of numbers on evidence held at the first of them."""
-        p, sides, out = len(self.names), self._sides, self._out
-        sides[:p], sides[p : 2 * p] = new.covariance, old.covariance
-        np.subtract(new.values, old.values, out=sides[2 * p])
-        self._weigh(data.T, sides, *self._scratch, out)
-        gain, separation, variance, misfit, claim = out[:5].tolist()
+        J, rho, moved = data.T[:, :-1], data.T[:, -1], new.values - old.values
+        apart = J @ moved
+        separation, slope = float(apart @ apart), J.T @ apart
+        variance = separation + max(float(slope @ new.covariance @ slope), 0.0)
         scale = max(self.overdispersion, data.rest / data.freedom if data.freedom else 1.0)
         return Comparison(
             blocks=data.blocks,
-            gain=gain,
+            gain=separation - 2.0 * float(apart @ rho),
             separation=separation,
             sd=2.0 * math.sqrt(variance * scale),
-            misfit=misfit,
-            claim=claim,
+            misfit=_squared_length(rho, self._unit + J @ new.covariance @ J.T),
+            claim=_squared_length(moved, new.covariance + old.covariance),
             scale=scale,
         )
 
@@ -297,27 +295,14 @@ class Gate:
         return q, P
 
 
-class _Sum:
-    """Evidence of blocks folded into one triangle at one point."""
-
-    __slots__ = ("T", "at", "blocks", "freedom", "other", "rest", "scratch")
-
-    def __init__(self, p: int) -> None:
-        self.T, self.other, self.scratch = np.zeros((p, p + 1)), np.zeros((p, p + 1)), np.zeros(p + 1)
-        self.clear(np.zeros(p))
-
-    def clear(self, at: Array) -> None:
-        self.T[:] = 0.0
-        self.at, self.rest, self.freedom, self.blocks = at, 0.0, 0, 0
-
-    def move(self, at: Array) -> None:
-        self.T[:, -1] += self.T[:, :-1] @ (at - self.at)
-        self.at = at
-
-    def add(self, evidence: Evidence, gather: Callable[..., bool]) -> bool:
-        if not gather(evidence.J, evidence.r, evidence.at, self.T, self.at, self.other, self.scratch):
-            return False
-        self.rest += evidence.rest
-        self.freedom += evidence.freedom
-        self.blocks += 1
-        return True
+def _squared_length(d: Array, covariance: Array) -> float:
+    """Return d^T covariance^-1 d; infinite where d moves a number without variance."""
+    known = covariance.diagonal() <= 0.0
+    if known.any():
+        if d[known].any():
+            return math.inf
+        d, covariance = d[~known], covariance[np.ix_(~known, ~known)]
+    A = covariance.copy(order="F")
+    A.ravel("K")[:: d.size + 1] *= 1.0 + _REGULAR
+    _, solved, _ = dposv(A, d, overwrite_a=True)
+    return float(d @ solved)

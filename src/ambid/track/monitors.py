@@ -12,11 +12,14 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.recursive.lines import Event
 from ambid.track.evidence import Evidence
+from ambid.track.rpem_kernels import fold
+from ambid.track.supervise_kernels import deviations
 
 
 class ErrorLevel:
@@ -75,6 +78,7 @@ class ErrorLevel:
 
 _RIDGE = 1e-3  # the numbers are of order one: one that nothing shows has a standard deviation of a thousand
 _WORSE = 1.5  # accuracy over `enough` at which a number is no longer fresh: hysteresis
+_NOTHING = 1e-100  # entries of a triangle under this become zero: the smallest numbers take long to compute with
 _FILLED = 0.5  # part of the window that has to be filled before anything is judged
 
 
@@ -89,9 +93,8 @@ class ExcitationMonitor:
     `names`: all numbers of the evidence; `block_s`: duration of a block, s; `window_s`: time constant of the window, s;
     `freeze`, `thaw`: parts of the reference; `enough`: relative standard deviation.
 
-    `fresh`: of each parameter; all are at the start; `sd`: what the window alone gives each parameter: relative
-    standard deviation (about a thousand: nothing), and information rate, 1/s; `rate`: what the window alone gives each
-    parameter: relative standard deviation (about a thousand: nothing), and information rate, 1/s.
+    `fresh`: of each parameter; all are at the start; `sd`: (p,), relative standard deviation that the window alone
+    gives each number (about a thousand: nothing); `duration_s`: of the data in the window.
     """
 
     def __init__(
@@ -106,8 +109,6 @@ class ExcitationMonitor:
         thaw: float = 0.05,
         enough: float = 0.01,
     ) -> None:
-        from ambid.track.supervise_kernels import inform
-
         self.names, p = tuple(names), len(names)
         for name in (*reference_rate, *held):
             if name not in self.names:
@@ -119,57 +120,58 @@ class ExcitationMonitor:
                 )
         if not (0 < block_s < window_s and 0 < freeze <= thaw and enough >= 0):
             raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Mend them")
-        self._inform, self._judged = inform, tuple(name for name in self.names if name in reference_rate)
+        self._judged = tuple(name for name in self.names if name in reference_rate)
         self._held = np.array([self.names.index(name) for name in held], dtype=np.int64)
         self._at = tuple(self.names.index(name) for name in self._judged)
-        self._reference = np.array([reference_rate.get(name, -1.0) for name in self.names])
-        self._limits = np.array([freeze, thaw, enough, _WORSE, _RIDGE])
+        self._parameter = np.array([name in reference_rate for name in self.names])
+        self._reference = np.array([reference_rate.get(name, 0.0) for name in self.names])
+        known = np.inf if enough == 0.0 else enough**-2.0
+        # information, and rate of it, below both of which a frozen number stays so, and a fresh one freezes
+        self._limits = (known, thaw * self._reference), (known / _WORSE**2, freeze * self._reference)
         self._block, self._window, self._decay = block_s, window_s, math.exp(-block_s / window_s)
-        self._duration = 0.0
-        self._R, self._J, self._work = np.zeros((p, p)), np.zeros((p, p)), np.zeros((3, p, p))
-        self._fresh, self._out = np.ones(p, dtype=np.int64), np.zeros((2, p))
-        self._before = self._fresh.copy()
-        self._out[0] = 1.0 / _RIDGE
+        self._keep = math.sqrt(self._decay)
+        self.duration_s = 0.0
+        self._R, self._rows = np.zeros((p, p)), np.zeros((p, p))
+        self._scratch = np.zeros((p, p)), np.zeros((2, p))
+        self._fresh = np.ones(p, dtype=np.bool_)
+        self._known, self._rate = self._limits[1]
+        self.sd = np.full(p, 1.0 / _RIDGE)
 
     @property
     def fresh(self) -> Mapping[str, bool]:  # noqa: D102
         return MappingProxyType({n: bool(self._fresh[i]) for n, i in zip(self._judged, self._at, strict=True)})
-
-    @property
-    def sd(self) -> Mapping[str, float]:  # noqa: D102
-        return MappingProxyType({n: float(self._out[0, i]) for n, i in zip(self._judged, self._at, strict=True)})
-
-    @property
-    def rate(self) -> Mapping[str, float]:  # noqa: D102
-        return MappingProxyType({n: float(self._out[1, i]) for n, i in zip(self._judged, self._at, strict=True)})
 
     def update(self, evidence: Evidence, t: float) -> tuple[Event, ...]:
         """Take in a block.
 
         `t`: its end, s of record. Returns ``frozen`` and ``thawed``, with the reason.
         """
-        J = evidence.J
-        if J.shape != self._J.shape or not math.isfinite(J.sum()):
+        J, duration = evidence.J, self.duration_s * self._decay + self._block
+        if J.shape != self._R.shape or not math.isfinite(J.sum()):
             raise EstimationError(
                 f"the block at sample {evidence.first} is not finite or of other numbers. Leave it out"
             )
-        self._J[:] = J
+        self._rows[:] = J.T
         if self._held.size:
-            self._J[:, self._held] = 0.0
-        self._duration = self._duration * self._decay + self._block
-        enough = self._duration >= _FILLED * self._window
-        changed = self._inform(
-            self._R, self._J, self._decay, self._duration if enough else -self._duration, self._limits,
-            self._reference, self._fresh, self._out, self._work,
-        )  # fmt: skip
-        return self._events(t) if changed else ()
+            self._rows[self._held] = 0.0
+        self._R *= self._keep
+        self._R[np.abs(self._R) < _NOTHING] = 0.0
+        fold(self._R, self._rows, len(self.names), 1)
+        deviations(self._R, _RIDGE, *self._scratch, self.sd)
+        self.duration_s = duration
+        if duration < _FILLED * self._window:
+            return ()
+        low = 1.0 / (self.sd * self.sd) < np.minimum(self._known, self._rate * duration)
+        changed = self._parameter & (low == self._fresh)
+        return self._events(t, changed) if changed.any() else ()
 
-    def _events(self, t: float) -> tuple[Event, ...]:
-        """Say which flags changed, and why."""
+    def _events(self, t: float, changed: NDArray[np.bool_]) -> tuple[Event, ...]:
+        """Turn the flags that change, and say why."""
         events = []
-        for j in np.flatnonzero(self._fresh != self._before):
-            name, thawed = self.names[j], bool(self._fresh[j])
-            sd, rate, reference = float(self._out[0, j]), float(self._out[1, j]), float(self._reference[j])
+        for j in np.flatnonzero(changed):
+            name, thawed = self.names[j], not self._fresh[j]
+            sd, reference = float(self.sd[j]), float(self._reference[j])
+            rate = 1.0 / (sd * sd * self.duration_s)
             part = rate / reference if reference > 0 else math.inf
             seen = f"the last {self._window:g} s alone would give {name} to {100 * sd:.3g} %"
             if sd > 0.5 / _RIDGE:
@@ -183,5 +185,6 @@ class ExcitationMonitor:
                     values={"sd": sd, "rate": rate, "reference_rate": reference},
                 )
             )
-        self._before = self._fresh.copy()
+        self._fresh = self._fresh ^ changed
+        self._known, self._rate = (np.where(self._fresh, b, a) for a, b in zip(*self._limits, strict=True))
         return tuple(events)

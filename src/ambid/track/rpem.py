@@ -15,7 +15,7 @@ keeps it positive.
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
-from ambid.track.evidence import Evidence, EvidenceStream, Samples, checked, linearise
+from ambid.recursive.square_root import covariance_of, factors_of, root_of_factors
+from ambid.track.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
 from ambid.track.numbers import TrackedNumbers, tracked_numbers
+from ambid.track.rpem_kernels import absorb, far, walk, walk_score
 
 Flags = NDArray[np.bool_]
 
@@ -40,32 +42,29 @@ class ParameterFilter:
     """
 
     def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
-        from ambid.track.rpem_kernels import absorb, far, spread
-
-        self.q = start.copy()
-        size = np.sqrt(np.diag(covariance))
-        self._S = np.ascontiguousarray(size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size)))
+        self.q, self._F = start.copy(), factors_of(covariance)
+        self._scratch = np.zeros((start.size + 2, start.size))
         self.active = np.ones(start.size, dtype=np.bool_)
         self._positive = np.zeros(start.size, dtype=np.bool_) if positive is None else positive
-        self._absorb, self._spread, self._far = absorb, spread, far
         self.n_shortened = 0
 
     @property
     def covariance(self) -> Array:
         """Covariance of `q`, shape (p, p)."""
-        return np.asarray(self._S @ self._S.T)
+        return covariance_of(self._F)
 
     @property
     def sd(self) -> Array:
         """Standard deviations of `q`, shape (p,)."""
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", self._S, self._S)))
+        half = root_of_factors(self._F)
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", half, half)))
 
     def walk(self, variance: Array, time: float = 1.0) -> None:
         """Let the active numbers walk.
 
         `variance`: (p,), of the walks, per second; `time`: s.
         """
-        self._spread(self._S, variance, self.active, time)
+        walk(self._F, variance, self.active, time, self._scratch[0])
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
         """Take in a block's evidence.
@@ -73,8 +72,8 @@ class ParameterFilter:
         Returns squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model
         and the covariance are right.
         """
-        misfit, part = self._absorb(
-            self.q, self._S, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise
+        misfit, part = absorb(
+            self.q, self._F, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise, self._scratch
         )
         self.n_shortened += part < 1.0
         return float(misfit)
@@ -85,13 +84,13 @@ class ParameterFilter:
         `at`: (p,); `J`: (p, p), upper triangle of a block's evidence; `curved`: (p,), squared moves over standard
         deviations that are too much; `most`: |J (q - at)|^2 that is too much.
         """
-        return bool(self._far(self.q, at, J, self._S, curved, most))
+        return bool(far(self.q, at, J, self._F, curved, most))
 
     def widen(self, place: int, sd: float) -> None:
         """Forget what is known of one number, but not the others: it may have moved by about `sd`."""
         variance = np.zeros(self.q.size)
         variance[place] = sd * sd
-        self._spread(self._S, variance, np.ones_like(self.active), 1.0)
+        walk(self._F, variance, np.ones_like(self.active), 1.0, self._scratch[0])
 
     def set(self, q: Array, covariance: Array) -> None:
         """Go on from other numbers.
@@ -99,23 +98,14 @@ class ParameterFilter:
         `q`: (p,); `covariance`: (p, p).
         """
         fresh = ParameterFilter(q, covariance)
-        self.q, self._S = fresh.q, fresh._S
+        self.q, self._F = fresh.q, fresh._F
 
     def copy(self) -> ParameterFilter:
         """Return an independent filter in the same state."""
         other = ParameterFilter.__new__(ParameterFilter)
         other.__dict__.update(self.__dict__)
-        other.q, other._S, other.active = self.q.copy(), self._S.copy(), self.active.copy()
+        other.q, other._F, other.active = self.q.copy(), self._F.copy(), self.active.copy()
         return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_absorb", "_spread", "_far")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from ambid.track.rpem_kernels import absorb, far, spread
-
-        self.__dict__.update(state)
-        self._absorb, self._spread, self._far = absorb, spread, far
 
 
 CHUNK_S = 0.05  # evidence is merged to this length: the fastest drift that is told from a jump
@@ -142,9 +132,6 @@ class DriftRates:
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
-        from ambid.track.rpem_kernels import walk_score
-        from ambid.track.supervise_kernels import gather
-
         p = start.size
         self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
         self.adapts = bool(np.any(ceiling > floor))
@@ -155,10 +142,8 @@ class DriftRates:
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
         self._scratch = np.zeros((room, p, p)), np.zeros((room, p, 2))
-        self._triangle, self._rows = np.zeros((p, p + 1)), (np.zeros((p, p + 1)), np.zeros(p + 1))
-        self._point = start
-        self._parts = self._count = self._next = self._since = self._looks = 0
-        self._score, self._gather = walk_score, gather
+        self._chunk = EvidenceSum(p)
+        self._count = self._next = self._since = self._looks = 0
 
     def add(self, evidence: Evidence, before: ParameterFilter) -> None:
         """Take in a block.
@@ -167,16 +152,15 @@ class DriftRates:
         """
         if not self.adapts:
             return
-        if not self._parts:
+        chunk = self._chunk
+        if not chunk.blocks:
             self._q[self._next], self._P[self._next] = before.q, before.covariance
-            self._triangle[:], self._point = 0.0, evidence.at
-        self._gather(evidence.J, evidence.r, evidence.at, self._triangle, self._point, *self._rows)
-        self._parts += 1
-        if self._parts < self._per_chunk:
+            chunk.clear(evidence.at)
+        chunk.add(evidence)
+        if chunk.blocks < self._per_chunk:
             return
-        self._parts = 0
-        self._J[self._next], self._r[self._next] = self._triangle[:, :-1], self._triangle[:, -1]
-        self._at[self._next] = self._point
+        self._J[self._next], self._r[self._next], self._at[self._next] = chunk.T[:, :-1], chunk.T[:, -1], chunk.at
+        chunk.blocks = 0
         self._next = (self._next + 1) % _WINDOW
         self._count = min(self._count + 1, _WINDOW)
         self._since += 1
@@ -186,30 +170,20 @@ class DriftRates:
 
         `noise`: variance of the evidence's residual.
         """
-        if self._parts == 0 and self._count >= _FEWEST and self._since >= _EVERY:
+        if not self._chunk.blocks and self._count >= _FEWEST and self._since >= _EVERY:
             self._since = 0
             self._adapt(known, noise)
 
     def restart(self) -> None:
         """Forget the window: a jump in it would pass for drift."""
-        self._count = self._next = self._since = self._parts = 0
+        self._count = self._next = self._since = self._chunk.blocks = 0
 
     def copy(self) -> DriftRates:
         """Return an independent copy in the same state."""
         other = copy.copy(self)
-        for name in ("variance", "_J", "_r", "_at", "_q", "_P", "_triangle"):
-            setattr(other, name, getattr(self, name).copy())
+        for name in ("variance", "_J", "_r", "_at", "_q", "_P", "_chunk"):
+            setattr(other, name, copy.deepcopy(getattr(self, name)))
         return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_score", "_gather")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from ambid.track.rpem_kernels import walk_score
-        from ambid.track.supervise_kernels import gather
-
-        self.__dict__.update(state)
-        self._score, self._gather = walk_score, gather
 
     def _adapt(self, known: ParameterFilter, noise: float) -> None:
         active, before = known.active, self.variance
@@ -247,7 +221,7 @@ class DriftRates:
     def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
         first = (self._next - count) % _WINDOW
-        found: tuple[Array, Array, Array, Array] = self._score(
+        found: tuple[Array, Array, Array, Array] = walk_score(
             self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise,
             *self._scratch,
         )  # fmt: skip

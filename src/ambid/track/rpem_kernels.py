@@ -1,5 +1,5 @@
 """Compiled loops of the tracker: predictor with exact sensitivities, folded block by block into a triangle; and the
-square-root filter of the tracked numbers.
+filter of the tracked numbers, on the square-root core of all recursions.
 
 One step of the predictor is x+ = M w, w = [x; inputs at their lags; y; 1; unbalance forcing]; the derivative by number
 q is s_q+ = F s_q + D_q w. Weighted innovations and their derivatives are the rows that Householder reflections take
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
+from ambid.recursive.square_root_kernels import project, shrink, variance, widen
 
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -30,6 +31,7 @@ def advance(
     M: Array,
     D: Array,
     C: Array,
+    H: Array,
     W: Array,
     scale: Array,
     lags: Integers,
@@ -44,49 +46,36 @@ def advance(
     """Run until a block is complete, samples are used up, or one is not finite; return how many were used.
 
     `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `errors` (n_samples, n_y) gets
-    innovations in scaled units, `W` weights them. `rows` (p + 1, room) holds rows that are not folded yet. `counts`:
-    place of the next input in `history`, rows and samples of the present block, samples still to settle, samples of a
-    block.
+    innovations in scaled units, `W` weights them, and `H` is W C. `rows` (p + 1, room) holds rows that are not folded
+    yet. `counts`: place of the next input in `history`, rows and samples of the present block, samples still to settle,
+    samples of a block.
     """
     (n_x, n_l), (n_u, n_y), p = M.shape, (u.shape[1], y.shape[1]), s.shape[1]
     depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
-    w, f, H = np.empty(n_l), np.empty((n_x, p)), np.zeros((n_y, n_x))
-    for i in range(n_y):
-        for j in range(n_y):
-            for q in range(n_x):
-                H[i, q] += W[i, j] * C[j, q]
+    w, f, first_y = np.empty(n_l), np.empty((n_x, p)), n_x + lags.size * n_u
     for k in range(y.shape[0]):
-        finite = True
+        now, finite = counts[0], True
         for j in range(n_u):
+            history[now, j] = (u[k, j] - scale[0, j]) / scale[1, j]
             finite = finite and math.isfinite(u[k, j])
         for j in range(n_y):
+            w[first_y + j] = (y[k, j] - scale[0, n_u + j]) / scale[1, n_u + j]
             finite = finite and math.isfinite(y[k, j])
+        w[first_y + n_y] = 1.0
         for j in range(n_f):
+            w[first_y + n_y + 1 + j] = forcing[k, j]
             finite = finite and math.isfinite(forcing[k, j])
         if not finite:
             return k
-        now = counts[0]
-        for j in range(n_u):
-            history[now, j] = (u[k, j] - scale[0, j]) / scale[1, j]
-        column = 0
-        for j in range(n_x):
-            w[j] = x[j]
         column = n_x
         for lag in lags:
             at = (now - lag) % depth
             for j in range(n_u):
                 w[column] = history[at, j]
                 column += 1
-        for j in range(n_y):
-            w[column] = (y[k, j] - scale[0, n_u + j]) / scale[1, n_u + j]
-            column += 1
-        w[column] = 1.0
-        column += 1
-        for j in range(n_f):
-            w[column] = forcing[k, j]
-            column += 1
+        for j in range(n_x):
+            w[j] = x[j]
         counts[0] = (now + 1) % depth
-        first_y = n_x + lags.size * n_u
         for i in range(n_y):
             v = w[first_y + i]
             for j in range(n_x):
@@ -131,7 +120,7 @@ def advance(
                 v += M[i, c] * w[c]
             x[i] = v
         if counts[1] + n_y > room or counts[2] == counts[4]:
-            fold(triangle, rows, counts[1])
+            fold(triangle, rows, counts[1], counts[1])
             counts[1] = 0
             if counts[2] == counts[4]:
                 return k + 1
@@ -139,13 +128,17 @@ def advance(
 
 
 @compiled(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def fold(R: Array, w: Array, n: int) -> None:
-    """Take the first `n` samples of rows `w` (p, room) into the upper triangle R (p, p); `w` is used up."""
-    p = R.shape[0]
+def fold(R: Array, w: Array, n: int, begun: int) -> None:
+    """Take `n` rows into the upper triangle R (p, width), width >= p; `w` (width, room) has them in columns, used up.
+
+    Entry j of a row is zero in all but the first `begun` + j of them: `n` for any rows, 1 for those of a triangle.
+    """
+    p, width = R.shape
     for j in range(p):
         v = w[j]
+        m = min(n, begun + j)
         s = 0.0
-        for t in range(n):
+        for t in range(m):
             s += v[t] * v[t]
         if s == 0.0:
             continue
@@ -153,156 +146,81 @@ def fold(R: Array, w: Array, n: int) -> None:
         b = -math.sqrt(a * a + s) if a > 0 else math.sqrt(a * a + s)
         size, tau = 1.0 / (a - b), (b - a) / b
         R[j, j] = b
-        for k in range(j + 1, p):
+        for k in range(j + 1, width):
             x = w[k]
             dot = 0.0
-            for t in range(n):
+            for t in range(m):
                 dot += v[t] * x[t]
             g = tau * (R[j, k] + dot * size)
             R[j, k] -= g
             g *= size
-            for t in range(n):
+            for t in range(m):
                 x[t] -= g * v[t]
 
 
 @compiled(error_model="numpy")
-def lower(W: Array) -> None:
-    """Turn W (p, m), m >= p, into [L 0] with the same W W^T, L lower triangular, its diagonal not negative."""
-    p, m = W.shape
-    for i in range(p):
-        s = 0.0
-        for t in range(i + 1, m):
-            s += W[i, t] * W[i, t]
-        if s > 0.0:
-            a = W[i, i]
-            b = -math.sqrt(a * a + s) if a > 0 else math.sqrt(a * a + s)
-            tau, size = (b - a) / b, 1.0 / (a - b)
-            for k in range(i + 1, p):
-                dot = W[k, i]
-                for t in range(i + 1, m):
-                    dot += W[k, t] * W[i, t] * size
-                g = tau * dot
-                W[k, i] -= g
-                g *= size
-                for t in range(i + 1, m):
-                    W[k, t] -= g * W[i, t]
-            W[i, i] = b
-            for t in range(i + 1, m):
-                W[i, t] = 0.0
-        if W[i, i] < 0.0:
-            for k in range(i, p):
-                W[k, i] = -W[k, i]
-
-
-@compiled(error_model="numpy")
 def absorb(
-    q: Array, S: Array, J: Array, r: Array, at: Array, active: Flags, positive: Flags, noise: float
+    q: Array, F: Array, J: Array, r: Array, at: Array, active: Flags, positive: Flags, noise: float, K: Array
 ) -> tuple[float, float]:
-    """Update q and its square-root covariance S by the rows r + J (q* - at) ~ N(0, noise I), J upper triangular.
+    """Update q and the factors F of its covariance by the rows r + J (q* - at) ~ N(0, noise I), J upper triangular.
 
     Return rho^T V^-1 rho, where rho = r + J (q - at) and V = noise I + J P J^T, and the part of the step that is taken.
     The gain is optimal for the numbers that are active and zero for the others (Schmidt). Where the step would take a
     positive number below half of what it is, gain and step are made smaller: so far a first-order step is not to be
-    believed. The covariance is Joseph's, which is right for any gain.
+    believed. With a gain D K, K optimal and D diagonal, the covariance is that of K plus (I - D) K V K^T (I - D), and
+    K V K^T the sum of what the rows have taken off one by one (Joseph's form). `K` (p + 2, p) is scratch.
     """
-    p, m = q.size, r.size
-    JS, rho = np.zeros((m, p)), np.empty(m)
-    for i in range(m):
-        rho[i] = r[i]
+    p, total, part, held = q.size, 0.0, 1.0, False
+    step, f = K[p], K[p + 1]
+    for j in range(p):
+        step[j] = 0.0
+    for i in range(p):
+        rho = r[i]
         for j in range(i, p):
-            v = J[i, j]
-            rho[i] += v * (q[j] - at[j])
-            for k in range(p):
-                JS[i, k] += v * S[j, k]
-    V = np.zeros((m, m))
-    for i in range(m):
-        for j in range(i + 1):
-            v = 0.0
-            for k in range(p):
-                v += JS[i, k] * JS[j, k]
-            V[i, j] = v
-        V[i, i] += noise
-    # Cholesky in place
-    for i in range(m):
-        for j in range(i + 1):
-            v = V[i, j]
-            for k in range(j):
-                v -= V[i, k] * V[j, k]
-            V[i, j] = math.sqrt(v) if i == j else v / V[j, j]
-    left = np.empty(m)
-    total = 0.0
-    for i in range(m):
-        v = rho[i]
-        for k in range(i):
-            v -= V[i, k] * left[k]
-        left[i] = v / V[i, i]
-        total += left[i] * left[i]
-    K, step, row, part = np.zeros((p, m)), np.zeros(p), np.empty(m), 1.0
-    for a in range(p):
-        if not active[a]:
-            continue
-        for i in range(m):
-            v = 0.0
-            for k in range(p):
-                v += S[a, k] * JS[i, k]
-            for k in range(i):
-                v -= row[k] * V[i, k]
-            row[i] = v / V[i, i]
-        for i in range(m):
-            step[a] += row[i] * left[i]
-        if positive[a] and step[a] > _MOST * q[a]:
-            part = min(part, _MOST * q[a] / step[a])
-        for i in range(m - 1, -1, -1):
-            v = row[i]
-            for k in range(i + 1, m):
-                v -= V[k, i] * K[a, k]
-            K[a, i] = v / V[i, i]
-    W = np.empty((p, p + m))
-    root = part * math.sqrt(noise)
-    for a in range(p):
-        q[a] -= part * step[a]
-        for k in range(p):
-            v = S[a, k]
-            for i in range(m):
-                v -= part * K[a, i] * JS[i, k]
-            W[a, k] = v
-        for i in range(m):
-            W[a, p + i] = root * K[a, i]
-    lower(W)
-    for a in range(p):
-        for k in range(p):
-            S[a, k] = W[a, k]
+            rho += J[i, j] * (q[j] - at[j] + step[j])
+        project(F, J[i], f)
+        alpha = shrink(F, f, noise, K[i])
+        total += rho * rho / alpha
+        root = 1.0 / math.sqrt(alpha)
+        for j in range(p):
+            K[i, j] *= root
+            step[j] -= K[i, j] * root * rho
+    for j in range(p):
+        if not active[j]:
+            held = True
+        elif positive[j] and -step[j] > _MOST * q[j]:
+            part = min(part, -_MOST * q[j] / step[j])
+    for j in range(p):
+        if active[j]:
+            q[j] += part * step[j]
+    if held or part < 1.0:
+        for i in range(p):
+            for j in range(p):
+                f[j] = K[i, j] * (1.0 - part) if active[j] else K[i, j]
+            widen(F, f, 1.0)
     return total, part
 
 
 @compiled(error_model="numpy")
-def spread(S: Array, variance: Array, active: Flags, time: float) -> None:
-    """Let the active numbers walk: their diagonal of S S^T grows by time x variance."""
-    p = S.shape[0]
-    W = np.zeros((p, 2 * p))
-    for a in range(p):
-        for k in range(p):
-            W[a, k] = S[a, k]
-        if active[a]:
-            W[a, p + a] = math.sqrt(variance[a] * time)
-    lower(W)
-    for a in range(p):
-        for k in range(p):
-            S[a, k] = W[a, k]
+def walk(F: Array, rates: Array, active: Flags, time: float, f: Array) -> None:
+    """Let the active numbers walk: their variances grow by time x rates; `f` (p,) is scratch."""
+    for j in range(rates.size):
+        if active[j] and rates[j] > 0.0:
+            for i in range(f.size):
+                f[i] = 1.0 if i == j else 0.0
+            widen(F, f, time * rates[j])
 
 
 @compiled(error_model="numpy")
-def far(q: Array, at: Array, J: Array, S: Array, curved: Array, most: float) -> bool:
+def far(q: Array, at: Array, J: Array, F: Array, curved: Array, most: float) -> bool:
     """Return whether |J (q - at)|^2 passes `most`, or a squared move its standard deviation times `curved`."""
     p, total = q.size, 0.0
     for a in range(p):
-        v, s = 0.0, 0.0
+        v = 0.0
         for k in range(a, p):
             v += J[a, k] * (q[k] - at[k])
-        for k in range(p):
-            s += S[a, k] * S[a, k]
         total += v * v
-        if (q[a] - at[a]) ** 2 > curved[a] * math.sqrt(s):
+        if (q[a] - at[a]) ** 2 > curved[a] * math.sqrt(variance(F, a)):
             return True
     return total > most
 
