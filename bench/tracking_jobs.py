@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ambid.recursive.kalman import KalmanFilter, constant_velocity
+from ambid.recursive.kalman import KalmanFilter, constant_velocity, linear_state
 from ambid.recursive.polynomial import RecursivePolynomial
 from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
-from ambid.recursive.streaming import ScalarKalman
 from experiments import AT_SPEED
 from peers import Array, Bench, model_of
 from tracking_bearing_jobs import bearing_jobs
@@ -103,10 +102,11 @@ def _filters() -> Iterator[Job]:
     name = "Kalman filter, position and velocity"
     for peer, program in (("filterpy", "filterpy"), ("statsmodels, compiled", "statsmodels")):
         yield filter_job(name, lambda: KalmanFilter(model, start_covariance=P0), peer, program, plain)
+    thesis = linear_state([[1.0]], [[1.0]], [[60.0 / RATE]], [[RATE]])
     bucy = {"A": [[1.0]], "C": [[1.0]], "Q": [[60.0 / RATE]], "R": [[RATE]], "P0": [[RATE]]}
     yield filter_job(
         "Kalman-Bucy filter of the thesis, discrete",
-        lambda: ScalarKalman(RATE, form="discrete", start=0.0, start_variance=RATE),
+        lambda: KalmanFilter(thesis, start_covariance=[[RATE]]),
         "filterpy", "filterpy", bucy,
     )  # fmt: skip
 

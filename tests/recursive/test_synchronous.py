@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.synchronous import SynchronousFilter
+from ambid.recursive.streaming import SynchronousFilter
 
 RATE = 5000.0
 

@@ -33,6 +33,6 @@ if TYPE_CHECKING:
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares
     from ambid.recursive.streaming import PassiveLowpass as PassiveLowpass
     from ambid.recursive.streaming import ScalarKalman as ScalarKalman
-    from ambid.recursive.synchronous import SynchronousFilter as SynchronousFilter
+    from ambid.recursive.streaming import SynchronousFilter as SynchronousFilter
 
 __getattr__, __dir__, __all__ = exports(__name__)

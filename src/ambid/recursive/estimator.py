@@ -5,8 +5,10 @@ And how what a caller gives is brought into the one form that the compiled recur
 
 from __future__ import annotations
 
+from functools import cache
+from importlib import import_module
 from math import isfinite
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,6 +78,12 @@ class RecursiveEstimator(Protocol):
         RecursiveEstimator
         """
         ...
+
+
+@cache
+def kernels(name: str) -> Any:
+    """Return a module of compiled loops of this room; the first one loads Numba. No estimator keeps it: they pickle."""
+    return import_module(f"ambid.recursive.{name}_kernels")
 
 
 def as_blocks(

@@ -6,16 +6,16 @@ construction however long it runs.
 
 from __future__ import annotations
 
-from copy import copy
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_block, check_channels
+from ambid.recursive.estimator import as_block, check_channels, kernels
 from ambid.recursive.square_root import covariance_of, factors_of, root_of
 
 
@@ -128,8 +128,6 @@ class KalmanFilter:
         State at the first sample, before it is measured; 0 by default.
     start_covariance : array_like, shape (n_states, n_states), optional
         Of its error, positive definite.
-    give : {"filtered", "predicted"}
-        Whether `update` returns the state with or without the sample of the same instant.
 
     Attributes
     ----------
@@ -148,12 +146,7 @@ class KalmanFilter:
         *,
         start: ArrayLike | None = None,
         start_covariance: ArrayLike | None = None,
-        give: Literal["filtered", "predicted"] = "filtered",
     ) -> None:
-        from ambid.recursive.kalman_kernels import state_scan
-
-        if give not in ("filtered", "predicted"):
-            raise EstimationError(f"Kalman filter: give {give!r}; it is 'filtered' or 'predicted'. Choose one of them")
         self.model = model
         n, m, n_u = model.A.shape[0], model.C.shape[0], model.B.shape[1]
         self._n, self._m, self._n_u = n, m, n_u
@@ -163,10 +156,9 @@ class KalmanFilter:
         self._memory[: n * n] = factors_of(_start(model, start_covariance)).ravel()
         self._memory[n * n :][:n] = 0.0 if start is None else _vector(start, n)
         self._work = np.zeros(3 * n * n + 3 * n)
-        self._tally = np.array([0.0, float(give == "predicted"), 0.0, 0.0, 0.0])
-        self._scan = state_scan
+        self._tally = np.zeros(2)
         self._none = np.empty((1, 0))
-        self._one = (np.empty((1, m)), np.empty((1, n)), np.empty((1, m)))
+        self._one = (np.empty((1, m)), np.empty((1, n)))
         self.n_samples = 0
 
     def update(self, measurement: ArrayLike, inputs: ArrayLike | None = None) -> Array:
@@ -182,7 +174,7 @@ class KalmanFilter:
         Returns
         -------
         ndarray, shape (n_states,), or (n_samples, n_states) for a block
-            State at the instants of the samples.
+            State at the instants of the samples, these included.
 
         Raises
         ------
@@ -190,23 +182,24 @@ class KalmanFilter:
             If shapes do not fit, or an input is missing or not finite.
         """
         if isinstance(measurement, float) and self._m == 1 and inputs is None and self._n_u == 0:
-            y, out, errors = self._one
+            y, out = self._one
             y[0, 0] = measurement
-            self._scan(y, self._none, out, errors, self._model, self._memory, self._work, self._tally)
-            self.n_samples += 1
+            self._run(y, self._none, out)
             return out[0].copy()
         given = np.asarray(measurement, dtype=np.float64)
         y = as_block(given, self._m, "Kalman filter")
-        u = self._inputs(inputs, y.shape[0])
-        out, errors = np.empty((y.shape[0], self._n)), np.empty(y.shape)
-        self._scan(y, u, out, errors, self._model, self._memory, self._work, self._tally)
-        self.n_samples += y.shape[0]
+        out = np.empty((y.shape[0], self._n))
+        self._run(y, self._inputs(inputs, y.shape[0]), out)
         alone = given.ndim == 0 or (given.ndim == 1 and self._m > 1)
         return out[0] if alone else out
 
+    def _run(self, y: Array, u: Array, out: Array) -> None:
+        kernels("kalman").state_scan(y, u, out, self._model, self._memory, self._work, self._tally)
+        self.n_samples += y.shape[0]
+
     @property
     def state(self) -> Array:
-        """Predicted state at the next sample, shape (n_states,)."""
+        """State predicted for the next sample, shape (n_states,)."""
         return self._memory[self._n**2 :][: self._n].copy()
 
     @property
@@ -215,25 +208,9 @@ class KalmanFilter:
         return covariance_of(self._memory[: self._n**2].reshape(self._n, self._n))
 
     @property
-    def filtered_covariance(self) -> Array:
-        """Covariance of the state's error with the last sample used, shape (n_states, n_states).
-
-        Of a sample with all outputs, taken from the present `covariance`.
-        """
-        P, C = self.covariance, self.model.C
-        K = np.linalg.solve(C @ P @ C.T + self.model.R, C @ P).T
-        left = np.eye(self._n) - K @ C
-        return np.asarray(left @ P @ left.T + K @ self.model.R @ K.T)
-
-    @property
     def n_missing(self) -> int:
         """Single measured values that were missing."""
-        return int(self._tally[2])
-
-    @property
-    def mean_squared_innovation(self) -> float:
-        """Mean square of the normalised innovations so far: 1 if the model is right; NaN before the first."""
-        return float(self._tally[4] / self._tally[3]) if self._tally[3] else float("nan")
+        return int(self._tally[1])
 
     def copy(self) -> Self:
         """Return an independent filter in the same state.
@@ -242,11 +219,7 @@ class KalmanFilter:
         -------
         KalmanFilter
         """
-        other = copy(self)
-        other._memory, other._work = self._memory.copy(), self._work.copy()
-        other._tally = self._tally.copy()
-        other._one = (self._one[0].copy(), self._one[1].copy(), self._one[2].copy())
-        return other
+        return deepcopy(self)
 
     def _inputs(self, inputs: ArrayLike | None, n: int) -> Array:
         if self._n_u == 0 and inputs is None:

@@ -1,6 +1,6 @@
-"""Compiled recursions of the streaming filters: one pass over a block, state moved along in place.
+"""Compiled recursions of the filters: one pass over a block, state moved along in place.
 
-A value that is not finite is missing: the filter predicts over it. Every recursion returns how many were missing.
+A value that is not finite is missing: the filter predicts over it.
 """
 
 from __future__ import annotations
@@ -16,111 +16,38 @@ from ambid.recursive.square_root_kernels import project, propagate, shrink, vari
 _SAME = 2e-15  # relative change of a root of a covariance that is rounding
 
 
-@compiled
-def _begin(y: Array, out: Array, j: int, x: float, first: float) -> tuple[int, float]:
-    """Pass over what is missing before the first sample, which gives the state where none was given (x is NaN)."""
-    k = 0
-    while x != x and k < y.shape[0]:
-        if isfinite(y[k, j]):
-            x = first * y[k, j]
-        else:
-            out[k, j] = x
-            k += 1
-    return k, x
-
-
 @compiled(fastmath={"contract"})
 def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
-    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x. `state` (m, 1)."""
+    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x. Returns how many were missing.
+
+    `state` (m,) is NaN where none is given: the first value then gives it.
+    """
     decay, forward, alone, first = constants
     missing = 0
     for j in range(y.shape[1]):
-        begun, x = _begin(y, out, j, state[j, 0], first)
-        missing += begun
-        for k in range(begun, y.shape[0]):
+        x = state[j]
+        begun = isfinite(x)
+        for k in range(y.shape[0]):
             v = y[k, j]  # before out, which may be the same array
+            seen = isfinite(v)
+            if seen and not begun:
+                x, begun = first * v, True
             out[k, j] = x
-            if isfinite(v):
+            if seen:
                 x = decay * x + forward * v
             else:
                 x *= alone
                 missing += 1
-        state[j, 0] = x
+        state[j] = x
     return missing
 
 
 @compiled(fastmath={"contract"})
-def riccati_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
-    """Kalman-Bucy filter whose variance follows the Riccati equation exactly over each sample. `state` (m, 2): x, S.
-
-    With g = c²/r, v² = a² + g w² q, t = tanh(v T)/v: V = 1 - a t + g S t is what exp(∫ (g S - a)) comes to, apart from
-    cosh, and S+ = (w² q t + S (1 + a t))/V. Both stay positive.
-    """
-    a, g, drive, per_c, t, sech, area, alone, far = constants
-    missing = 0
-    for j in range(y.shape[1]):
-        begun, x = _begin(y, out, j, state[j, 0], per_c)
-        S = state[j, 1]
-        missing += begun
-        for k in range(begun, y.shape[0]):
-            v = y[k, j]  # before out, which may be the same array
-            out[k, j] = x
-            if isfinite(v):
-                short = 1.0 / (1.0 - a * t + g * S * t)
-                level = v * per_c  # the state that this sample points to, held
-                x = level + short * (sech * (x - level) + a * level * (t + (g * S - a) * area))
-                S = (drive * t + S * (1.0 + a * t)) * short
-            else:
-                x *= alone
-                S = alone * alone * S + far
-                missing += 1
-        state[j, 0], state[j, 1] = x, S
-    return missing
-
-
-@compiled(fastmath={"contract"})
-def scalar_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
-    """Discrete scalar Kalman filter. `state` (m, 3): predicted x and P, whether P has stopped changing."""
-    rho, c, q, r, predicted = constants
-    missing = 0
-    for j in range(y.shape[1]):
-        begun, x = _begin(y, out, j, state[j, 0], 1.0 / c)
-        missing += begun
-        P, settled = state[j, 1], state[j, 2] > 0.0
-        gain = c * P / (c * c * P + r)
-        for k in range(begun, y.shape[0]):
-            v = y[k, j]
-            if isfinite(v):
-                if settled:
-                    now = x + gain * (v - c * x)
-                else:
-                    s = 1.0 / (c * c * P + r)
-                    gain = c * P * s
-                    now = x + gain * (v - c * x)
-                    new = rho * rho * (P * r * s) + q
-                    settled = abs(new - P) <= _SAME * P
-                    P = new
-            else:
-                now = x
-                P = rho * rho * P + q
-                settled = False
-                missing += 1
-            out[k, j] = x if predicted > 0.0 else now
-            x = rho * now
-        state[j, 0], state[j, 1], state[j, 2] = x, P, 1.0 if settled else 0.0
-    return missing
-
-
-@compiled(fastmath={"contract"})
-def state_scan(
-    y: Array, u: Array, out: Array, innovations: Array, model: Array, memory: Array, work: Array, tally: Array
-) -> None:
+def state_scan(y: Array, u: Array, out: Array, model: Array, memory: Array, work: Array, tally: Array) -> None:
     """Kalman filter over the square-root core: outputs one by one, what their noises have in common taken off first.
 
     `model`: A, B, C, G with G Gᵀ = Q, and R, one behind the other. `memory`: factors of the covariance, predicted
-    state; L with L Lᵀ = R, H = L⁻¹ C, gains and variances of the whitened outputs of the last sample. `tally`: whether
-    the covariance has stopped changing, whether predictions are wanted, values missing, values used, their squared
-    normalised innovations. `innovations` gets y - C x, or NaN.
+    state, and what `_correct` keeps. `tally`: whether the covariance has stopped changing, values missing.
     """
     (n_samples, m), n, n_u = y.shape, out.shape[1], u.shape[1]
     A, at = model[: n * n].reshape(n, n), n * n
@@ -131,30 +58,20 @@ def state_scan(
     rest = memory[n * n + n :].reshape(m, 2 * n + m + 2)
     W, w = work[: 2 * n * n].reshape(n, 2 * n), work[2 * n * n : 2 * n * n + 2 * n]
     f, before = work[2 * n * n + 2 * n :][:n], work[2 * n * n + 3 * n :].reshape(n, n)
-    J, settled, predicted, k = np.empty((n, 0)), tally[0] > 0.0, tally[1] > 0.0, 0
+    J, settled, k = np.empty((n, 0)), tally[0] > 0.0, 0
     while k < n_samples:
-        if settled and n == 2 and m == 1 and n_u == 0:
-            k = _steady(k, y, out, innovations, A, C, x, rest, predicted, tally)
+        if settled and n <= 2 and m == 1 and n_u == 0:
+            k = _steady(k, y, out, A, C, x, rest)
             if k == n_samples:
                 break
         seen = 0
         for i in range(m):
-            e = y[k, i]
-            for j in range(n):
-                e -= C[i, j] * x[j]
-            innovations[k, i] = e if isfinite(e) else np.nan
-            seen += isfinite(e)
-        tally[2] += m - seen
-        tally[3] += seen
-        if predicted:
-            for i in range(n):
-                out[k, i] = x[i]
+            seen += isfinite(y[k, i])
+        tally[1] += m - seen
         steady = settled and seen == m
-        tally[4] += _correct(innovations[k], C, R, F, x, rest, f, steady)
-        if not predicted:
-            for i in range(n):
-                out[k, i] = x[i]
+        _correct(y[k], C, R, F, x, rest, f, steady)
         for i in range(n):
+            out[k, i] = x[i]
             f[i] = 0.0
             for j in range(n):
                 f[i] += A[i, j] * x[j]
@@ -177,14 +94,15 @@ def state_scan(
 
 
 @compiled(fastmath={"contract"})
-def _correct(e: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: Array, steady: bool) -> float:
-    """x += K e of what was measured, with the gains of before where these are steady; return eᵀ S⁻¹ e.
+def _correct(y: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: Array, steady: bool) -> None:
+    """Take in what was measured, with the gains of before where these are steady.
 
-    A row of `rest` holds one of L, of H = L⁻¹ C and of the gains P Hᵀ, and the variance of its whitened innovation.
+    A row of `rest` holds one of L with L Lᵀ = R of the measured outputs, one of H = L⁻¹ C, the gain P h and the
+    variance of its whitened innovation, and the whitened output.
     """
-    (m, n), row, total, one = C.shape, 0, 0.0, 1.0
+    (m, n), row, one = C.shape, 0, 1.0
     for i in range(m):
-        if not isfinite(e[i]):
+        if not isfinite(y[i]):
             continue
         own = rest[row]
         h, gain = own[m : m + n], own[m + n : m + 2 * n]
@@ -193,7 +111,7 @@ def _correct(e: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: A
                 h[c] = C[i, c]
             before, left = 0, R[i, i]
             for j in range(i):
-                if isfinite(e[j]):
+                if isfinite(y[j]):
                     v = R[i, j]
                     for c in range(before):
                         v -= own[c] * rest[before, c]
@@ -207,52 +125,42 @@ def _correct(e: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: A
                 h[c] /= own[row]
             project(F, h, f)
             own[m + 2 * n] = shrink(F, f, one, gain)
-        v = e[i]
+        v = y[i]
         for c in range(row):
             v -= own[c] * rest[c, m + 2 * n + 1]
         v /= own[row]
-        rest[row, m + 2 * n + 1] = v
-        row += 1
-    for r in range(row):  # H moves with the outputs before
-        own = rest[r]
-        v = own[m + 2 * n + 1]
+        own[m + 2 * n + 1] = v
         for c in range(n):
-            v -= own[m + c] * f[c] if r > 0 else 0.0
+            v -= h[c] * x[c]
         v /= own[m + 2 * n]
-        total += v * v * own[m + 2 * n]
         for c in range(n):
-            f[c] = own[m + n + c] * v + (f[c] if r > 0 else 0.0)
-    if row > 0:
-        for c in range(n):
-            x[c] += f[c]
-    return total
+            x[c] += gain[c] * v
+        row += 1
 
 
 @compiled(fastmath={"contract"})
-def _steady(
-    k: int, y: Array, out: Array, innovations: Array, A: Array, C: Array, x: Array, rest: Array, predicted: bool,
-    tally: Array,
-) -> int:  # fmt: skip
-    """Two states, one output, a constant gain: one linear recursion in registers, up to the first missing value."""
-    a00, a01, a10, a11, c0, c1 = A[0, 0], A[0, 1], A[1, 0], A[1, 1], C[0, 0], C[0, 1]
-    part = 1.0 / (rest[0, 0] * rest[0, 5])
-    k0, k1, weight = rest[0, 3] * part, rest[0, 4] * part, part / rest[0, 0]
+def _steady(k: int, y: Array, out: Array, A: Array, C: Array, x: Array, rest: Array) -> int:
+    """One or two states, one output, a constant gain: a linear recursion in registers, up to the first missing value.
+
+    Where there is one state, all that belongs to a second is zero and falls on the first before that is written.
+    """
+    last = x.size - 1
+    two = 1.0 if last > 0 else 0.0
+    a00, a01, a10, a11 = A[0, 0], two * A[0, last], two * A[last, 0], two * A[last, last]
+    c0, c1, part = C[0, 0], two * C[0, last], 1.0 / (rest[0, 0] * rest[0, 2 * x.size + 1])
+    k0, k1 = rest[0, 1 + x.size] * part, two * rest[0, 1 + x.size + last] * part
     l0, l1 = a00 * k0 + a01 * k1, a10 * k0 + a11 * k1
     b00, b01, b10, b11 = a00 - l0 * c0, a01 - l0 * c1, a10 - l1 * c0, a11 - l1 * c1
-    p0, p1, squares, first = x[0], x[1], tally[4], k
+    p0, p1 = x[0], two * x[last]
     while k < y.shape[0] and isfinite(y[k, 0]):
         v = y[k, 0]
         e = v - (c0 * p0 + c1 * p1)
-        innovations[k, 0] = e
-        squares += e * e * weight
-        if predicted:
-            out[k, 0], out[k, 1] = p0, p1
-        else:
-            out[k, 0], out[k, 1] = p0 + k0 * e, p1 + k1 * e
+        out[k, last] = p1 + k1 * e
+        out[k, 0] = p0 + k0 * e
         p0, p1 = l0 * v + (b00 * p0 + b01 * p1), l1 * v + (b10 * p0 + b11 * p1)
         k += 1
-    x[0], x[1], tally[4] = p0, p1, squares
-    tally[3] += k - first
+    x[last] = p1
+    x[0] = p0
     return k
 
 

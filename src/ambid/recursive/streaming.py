@@ -1,59 +1,62 @@
-"""First-order filters that run on-line: the scalar Kalman-Bucy filter (thesis eq. 5.3) and the passive low-pass.
+"""Filters that run on-line: the scalar Kalman-Bucy filter (thesis eq. 5.3), the passive low-pass, and a notch.
 
-The state x' = a x + w·noise of intensity q, measured as y = c x + noise of intensity r, is estimated in one of two
-discrete forms: the continuous filter fed with held samples, or the Kalman filter of the sampled state itself.
+The Kalman-Bucy filter of x' = a x + w·noise of intensity q, measured as y = c x + noise of intensity r, is fed with
+held samples. The notch follows a sinusoid whose phase angle is known at every sample and takes it off, as unbalance
+through a spin-up: y = a cos φ(t) + b sin φ(t) + offset + noise with a, b and the offset in random walks is a Kalman
+filter of three states whose regressors turn with the shaft.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from copy import copy
-from math import cosh, exp, expm1, isfinite, pi, sinh, sqrt, tanh
-from typing import Literal, Self
+from copy import deepcopy
+from dataclasses import dataclass
+from math import exp, expm1, isfinite, pi, sqrt
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_block, check_channels
+from ambid.recursive.estimator import as_block, check_channels, kernels
+from ambid.recursive.square_root import covariance_of
 from ambid.signals.scalar_filter import kalman_bucy_gain
 
-Scan = Callable[[Array, Array, Array, Array], int]
-
-_FAST = 300.0  # time constants within one sample
+_START = 1e6  # variance of each state of the notch before the first sample, over that of the noise
+_BATCHES = 16  # in one memory, to see the density of the noise around the rotation
+_LONGEST = 4 * _BATCHES  # batches over which that is averaged
+_ANY = pi / sqrt(3.0)  # standard deviation of a phase of which nothing is known
 
 
 class StreamingFilter:
-    """A filter that runs on each of several channels alone, with state.
+    """A first-order filter x⁺ = decay x + forward y that runs on each of several channels alone.
 
     Splitting a stream into samples and blocks in another way does not change any number. A value that is not finite is
-    missing: the filter runs on over it and counts it.
-
-    `name`: for messages; `state`: (channels, n_state); `constants`: (n_constants,); `scan`: name of the compiled
-    recursion.
-
-    `n_samples`: samples (of all channels) that were taken in, and single values that were missing; `n_missing`: samples
-    (of all channels) that were taken in, and single values that were missing.
+    missing: x⁺ = alone x, and `n_missing` counts it. `first` is the state over the first value, where none is given.
     """
 
-    def __init__(self, name: str, *, channels: int, state: Array, constants: Array, scan: str) -> None:
-        from ambid.recursive import kalman_kernels
-
-        self.name = name
-        self.channels = channels
-        self.n_samples = 0
-        self.n_missing = 0
-        self._state = np.ascontiguousarray(state, dtype=np.float64)
-        self._begun = self._state.copy()
-        self._constants = np.ascontiguousarray(constants, dtype=np.float64)
-        self._scan: Scan = getattr(kalman_kernels, scan)
-        self._one, self._one_out = np.empty((1, channels)), np.empty((1, channels))
+    def __init__(
+        self,
+        name: str,
+        *,
+        channels: int,
+        decay: float,
+        forward: float,
+        alone: float,
+        first: float,
+        start: float | None,
+    ) -> None:
+        self.name, self.channels = name, channels
+        self.n_samples = self.n_missing = 0
+        self._begun = np.nan if start is None else float(start)
+        self._state = np.full(channels, self._begun)
+        self._constants = np.array([decay, forward, alone, first])
+        self._one = np.empty((2, 1, 1))
 
     @property
     def state(self) -> Array:
         """A copy of the estimate that is ready for the next sample, shape (channels,)."""
-        return self._state[:, 0].copy()
+        return self._state.copy()
 
     def update(self, measurement: ArrayLike) -> Array | float:
         """Take in one sample or a block and return it filtered.
@@ -61,15 +64,14 @@ class StreamingFilter:
         `measurement`: (channels,), or (n_samples, channels) for a block.
         """
         if isinstance(measurement, float) and self.channels == 1:
-            self._one[0, 0] = measurement
-            self.n_missing += self._scan(self._one, self._one_out, self._state, self._constants)
-            self.n_samples += 1
-            return float(self._one_out[0, 0])
+            y, out = self._one
+            y[0, 0] = measurement
+            self.run(y, out)
+            return float(out[0, 0])
         given = np.asarray(measurement, dtype=np.float64)
         block = as_block(given, self.channels, self.name)
         out = np.empty(block.shape)
-        self.n_missing += self._scan(block, out, self._state, self._constants)
-        self.n_samples += block.shape[0]
+        self.run(block, out)
         return float(out[0, 0]) if given.ndim == 0 else out.reshape(given.shape)
 
     def run(self, block: Array, out: Array) -> None:
@@ -77,57 +79,43 @@ class StreamingFilter:
 
         `block`, `out`: (n_samples, channels), C order, writeable, measured and, on return, filtered; may be one array.
         """
-        self.n_missing += self._scan(block, out, self._state, self._constants)
+        self.n_missing += kernels("kalman").hold_scan(block, out, self._state, self._constants)
         self.n_samples += block.shape[0]
 
     def anew(self, channels: int) -> Self:
-        """Return a filter of the same numbers that has seen nothing yet.
-
-        `channels`: all begin as the first channel of this one did.
-        """
-        other = copy(self)
+        """Return a filter of the same numbers, for another number of channels, that has seen nothing yet."""
+        other = deepcopy(self)
         other.channels, other.n_samples, other.n_missing = channels, 0, 0
-        other._begun = np.tile(self._begun[:1], (channels, 1))
-        other._state = other._begun.copy()
-        other._one, other._one_out = np.empty((1, channels)), np.empty((1, channels))
+        other._state = np.full(channels, self._begun)
         return other
 
     def copy(self) -> Self:
         """Return an independent filter in the same state."""
-        other = copy(self)
-        other._state = self._state.copy()
-        other._one, other._one_out = self._one.copy(), self._one_out.copy()
-        return other
+        return deepcopy(self)
 
 
 class ScalarKalman(StreamingFilter):
-    """Scalar Kalman filter of one or several channels that have nothing to do with each other.
+    """Stationary Kalman-Bucy filter of one or several channels that have nothing to do with each other.
 
-    The defaults are the thesis's (5.3.2): A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 = 7.746 1/s.
+    x̂' = A x̂ + L (y - C x̂) is solved exactly, each sample of y held until the next; what comes out is x̂ at the sampling
+    instants, from the samples before, as `ambid.signals.kalman_bucy` gives it. The defaults are the thesis's (5.3.2):
+    A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 = 7.746 1/s. `KalmanFilter` has the discrete and the varying form.
 
     Parameters
     ----------
     rate_hz : float
         Sampling rate in Hz.
     a, c, w, q, r : float
-        As in `ambid.signals.kalman_bucy_gain`: intensities, not variances of samples. White noise of
-        variance σ² in samples of f Hz has r = σ²/f.
-    form : {"continuous", "discrete"}
-        "continuous": x̂' = A x̂ + L (y - C x̂) solved exactly, each sample of y held until the next; gives x̂ at the
-        sampling instants, from the samples before (as `ambid.signals.kalman_bucy`). "discrete": the
-        optimal filter of the sampled state, x⁺ = e^(aT) x + noise of the exact variance, y with variance r f.
-    start_variance : float, optional
-        Variance of the state before the first sample: the gain then follows the variance in time. None: stationary.
+        As in `ambid.signals.kalman_bucy_gain`: intensities, not variances of samples. White noise of variance σ² in
+        samples of f Hz has r = σ²/f.
     start : float, optional
         Estimate before the first sample; y/c of the first sample by default.
-    give : {"filtered", "predicted"}
-        What the discrete form returns: x̂ from the samples up to this one, or before this one.
     channels : int
 
     Raises
     ------
     EstimationError
-        If a number is out of range, or there is no stationary filter and no `start_variance`.
+        If a number is out of range, or there is no stationary filter.
     """
 
     def __init__(
@@ -139,60 +127,28 @@ class ScalarKalman(StreamingFilter):
         w: float = 1.0,
         q: float = 60.0,
         r: float = 1.0,
-        form: Literal["continuous", "discrete"] = "continuous",
-        start_variance: float | None = None,
         start: float | None = None,
-        give: Literal["filtered", "predicted"] = "filtered",
         channels: int = 1,
     ) -> None:
         check_channels("scalar Kalman filter", rate_hz, channels)
-        if form not in ("continuous", "discrete") or give not in ("filtered", "predicted"):
-            raise EstimationError(
-                f"scalar Kalman filter: form {form!r}, give {give!r}; form is 'continuous' or 'discrete', give "
-                f"'filtered' or 'predicted'. Choose one of them"
-            )
-        self._fixed = (a, c, w, q, r, rate_hz)
-        varying = start_variance is not None
-        if start_variance is not None and not (isfinite(start_variance) and start_variance >= 0):
-            raise EstimationError(
-                f"scalar Kalman filter: start_variance is {start_variance}; it must be 0 or more. Give another"
-            )
-        if form == "continuous":
-            self.gain = _gain(a, c, w, q, r, varying=varying)
-            S = start_variance if start_variance is not None else self.gain * r / c
-            scan = "riccati_scan" if varying else "hold_scan"
-            constants = _riccati(a, c, w, q, r, 1 / rate_hz) if varying else _held(a, c, self.gain, 1 / rate_hz)
-            columns = [S, 0.0]
-        else:
-            rho, noise = _sampled(a, w, q, 1 / rate_hz)
-            _gain(a, c, w, q, r, varying=varying)
-            P = _stationary(rho, c, noise, r * rate_hz) if start_variance is None else start_variance
-            self.gain = c * P / (c * c * P + r * rate_hz)
-            scan, constants = "scalar_scan", np.array([rho, c, noise, r * rate_hz, float(give == "predicted")])
-            columns = [P, 0.0 if varying else 1.0]
-        first = np.nan if start is None else float(start)
+        self.gain = kalman_bucy_gain(a=a, c=c, w=w, q=q, r=r)
+        pole = a - self.gain * c
         super().__init__(
             "scalar Kalman filter",
             channels=channels,
-            state=np.tile([first, *columns], (channels, 1)),
-            constants=constants,
-            scan=scan,
+            decay=exp(pole / rate_hz),
+            forward=self.gain * expm1(pole / rate_hz) / pole,
+            alone=exp(a / rate_hz),
+            first=1.0 / c,
+            start=start,
         )
-
-    @property
-    def variance(self) -> Array:
-        """Variance of the error of `state`, shape (channels,): before the next sample.
-
-        In the continuous form that of a measurement that is not sampled: what the thesis's equations say.
-        """
-        return self._state[:, 1].copy()
 
 
 class PassiveLowpass(StreamingFilter):
     """First-order RC low-pass, x' = (y - x)/τ with τ = 1/(2π corner), discretised exactly; y held over a sample.
 
-    Gives the voltage over the capacitor at the sampling instants, as `ambid.signals.passive_lowpass`. Over
-    a missing value it stays where it is.
+    Gives the voltage over the capacitor at the sampling instants, as `ambid.signals.passive_lowpass`. Over a missing
+    value it stays where it is.
 
     Parameters
     ----------
@@ -219,48 +175,156 @@ class PassiveLowpass(StreamingFilter):
         super().__init__(
             "passive low-pass",
             channels=channels,
-            state=np.full((channels, 1), np.nan if start is None else float(start)),
-            constants=np.array([exp(step), -expm1(step), 1.0, 1.0]),
-            scan="hold_scan",
+            decay=exp(step),
+            forward=-expm1(step),
+            alone=1.0,
+            first=1.0,
+            start=start,
         )
 
 
-def _gain(a: float, c: float, w: float, q: float, r: float, *, varying: bool) -> float:
-    """L of the stationary filter; checks the numbers of a varying one, which exists without process noise too."""
-    if varying and a == 0.0 and w * w * q == 0.0 and isfinite(w) and isfinite(q):
-        kalman_bucy_gain(a=-1.0, c=c, w=w, q=q, r=r)
-        return 0.0
-    return kalman_bucy_gain(a=a, c=c, w=w, q=q, r=r)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sinusoid:
+    """amplitude·cos(φ + phase), as it is now."""
+
+    amplitude: float  # in the unit of the signal. Under about two standard deviations the amplitude leans upward.
+    amplitude_sd: float
+    phase: float  # in rad, -π to π; 1.81 rad is the spread of a phase of which nothing is known
+    phase_sd: float
 
 
-def _held(a: float, c: float, gain: float, period: float) -> Array:
-    pole = a - gain * c
-    return np.array([exp(pole * period), gain * expm1(pole * period) / pole, exp(a * period), 1.0 / c])
+class SynchronousFilter:
+    """Known-frequency regressor and notch.
 
+    Cosine and sine parts and the offset are followed with a memory that is fixed in time, so that the notch is
+    2/(2π memory) Hz wide at any speed. Standard deviations come from the random walk and from the density of the noise
+    around the rotation, which is estimated beside: coloured noise is allowed for. Parts that stand still have smaller
+    errors than they say, by √2. At standstill sine and cosine cannot be told from the offset: the covariance grows to
+    its start and no further.
 
-def _riccati(a: float, c: float, w: float, q: float, r: float, period: float) -> Array:
-    g, drive = c * c / r, w * w * q
-    rate = sqrt(a * a + g * drive)
-    if rate * period > _FAST:
-        raise EstimationError(
-            f"scalar Kalman filter: {rate * period:.3g} time constants of the filter in one sample, so that its "
-            "variance has no use of a start. Leave start_variance out"
+    Under feedback the controller answers the rotation too: what is found is the synchronous part of this signal, not
+    the force of the unbalance.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    memory_s : float
+        Time constant of the estimates, s; at least 32 samples.
+    channels : int
+        Signals that share the angle.
+
+    Attributes
+    ----------
+    n_samples, n_missing : int
+        Samples taken in, and single values that were missing.
+
+    Raises
+    ------
+    EstimationError
+        If the rate is not positive or the memory too short.
+    """
+
+    def __init__(self, rate_hz: float, *, memory_s: float, channels: int = 1) -> None:
+        check_channels("synchronous filter", rate_hz, channels)
+        n = memory_s * rate_hz
+        if not (isfinite(n) and n >= 2 * _BATCHES):
+            raise EstimationError(
+                f"synchronous filter: a memory of {memory_s} s is {n:.3g} samples; at least {2 * _BATCHES} are wanted. "
+                "Give a longer one"
+            )
+        self.channels, self.memory_s = channels, memory_s
+        self.n_samples = self.n_missing = 0
+        self._state = np.zeros((channels, 18))
+        # a walk of variance q a sample is followed with the gain √(q/2) a sample where cos² is 1/2 on average
+        size = int(n / _BATCHES)
+        taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+        taper /= np.sqrt(np.mean(taper**2))
+        self._constants = np.array([2.0 / n**2, 3 * _START, _LONGEST, _START, *taper])
+        self._one = (np.empty((1, channels)), np.empty(1), np.empty((1, channels)))
+
+    def update(self, signal: ArrayLike, phase: ArrayLike) -> Array | float:
+        """Take in one sample or a block and return it without the rotation.
+
+        Parameters
+        ----------
+        signal : array_like, shape (channels,), or (n_samples, channels) for a block
+            A number, or (n_samples,), where there is one channel. NaN where a value is missing.
+        phase : array_like, shape () or (n_samples,)
+            Angle φ of the shaft in rad; may be wrapped or not. NaN where it is missing.
+
+        Returns
+        -------
+        ndarray or float, shape of `signal`
+            signal - a cos φ - b sin φ with a and b from the samples before; NaN where something is missing.
+
+        Raises
+        ------
+        EstimationError
+            If shapes do not fit.
+        """
+        if isinstance(signal, float) and isinstance(phase, float) and self.channels == 1:
+            y, angle, out = self._one
+            y[0, 0], angle[0] = signal, phase
+            self.n_missing += kernels("kalman").synchronous_scan(y, angle, out, self._state, self._constants)
+            self.n_samples += 1
+            return float(out[0, 0])
+        given = np.asarray(signal, dtype=np.float64)
+        y = as_block(given, self.channels, "synchronous filter")
+        angle = as_block(np.asarray(phase, dtype=np.float64), 1, "synchronous filter")[:, 0]
+        if angle.size != y.shape[0]:
+            raise EstimationError(
+                f"synchronous filter: {angle.size} angles for {y.shape[0]} samples; give one for each sample"
+            )
+        out = np.empty(y.shape)
+        self.n_missing += kernels("kalman").synchronous_scan(
+            y, np.ascontiguousarray(angle), out, self._state, self._constants
         )
-    z = rate * period
-    t = tanh(z) / rate if rate > 0 else period
-    area = 2.0 * (sinh(z / 2) / rate) ** 2 / cosh(z) if rate > 0 else period * period / 2
-    rho, far = _sampled(a, w, q, period)
-    return np.array([a, g, drive, 1.0 / c, t, 1.0 / cosh(z), area, rho, far])
+        self.n_samples += y.shape[0]
+        return float(out[0, 0]) if given.ndim == 0 else out.reshape(given.shape)
 
+    @property
+    def parts(self) -> Array:
+        """Cosine part, sine part and offset of each channel, shape (channels, 3)."""
+        return self._state[:, :3].copy()
 
-def _sampled(a: float, w: float, q: float, period: float) -> tuple[float, float]:
-    """e^(aT) and the variance that the process noise adds over a sample."""
-    grown = expm1(2 * a * period) / (2 * a) if a != 0.0 else period
-    return exp(a * period), w * w * q * grown
+    @property
+    def covariance(self) -> Array:
+        """Of the parts of each channel, shape (channels, 3, 3); infinite before the noise is known."""
+        out = np.empty((self.channels, 3, 3))
+        for j, s in enumerate(self._state):
+            out[j] = covariance_of(s[3:12].reshape(3, 3)) * s[15] if s[16] > 0 else np.diag(np.full(3, np.inf))
+        return out
 
+    def sinusoid(self, channel: int = 0) -> Sinusoid:
+        """Return amplitude and phase of one channel, with standard deviations by the delta method.
 
-def _stationary(rho: float, c: float, noise: float, r: float) -> float:
-    """Positive root of P = ρ² P r/(c² P + r) + noise, without cancellation."""
-    half = (noise * c * c + (rho * rho - 1.0) * r) / 2.0
-    root = sqrt(half * half + c * c * noise * r)
-    return (half + root) / (c * c) if half > 0 else noise * r / (root - half)
+        Parameters
+        ----------
+        channel : int
+
+        Returns
+        -------
+        Sinusoid
+        """
+        a, b = (float(x) for x in self._state[channel, :2])
+        size = float(np.hypot(a, b))
+        P = self.covariance[channel][:2, :2]
+        if not np.isfinite(P).all() or size == 0.0:
+            return Sinusoid(amplitude=size, amplitude_sd=float("inf"), phase=0.0, phase_sd=_ANY)
+        along, across = np.array([a, b]) / size, np.array([-b, a]) / size
+        return Sinusoid(
+            amplitude=size,
+            amplitude_sd=float(np.sqrt(along @ P @ along)),
+            phase=float(np.arctan2(-b, a)),
+            phase_sd=float(min(np.sqrt(across @ P @ across) / size, _ANY)),
+        )
+
+    def copy(self) -> Self:
+        """Return an independent filter in the same state.
+
+        Returns
+        -------
+        SynchronousFilter
+        """
+        return deepcopy(self)
