@@ -13,8 +13,7 @@ from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.recursive.fusion import SensorFusion, free_motion
 from ambid.recursive.fusion_sensor import FusedSensor
-from ambid.recursive.joint import JointEkf, JointUkf
-from ambid.recursive.joint_start import JointStart
+from ambid.recursive.joint import JointEkf, JointStart, JointUkf
 from ambid.track.evidence import Samples
 from ambid.track.rpem import PhysicalRpem
 from ambid.track.window import MovingWindow

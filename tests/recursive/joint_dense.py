@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import expm
 
-from ambid.recursive.joint_start import JointStart
+from ambid.recursive.joint import JointStart
 from tests.estimation.reference import continuous
 
 LOGS = ("m", "R", "L")
@@ -19,7 +19,7 @@ STEP = 1e-30
 class Dense:
     """Augmented state [q, o, x] in SI but for q."""
 
-    def __init__(self, start: JointStart, offset: np.ndarray, wide: np.ndarray, *, unscented: float | None = None):
+    def __init__(self, start: JointStart, offset: np.ndarray, wide: np.ndarray, *, unscented: bool):
         self.start, self.unscented, p = start, unscented, len(start.free)
         self.size = np.array([start.values[k] for k in start.free])
         logs = np.array([k in LOGS for k in start.free])
@@ -70,22 +70,21 @@ class Dense:
 
     def step(self, now: np.ndarray, late: np.ndarray) -> None:
         noise, n = self.noise(), self.z.size
-        if self.unscented is None:
+        if not self.unscented:
             z = self.z.astype(complex)
             J = np.array([self.moved(z + 1j * STEP * d, now, late).imag / STEP for d in np.eye(n)]).T
             self.z, self.P = self.moved(z, now, late).real, J @ self.P @ J.T + noise
             return
-        square = self.unscented**2 * n
         turned = np.r_[self.s : n, self.p : self.s, : self.p]  # the root is upper triangular in [x, o, q]
         factor = np.zeros((n, n))
         upper = np.linalg.cholesky(self.P[np.ix_(turned, turned)][::-1, ::-1])[::-1, ::-1]
-        factor[np.ix_(turned, turned)] = np.sqrt(square) * upper
+        factor[np.ix_(turned, turned)] = np.sqrt(n) * upper
         points = np.array([self.z, *(self.z + factor.T), *(self.z - factor.T)])
-        weights = np.full(2 * n + 1, 0.5 / square)
-        weights[0] = 1 - n / square
+        weights = np.full(2 * n + 1, 0.5 / n)
+        weights[0] = 0.0
         ends = np.array([self.moved(p, now, late).real for p in points])
         self.z = weights @ ends
-        weights[0] += 1 - self.unscented**2 + 2.0
+        weights[0] = 2.0
         self.P = (weights * (ends - self.z).T) @ (ends - self.z) + noise
 
     def run(self, u: np.ndarray, y: np.ndarray) -> np.ndarray:

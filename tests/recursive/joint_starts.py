@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.joint_start import JointStart
+from ambid.recursive.joint import JointStart
 from tests.bearing.benches import Bench
 
 
@@ -34,3 +34,8 @@ def start_of(
 def truth_of(bench: Bench, names: tuple[str, ...]) -> np.ndarray:
     """True values of a filter's numbers; offsets are zero."""
     return np.array([bench.truth.get(k, 0.0) for k in names])
+
+
+def rates_of(share: dict[str, float], values: dict[str, float]) -> dict[str, float]:
+    """Rates of random walks, as `JointStart` wants them, from the relative deviation gained in one second."""
+    return {name: rate * abs(values[name]) for name, rate in share.items()}

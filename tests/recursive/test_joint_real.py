@@ -7,9 +7,9 @@ import pytest
 
 from ambid.job import identify, load
 from ambid.recursive.joint import JointEkf, JointUkf
-from ambid.recursive.joint_start import rates_of
 from ambid.rig import load_rig
 from tests.real.test_maglev import AXIS_RIG, MAGLEV, written
+from tests.recursive.joint_starts import rates_of
 
 pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive import square_root_kernels as core
-from ambid.recursive.square_root import covariance_of, factors_of, root_of_factors
+from ambid.recursive.square_root import covariance_of, factors_of
 
 SCALE = 10.0 ** np.array([-6, 0, 3, 6, -2])
 N = SCALE.size
@@ -49,18 +49,11 @@ def test_a_measurement_takes_what_it_says(P: np.ndarray, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("leading", [N, 3])
-def test_adding_and_taking_away_one_direction(P: np.ndarray, rng: np.random.Generator, leading: int) -> None:
+def test_adding_one_direction(P: np.ndarray, rng: np.random.Generator, leading: int) -> None:
     F, a = factors_of(P), np.zeros(N)
     a[:leading] = SCALE[:leading] * rng.normal(size=leading)
     core.widen(F, a[:leading].copy(), 2.0)
     assert_covariance(F, P + 2 * np.outer(a, a))
-    down, k = np.sqrt(2.0) * a, np.empty(N)
-    assert core.narrow(F, down.copy(), k)
-    assert_covariance(F, P)
-    before = F.copy()
-    just_too_much = 1.001 * root_of_factors(F)[:, -1].copy()
-    assert not core.narrow(F, just_too_much, k)
-    np.testing.assert_array_equal(F, before)
 
 
 @pytest.mark.parametrize("columns", [0, 2, 3])

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from ambid.recursive.fusion_sensor import FusedSensor as FusedSensor
     from ambid.recursive.instrumental import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
     from ambid.recursive.joint import JointEkf as JointEkf
+    from ambid.recursive.joint import JointStart as JointStart
     from ambid.recursive.joint import JointUkf as JointUkf
-    from ambid.recursive.joint_start import JointStart as JointStart
     from ambid.recursive.kalman import KalmanFilter as KalmanFilter
     from ambid.recursive.kalman import LinearState as LinearState
     from ambid.recursive.kalman import constant_velocity as constant_velocity

@@ -8,22 +8,21 @@ second-order terms (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
-from ambid.estimation.innovations import gain_derivatives, predictor_gain
+from ambid.errors import EstimationError, nearest
 from ambid.estimation.problem import scales_for
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import LinearModel, StateSpace
-from ambid.recursive.estimator import as_blocks
-from ambid.recursive.joint_start import JointStart, parameter_scales, start_from
+from ambid.physics.models import model as model_named
+from ambid.recursive.estimator import as_blocks, kernels
 from ambid.recursive.square_root import covariance_of, factors_of
 
 if TYPE_CHECKING:
@@ -39,6 +38,139 @@ _CURVED = 0.1  # of the squared relative error at the start: what linearising ma
 _AMOUNT = 2e-3  # relative movement of a parameter after which the matrices are renewed: what is left is its square
 _MOST_TERMS = 40
 _REST = 1e-15  # of the Taylor series, relative
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JointStart:
+    """Start of a joint filter; SI units.
+
+    Attributes
+    ----------
+    model : LinearModel
+    rate_hz : float
+    values : Mapping[str, float]
+        All of the model's parameters.
+    free : tuple of str
+        Those that are followed.
+    covariance : ndarray, shape (n_free, n_free)
+        Of the free ones at the start; positive definite.
+    sensor_sd : Mapping[str, float]
+        Noise of each output; positive.
+    disturbance_sd : Mapping[str, float]
+        Each disturbance, held over a sample; zero where there is none.
+    delay : float
+        Of the inputs, samples: whole ones and a fraction.
+    operating_point : Mapping[str, float]
+        Taken off inputs and outputs, by role; zero where it is not named.
+    offset_sd : Mapping[str, float]
+        What is known at the start of the constant part of each disturbance, which is zero; a role that is not named
+        gets ten times its disturbance, or, where there is none, what moves an output by its noise within two samples.
+    rates : Mapping[str, float]
+        Standard deviation that a number of `names` gains in one second of its random walk, in its unit times
+        s^(-1/2). A number that is not named stands still: its variance falls as long as data come.
+    """
+
+    model: LinearModel
+    rate_hz: float
+    values: Mapping[str, float]
+    free: tuple[str, ...]
+    covariance: Array
+    sensor_sd: Mapping[str, float]
+    disturbance_sd: Mapping[str, float]
+    delay: float = 0.0
+    operating_point: Mapping[str, float] = field(default_factory=dict)
+    offset_sd: Mapping[str, float] = field(default_factory=dict)
+    rates: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kept in ("values", "sensor_sd", "disturbance_sd", "operating_point", "offset_sd", "rates"):
+            object.__setattr__(self, kept, dict(getattr(self, kept)))  # a copy, and one that can be pickled
+        known = [p.name for p in self.model.parameters]
+        _named("values", self.values, known, complete=True)
+        _named("free parameters", dict.fromkeys(self.free, 1.0), known)
+        _named("sensor_sd", self.sensor_sd, self.model.outputs, complete=True)
+        _named("disturbance_sd", self.disturbance_sd, self.model.disturbances, complete=True)
+        _named("operating_point", self.operating_point, (*self.model.inputs, *self.model.outputs))
+        _named("offset_sd", self.offset_sd, self.model.disturbances)
+        _named("rates", self.rates, self.names)
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0 and np.isfinite(self.delay) and self.delay >= 0):
+            raise EstimationError(
+                f"rate_hz {self.rate_hz} must be positive and delay {self.delay} not negative. Correct them"
+            )
+        for what, table, least in (
+            ("sensor_sd", self.sensor_sd, True),
+            ("disturbance_sd", self.disturbance_sd, False),
+            ("offset_sd", self.offset_sd, True),
+            ("rates", self.rates, False),
+        ):
+            for name, value in table.items():
+                if not (np.isfinite(value) and (value > 0 if least else value >= 0)):
+                    rule = "positive" if least else "zero or positive"
+                    raise EstimationError(f"{what}[{name!r}] is {value}; it must be {rule}. Correct it")
+        for spec in self.model.parameters:
+            if spec.positive and not self.values[spec.name] > 0:
+                raise EstimationError(
+                    f"parameter {spec.name!r} starts at {self.values[spec.name]} {spec.unit}; it must be positive. "
+                    "Start from another estimate"
+                )
+        _check_covariance(self)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Followed numbers: free parameters, then the offset of each disturbance (``force_offset``)."""
+        return (*self.free, *(f"{d}_offset" for d in self.model.disturbances))
+
+
+def _named(
+    what: str, table: Mapping[str, float], known: tuple[str, ...] | list[str], *, complete: bool = False
+) -> None:
+    for name in table:
+        if name not in known:
+            raise EstimationError(
+                f"{what} names {name!r}; there are {', '.join(known)}.{nearest(name, list(known))} Correct the name"
+            )
+    lacking = [name for name in known if complete and name not in table]
+    if lacking:
+        raise EstimationError(f"{what} lacks {', '.join(lacking)}; each wants a number. Give it")
+
+
+def _check_covariance(start: JointStart) -> None:
+    p = len(start.free)
+    if p == 0:
+        raise EstimationError("no parameter is free; nothing can be followed. Free at least one")
+    if np.shape(start.covariance) != (p, p):
+        raise EstimationError(
+            f"the covariance has shape {np.shape(start.covariance)}; {p} free parameters want ({p}, {p}). Reshape it"
+        )
+    spread = np.sqrt(np.maximum(np.diag(start.covariance), 0.0))
+    try:
+        if not np.all(np.isfinite(start.covariance)):
+            raise np.linalg.LinAlgError
+        np.linalg.cholesky(start.covariance / np.outer(spread, spread) if np.all(spread > 0) else -np.eye(p))
+    except np.linalg.LinAlgError:
+        raise EstimationError("the covariance at the start is not positive definite. Give another") from None
+    size = parameter_scales(start)
+    for name, sd, one in zip(start.free, spread, size, strict=True):
+        if sd > one:
+            raise EstimationError(
+                f"parameter {name!r} starts with a standard deviation of {sd:.3g}, more than its size {one:.3g}; a "
+                "filter that is linear around its start cannot follow that. Fix it, give it a prior, or identify longer"
+            )
+
+
+def parameter_scales(start: JointStart) -> Array:
+    """Return the size of each free parameter: its value, or the model's reference where that is larger.
+
+    Returns (n_free,), SI.
+    """
+    reference = start.model.references(start.values)
+    positive = {p.name for p in start.model.parameters if p.positive}
+    return np.array(
+        [
+            abs(start.values[k]) if k in positive else max(abs(start.values[k]), reference.get(k, 0.0))
+            for k in start.free
+        ]
+    )
 
 
 class JointFilter:
@@ -94,30 +226,13 @@ class JointFilter:
         rates = np.array([start.rates.get(k, 0.0) for k in self.names]) / unit * np.sqrt(EVERY / start.rate_hz)
         rest = np.maximum(np.sqrt(np.diag(P)), np.r_[np.zeros(s), np.full(p, _LARGEST)])
         self._walk = np.array([np.r_[np.zeros(s - n_d), rates[p:], rates[:p]], rest])
-        self._counts = np.zeros(9, dtype=np.int64)
+        self._counts = np.zeros(8, dtype=np.int64)
         self._counts[5] = 1
 
     @classmethod
-    def from_estimate(
-        cls,
-        estimate: Estimate,
-        rate_hz: float,
-        *,
-        rates: Mapping[str, float] | None = None,
-        offset_sd: Mapping[str, float] | None = None,
-        sensor_sd: Mapping[str, float] | None = None,
-        disturbance_sd: Mapping[str, float] | None = None,
-        **settings: Any,
-    ) -> Self:
-        """Return a filter that starts from an off-line estimate of the same rate.
-
-        `rates` and `offset_sd` as in `JointStart`; `sensor_sd` and `disturbance_sd` in place of the estimate's levels;
-        `settings` of the filter.
-        """
-        start = start_from(
-            estimate, rate_hz, rates=rates, offset_sd=offset_sd, sensor_sd=sensor_sd, disturbance_sd=disturbance_sd
-        )
-        return cls(start, **settings)
+    def from_estimate(cls, estimate: Estimate, rate_hz: float, **settings: Mapping[str, float]) -> Self:
+        """Return a filter that starts from an off-line estimate of the same rate; `settings` as in `start_from`."""
+        return cls(start_from(estimate, rate_hz, **settings))
 
     @property
     def estimate(self) -> Array:
@@ -207,11 +322,52 @@ class JointFilter:
 
     def copy(self) -> Self:
         """Return an independent filter in the same state."""
-        twin = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                setattr(twin, name, value.copy())
-        return twin
+        return deepcopy(self)
+
+
+def start_from(
+    estimate: Estimate,
+    rate_hz: float,
+    *,
+    rates: Mapping[str, float] | None = None,
+    offset_sd: Mapping[str, float] | None = None,
+    sensor_sd: Mapping[str, float] | None = None,
+    disturbance_sd: Mapping[str, float] | None = None,
+) -> JointStart:
+    """Return the start that an off-line estimate makes.
+
+    `estimate`: parameters, covariance, delay, noise levels and operating point are taken from it; `rates`, `offset_sd`:
+    as in `JointStart`; `sensor_sd`, `disturbance_sd`: in place of the estimate's.
+    """
+    if estimate.status == "failed":
+        raise EstimationError("the estimate has failed; a filter cannot start from it. Identify again")
+    rate = estimate.record.get("rate_hz")
+    if isinstance(rate, int | float) and abs(rate / rate_hz - 1.0) > 1e-6:
+        raise EstimationError(
+            f"the estimate is of a record at {rate:g} Hz and the samples come at {rate_hz:g} Hz; noise and delay are "
+            "per sample. Identify at the rate of the samples"
+        )
+    of, noise = model_named(estimate.model), estimate.noise
+    sensor, disturbance = sensor_sd or noise.sensor_sd, disturbance_sd or noise.disturbance_sd
+    if not sensor or not disturbance:
+        raise EstimationError(
+            f"the estimate describes its noise as a {noise.form}; a joint filter wants levels. Give sensor_sd and "
+            "disturbance_sd, or identify with noise levels"
+        )
+    delay = estimate.delay[of.inputs[0]]
+    return JointStart(
+        model=of,
+        rate_hz=rate_hz,
+        values=estimate.values,
+        free=estimate.covariance_names,
+        covariance=estimate.covariance,
+        sensor_sd=sensor,
+        disturbance_sd=disturbance,
+        delay=delay.samples + delay.fraction,
+        operating_point={r: estimate.operating_point.get(r, 0.0) for r in (*of.inputs, *of.outputs)},
+        offset_sd=offset_sd or {},
+        rates=rates or {},
+    )
 
 
 class JointEkf(JointFilter):
@@ -230,12 +386,6 @@ class JointEkf(JointFilter):
     Parameters
     ----------
     start : JointStart
-    corrected : bool
-        Add the dependence of the stationary gain on the parameters to the sensitivity of the state (Ljung 1979). The
-        filter is then a recursive prediction error method with given noise levels: where these are right, standard
-        deviations shrink by what the colour of the noise says (a few per cent, a fifth for the mass without
-        excitation); where they are wrong the parameters make up for them: disturbances ten times too large move the
-        mass by 21 % even with excitation. Hence only for levels that are known.
 
     Attributes
     ----------
@@ -246,17 +396,13 @@ class JointEkf(JointFilter):
         Times that the matrices were renewed at a new linearisation point.
     """
 
-    def __init__(self, start: JointStart, *, corrected: bool = False) -> None:
-        from ambid.recursive.joint_kernels import ekf_block
-
+    def __init__(self, start: JointStart) -> None:
         super().__init__(start)
-        self._kernel = ekf_block
-        self._corrected = corrected
-        n, n_y, p = self._wide.size, self._C.shape[0], self._logs.size
+        n, p = self._wide.size, self._logs.size
         wide = n + 2 * self._past.shape[1] + self._dist.size
         self._at = self._scaled_parameters.copy()
         self._begun = self._relative_sd()
-        self._M, self._dM, self._dG = np.zeros((n, wide)), np.zeros((p, n, wide)), np.zeros((p, n, n_y))
+        self._M, self._dM = np.zeros((n, wide)), np.zeros((p, n, wide))
         self.n_renewed = -1
         self._renew()
 
@@ -282,9 +428,9 @@ class JointEkf(JointFilter):
     def _run(self, u: Array, y: Array, e: Array) -> None:
         done = 0
         while True:
-            done = self._kernel(
-                done, u, y, e, self._z, self._F, self._at, self._M, self._dM, self._dG, self._C, self._dist, self._walk,
-                self._io, self._wide, self._past, self._counts, EVERY, _AMOUNT,
+            done = kernels("joint").ekf_block(
+                done, u, y, e, self._z, self._F, self._at, self._M, self._dM, self._C, self._dist, self._walk, self._io,
+                self._wide, self._past, self._counts, EVERY, _AMOUNT,
             )  # fmt: skip
             if self._counts[6]:
                 self._renew()
@@ -302,8 +448,6 @@ class JointEkf(JointFilter):
         self._M[:] = np.hstack([now.A, now.B, now.B_late, now.E])
         for j, d in enumerate(slopes):
             self._dM[j] = np.hstack([d.A, d.B, d.B_late, d.E])
-        if self._corrected:
-            self._correct(now, slopes)
         self.n_renewed += 1
 
     def _discrete(self) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
@@ -322,19 +466,6 @@ class JointEkf(JointFilter):
         now, slopes = discretise(scaled[0], 1.0 / self.start.rate_hz, fraction=self._fraction, derivatives=scaled[1:])
         return now, slopes[: len(self.start.free)]
 
-    def _correct(self, now: DiscreteSpace, slopes: tuple[DiscreteSpace, ...]) -> None:
-        """Sensitivity of the stationary gain: of K = A K_f the filter sees dA K_f already, A dK_f is what it lacks."""
-        power = self._dist**2
-        try:
-            at = predictor_gain(now.A, self._C, (now.E * power) @ now.E.T, np.eye(self._C.shape[0]))
-        except (np.linalg.LinAlgError, ValueError):
-            return  # no stationary gain here (no disturbance, say): the last sensitivity, at first none, stays
-        dA, dE = np.array([d.A for d in slopes]), np.array([d.E for d in slopes])
-        half = (dE * power) @ now.E.T
-        dR = np.zeros((len(slopes), *at.S.shape))
-        dK = gain_derivatives(now.A, self._C, at, dA, half + np.swapaxes(half, 1, 2), dR)
-        self._dG[:] = dK - dA @ np.linalg.solve(now.A, at.K)
-
 
 class JointUkf(JointFilter):
     """Joint unscented Kalman filter.
@@ -348,12 +479,6 @@ class JointUkf(JointFilter):
     Parameters
     ----------
     start : JointStart
-    alpha : float
-        Spread of the points: sqrt(n) alpha standard deviations, n the length of the augmented state. At 1 all weights
-        are positive; well below, the covariance is downdated, and a downdate that leaves nothing positive is left out
-        and counted.
-    beta : float
-        What is known of the distribution's kurtosis; 2 for a Gaussian one.
 
     Attributes
     ----------
@@ -364,27 +489,14 @@ class JointUkf(JointFilter):
     Raises
     ------
     EstimationError
-        If alpha is not positive, the model is no product of powers, or its sampling too slow for the series.
+        If the model is no product of powers, or its sampling too slow for the series.
     """
 
-    def __init__(self, start: JointStart, *, alpha: float = 1.0, beta: float = 2.0) -> None:
-        from ambid.recursive.joint_kernels import ukf_block
-
+    def __init__(self, start: JointStart) -> None:
         super().__init__(start)
-        if not (np.isfinite(alpha) and alpha > 0 and np.isfinite(beta)):
-            raise EstimationError(f"alpha {alpha} must be positive and beta {beta} a number. Correct them")
-        self._kernel = ukf_block
-        square = alpha**2 * self._z.size
-        mean_0 = 1.0 - self._z.size / square
-        self._scaled = np.array([square, mean_0, mean_0 + 1.0 - alpha**2 + beta, self._fraction])
         self._logs = self._logs.astype(np.int64)
         self._place, self._entry, self._first, self._factor = self._matrices()
         self._terms = self._series()
-
-    @property
-    def n_refused(self) -> int:
-        """Downdates of the covariance that were left out because nothing positive would have been left."""
-        return int(self._counts[7])
 
     def _matrices(self) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]:
         """[A, B, E] T in scaled units as products of powers of the followed numbers; the others are taken in."""
@@ -428,9 +540,9 @@ class JointUkf(JointFilter):
         )
 
     def _run(self, u: Array, y: Array, e: Array) -> None:
-        self._kernel(
+        kernels("joint").ukf_block(
             u, y, e, self._z, self._F, self._logs, self._place, self._entry, self._first, self._factor, self._C,
-            self._dist, self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._scaled,
+            self._dist, self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._fraction,
         )  # fmt: skip
 
 

@@ -11,54 +11,15 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.square_root_kernels import (
-    follow,
-    narrow,
-    orthogonalise,
-    propagate,
-    shrink,
-    size,
-    spread,
-    variance,
-    widen,
-)
+from ambid.recursive.square_root_kernels import propagate, shrink, size, variance, widen
 
 Ints = NDArray[np.int64]
 
 # places in `counts`
-K, USED, REJECTED, PARTIAL, FILLED, FRESH, DUE, REFUSED, MISSED = range(9)
+K, USED, REJECTED, PARTIAL, FILLED, FRESH, DUE, MISSED = range(8)
 _ABSURD, _HUGE = 1e3, 1e200  # standard deviations of an innovation beyond which it is no measurement
 _FORGET = 1.0 / 1024.0  # weight of a sample in the running level of the innovations
 _BLIND = 32  # samples without any output after which the state is taken for lost
-
-
-@compiled
-def _measure(z: Array, F: Array, C: Array, e: Array, level: Array, f: Array, b: Array) -> int:
-    """Take in outputs one by one, `e` their innovations (NaN: missing), `level` a running mean; return how many."""
-    n, taken, (n_y, n_x), one = z.size, 0, C.shape, 1.0
-    moved = np.zeros(n_x)  # what the outputs before have moved of x
-    for o in range(n_y):
-        if not np.isfinite(e[o]):
-            continue
-        left = e[o]
-        for i in range(n_x):
-            left -= C[o, i] * moved[i]
-        for j in range(n):
-            f[j] = C[o, j] if j < n_x else 0.0
-            for i in range(min(j, n_x)):
-                f[j] += F[j, i] * C[o, i]
-        alpha = one + size(F, f)
-        if not left * left <= _ABSURD * _ABSURD * alpha < _HUGE:
-            e[o] = np.nan
-            continue
-        level[o] += (left * left / alpha - level[o]) * _FORGET
-        gain = left / shrink(F, f, one, b)
-        for i in range(n):
-            z[i] += gain * b[i]
-        for i in range(n_x):
-            moved[i] += gain * b[i]
-        taken += 1
-    return taken
 
 
 @compiled
@@ -66,7 +27,8 @@ def _walk(F: Array, walk: Array, a: Array) -> None:
     """Let parameters and offsets walk at random, each only while its standard deviation is under its limit."""
     for j in range(walk.shape[1]):
         if walk[0, j] > 0.0 and variance(F, j) < walk[1, j] * walk[1, j]:
-            a[:] = 0.0
+            for i in range(j):
+                a[i] = 0.0
             a[j] = 1.0
             widen(F, a[: j + 1], walk[0, j] * walk[0, j])
 
@@ -74,10 +36,13 @@ def _walk(F: Array, walk: Array, a: Array) -> None:
 @compiled
 def _take(
     u: Array, y: Array, e: Array, z: Array, F: Array, C: Array, io: Array, wide: Array, past: Array, counts: Ints,
-    f: Array, b: Array,
+    f: Array, b: Array, move: Array,
 ) -> bool:  # fmt: skip
-    """Take in one sample; leave scaled innovations in `e`, inputs in `past`; return whether there is a step to make."""
-    (n_y, n_x), n_u = C.shape, u.size
+    """Take in one sample; leave scaled innovations in `e`, inputs in `past`; return whether there is a step to make.
+
+    A missing output is NaN in `e`; `io` holds a running mean of the squared innovations over what is expected of them.
+    """
+    (n_y, n_x), n_u, one = C.shape, u.size, 1.0
     missing = 0
     for o in range(n_y):
         e[o] = (y[o] - io[0, n_u + o]) / io[1, n_u + o]
@@ -87,7 +52,8 @@ def _take(
         if not np.isfinite(u[i]):
             counts[REJECTED] += 1
             counts[FILLED], counts[FRESH] = 0, 1
-            e[:] = np.nan
+            for o in range(n_y):
+                e[o] = np.nan
             return False
     for row in range(past.shape[0] - 1, 0, -1):
         for i in range(n_u):
@@ -97,7 +63,8 @@ def _take(
     counts[FILLED] = min(counts[FILLED] + 1, past.shape[0])
     if counts[FILLED] < past.shape[0]:
         counts[USED if missing < n_y else REJECTED] += 1
-        e[:] = np.nan
+        for o in range(n_y):
+            e[o] = np.nan
         return False
     if missing == n_y:
         counts[REJECTED] += 1
@@ -107,44 +74,67 @@ def _take(
         return bool(counts[FRESH] == 0)
     fresh, counts[MISSED] = counts[FRESH] == 1, 0
     if fresh:  # forget the plant's state, and what it had to do with the parameters
-        z[:n_x] = 0.0
-        F[:, :n_x] = 0.0
         for i in range(n_x):
+            z[i] = 0.0
+            for j in range(z.size):
+                F[j, i] = 0.0
             F[i, i] = wide[i] * wide[i]
         counts[FRESH] = 0
     for o in range(n_y):
         for i in range(n_x):
             e[o] -= C[o, i] * z[i]
-    taken = _measure(z, F, C, e, io[2, n_u:], f, b)
+        move[o] = e[o]
+    taken = 0
+    for o in range(n_y):  # outputs one by one, each innovation less what those before have moved of x
+        if not np.isfinite(e[o]):
+            continue
+        for j in range(z.size):
+            f[j] = C[o, j] if j < n_x else 0.0
+            for i in range(min(j, n_x)):
+                f[j] += F[j, i] * C[o, i]
+        alpha, left = one + size(F, f), move[o]
+        if not left * left <= _ABSURD * _ABSURD * alpha < _HUGE:
+            e[o] = np.nan
+            continue
+        io[2, n_u + o] += (left * left / alpha - io[2, n_u + o]) * _FORGET
+        gain = left / shrink(F, f, one, b)
+        for i in range(z.size):
+            z[i] += gain * b[i]
+        for later in range(o + 1, n_y):
+            for i in range(n_x):
+                move[later] -= C[later, i] * (gain * b[i])
+        taken += 1
     counts[USED if taken else REJECTED] += 1
     counts[PARTIAL] += 0 < taken < n_y
     if taken == 0:  # an innovation that no noise can make: the state is lost
         counts[FILLED], counts[FRESH] = 0, 1
     if fresh:
-        e[:] = np.nan
-    return bool(taken > 0)
+        for o in range(n_y):
+            e[o] = np.nan
+    return taken > 0
 
 
 @compiled
 def ekf_block(
-    first: int, u: Array, y: Array, e: Array, z: Array, F: Array, at: Array, M: Array, dM: Array, dG: Array, C: Array,
-    dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, amount: float,
+    first: int, u: Array, y: Array, e: Array, z: Array, F: Array, at: Array, M: Array, dM: Array, C: Array, dist: Array,
+    walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, amount: float,
 ) -> int:  # fmt: skip
     """Run the extended filter from sample `first` on; return before which sample the matrices are to be renewed.
 
-    x+ = M(q) [x; u; u late; o], M(q) = M + sum dM_j (q_j - at_j); dG holds what the stationary gain's dependence on q
-    adds to the sensitivity of x to q for a unit innovation (Ljung 1979).
+    x+ = M(q) [x; u; u late; o], M(q) = M + sum dM_j (q_j - at_j).
     """
     n, p, (n_x, columns) = z.size, dM.shape[0], M.shape
     s, n_u, n_y, n_d = n - p, u.shape[1], y.shape[1], dist.size
     f, b, v, now = np.empty(n), np.empty(n), np.empty(columns), np.empty((n_x, columns))
     J, G = np.empty((n_x, n - n_x)), np.empty((n_x, n_d))
-    W, w = np.empty((n_x, n_x + n_d)), np.empty(n_x + n_d)
+    W, w, move = np.empty((n_x, n_x + n_d)), np.empty(n_x + n_d), np.empty(n_y)
     for k in range(first, u.shape[0]):
         counts[K] += 1
-        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b):
-            now[:] = M
-            v[:n_x] = z[:n_x]
+        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b, move):
+            for i in range(n_x):
+                v[i] = z[i]
+                for c in range(columns):
+                    now[i, c] = M[i, c]
             for i in range(n_u):
                 v[n_x + i] = past[past.shape[0] - 2, i]
                 v[n_x + n_u + i] = past[past.shape[0] - 1, i]
@@ -158,9 +148,6 @@ def ekf_block(
                         slope = dM[j, i, c]
                         now[i, c] += slope * moved
                         acc += slope * v[c]
-                    for o in range(n_y):
-                        if np.isfinite(e[k, o]):
-                            acc += dG[j, i, o] * e[k, o]
                     J[i, n_d + j] = acc
             for i in range(n_x):
                 acc = 0.0
@@ -231,32 +218,37 @@ def _move(D: Array, x: Array, u: Array, late: Array, o: Array, fraction: float, 
 def ukf_block(
     u: Array, y: Array, e: Array, z: Array, F: Array, logs: Ints, place: Ints, scale: Array, start: Ints, factor: Ints,
     C: Array, dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, terms: int,
-    scaled: Array,
+    fraction: float,
 ) -> None:  # fmt: skip
-    """Run the unscented filter; `scaled` holds gamma^2, the weights W0 of mean and covariance, and the fraction."""
-    n, p, n_x, n_d, n_u = z.size, logs.size, C.shape[1], dist.size, u.shape[1]
+    """Run the unscented filter with points at √n standard deviations.
+
+    The central one has no weight in the mean, and 2 in the covariance, as a Gaussian wants.
+    """
+    n, p, n_x, n_d, n_u, n_y = z.size, logs.size, C.shape[1], dist.size, u.shape[1], y.shape[1]
     s = n_x + n_d
-    square, mean_0, cov_0, fraction = scaled[0], scaled[1], scaled[2], scaled[3]
-    gamma, other = np.sqrt(square), 0.5 / square
+    gamma, weight = np.sqrt(float(n)), 0.5 / n
     f, b, t, zero, point = np.empty(n), np.empty(n), np.empty(2 * n_x + p), np.zeros(n_u), np.empty(n)
     up, still, x, o, q = np.empty(n_x), np.empty(n_x), point[:n_x], point[n_x:s], point[s:]
-    D, ends = np.zeros((n_x, n_x + n_u + n_d)), np.empty((2 * n_x, p))
-    A, J = np.empty((n_x, n_x)), np.empty((n_x, n_d))
-    W, w = np.empty((n_x, s + p + 1)), np.ones(s + p + 1)
+    D, ends, move = np.zeros((n_x, n_x + n_u + n_d)), np.empty((2 * n_x, p)), np.empty(n_y)
+    A, J, G = np.empty((n_x, n_x)), np.empty((n_x, n_d)), np.empty((n_x, n_d + p + 1))
+    W, w = np.empty((n_x, s + p + 1)), np.empty(s + p + 1)
     # points of the linear columns lie about the moved centre: all share its distance from the mean
-    centre = cov_0 + 2.0 * other * (n - p)
+    others = 2.0 * weight * (n - p)
     for k in range(u.shape[0]):
         counts[K] += 1
-        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b):
+        if _take(u[k], y[k], e[k], z, F, C, io, wide, past, counts, f, b, move):
             now, late = past[past.shape[0] - 2], past[past.shape[0] - 1]
             # the central point, and the matrices there: the step is linear in states, offsets and disturbances
-            point[:] = z
+            for i in range(n):
+                point[i] = z[i]
             _fill(q, logs, place, scale, start, factor, D, t)
             _move(D, x, now, late, o, fraction, terms, t)
-            up[:] = x
+            for i in range(n_x):
+                up[i] = x[i]
+                still[i] = others * up[i]
             for j in range(s):
-                point[:s] = 0.0
-                point[j] = 1.0
+                for i in range(s):
+                    point[i] = 1.0 if i == j else 0.0
                 _move(D, x, zero, zero, o, fraction, terms, t)
                 for i in range(n_x):
                     if j < n_x:
@@ -264,37 +256,29 @@ def ukf_block(
                     else:
                         J[i, j - n_x] = x[i]
             # points along the parameters' columns, two by two
-            for i in range(n_x):
-                still[i] = (mean_0 + 2.0 * other * (n - p)) * up[i]
             for j in range(p):
                 away = gamma * np.sqrt(F[s + j, s + j])
                 for side in range(2):
                     to = away if side == 0 else -away
-                    point[:] = z
-                    for i in range(s + j):
-                        point[i] += to * F[s + j, i]
-                    point[s + j] += to
+                    for i in range(n):
+                        point[i] = z[i] + (to * F[s + j, i] if i < s + j else to if i == s + j else 0.0)
                     _fill(q, logs, place, scale, start, factor, D, t)
                     _move(D, x, now, late, o, fraction, terms, t)
                     for i in range(n_x):
                         ends[side * n_x + i, j] = x[i]
-                        still[i] += other * x[i]
-            follow(F, A, J, t)
-            spread(F, A, W, w)
+                        still[i] += weight * x[i]
             for i in range(n_x):
                 for j in range(n_d):
-                    W[i, n_x + j] = J[i, j] * dist[j]
+                    G[i, j] = J[i, j] * dist[j]
                 for j in range(p):
-                    plus, minus = ends[i, j], ends[n_x + i, j]
-                    F[s + j, i] = (plus - minus) / (2.0 * gamma * np.sqrt(F[s + j, s + j]))
-                    W[i, s + j] = np.sqrt(0.5 * other) * (plus + minus - 2.0 * still[i])
-                x[i] = np.sqrt(abs(centre)) * (up[i] - still[i])
-                W[i, s + p] = x[i] if centre > 0.0 else 0.0
+                    G[i, n_d + j] = np.sqrt(0.5 * weight) * (ends[i, j] + ends[n_x + i, j] - 2.0 * still[i])
+                G[i, n_d + p] = np.sqrt(2.0 + others) * (up[i] - still[i])
                 z[i] = still[i]
-            orthogonalise(W, w, F)
-            if centre < 0.0 and not narrow(F, x, b):
-                counts[REFUSED] += 1
-        for i in range(y.shape[1]):
+            propagate(F, A, J, G, W, w)
+            for j in range(p):
+                for i in range(n_x):
+                    F[s + j, i] = (ends[i, j] - ends[n_x + i, j]) / (2.0 * gamma * np.sqrt(F[s + j, s + j]))
+        for i in range(n_y):
             e[k, i] *= io[1, n_u + i]
         if counts[K] % every == 0:
             _walk(F, walk, f)

@@ -10,8 +10,6 @@ from __future__ import annotations
 from ambid.arrays import Array
 from ambid.compiled import compiled
 
-_SINGULAR = 1e-8  # what a covariance may lose by a subtraction, relative
-
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def project(F: Array, h: Array, f: Array) -> None:
@@ -94,32 +92,36 @@ def widen(F: Array, a: Array, q: float) -> None:
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def narrow(F: Array, a: Array, k: Array) -> bool:
-    """Replace P by P - a aᵀ; leave it and return False where that is not positive. `a` is used up, `k` is scratch.
+def propagate(F: Array, A: Array, J: Array, G: Array, W: Array, w: Array) -> None:
+    """Move P over one step of x⁺ = A x + J z + G noise, x the leading states and z those behind them, which stay.
 
-    With U p = a the difference is U (D - p pᵀ) Uᵀ, which is a measurement whose noise is what p leaves of one: nothing
-    cancels.
+    The noise has covariance one; `J` may have fewer columns than there are z. `W` (n_x, n_x + n_noise) and
+    `w` (n_x + n_noise,) are scratch. The new factors of x are those of W diag(w) Wᵀ by modified weighted Gram-Schmidt
+    (Bierman 1977, sec. VI.4): as stable as reflections, and without roots.
     """
-    solve(F, a)
-    rest = 1.0
-    for j in range(a.size):
-        p = a[j]
-        a[j] /= F[j, j]
-        rest -= p * a[j]
-    if not rest > _SINGULAR:
-        return False
-    shrink(F, a, rest, k)
-    return True
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-def orthogonalise(W: Array, w: Array, F: Array) -> None:
-    """Make the leading block of F the factors of W diag(w) Wᵀ; W is used up.
-
-    Modified weighted Gram-Schmidt (Bierman 1977, sec. VI.4): as stable as reflections, and without roots.
-    """
-    rows, columns = W.shape
-    for j in range(rows - 1, -1, -1):
+    n, columns, known = A.shape[0], W.shape[1], A.shape[0] + J.shape[1]
+    for j in range(n, F.shape[0]):
+        for i in range(n):
+            x = J[i, j - n] if j < known else 0.0
+            for c in range(n):
+                x += A[i, c] * F[j, c]
+            for c in range(n, min(j, known)):
+                x += J[i, c - n] * F[j, c]
+            w[i] = x
+        for i in range(n):
+            F[j, i] = w[i]
+    for j in range(n):
+        for i in range(n):
+            x = A[i, j]
+            for c in range(j):
+                x += A[i, c] * F[j, c]
+            W[i, j] = x
+        w[j] = F[j, j]
+    for j in range(n, columns):
+        for i in range(n):
+            W[i, j] = G[i, j - n]
+        w[j] = 1.0
+    for j in range(n - 1, -1, -1):
         square = 0.0
         for c in range(columns):
             square += W[j, c] * W[j, c] * w[c]
@@ -133,51 +135,3 @@ def orthogonalise(W: Array, w: Array, F: Array) -> None:
             F[j, i] = along
             for c in range(columns):
                 W[i, c] -= along * W[j, c]
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-def follow(F: Array, A: Array, J: Array, v: Array) -> None:
-    """Move what the leading states x⁺ = A x + J z have in common with the states z behind them, which stay.
-
-    `J` may have fewer columns than there are z; `v` is scratch. The block of x itself is left to `orthogonalise`.
-    """
-    n, known = A.shape[0], A.shape[0] + J.shape[1]
-    for j in range(n, F.shape[0]):
-        for i in range(n):
-            x = J[i, j - n] if j < known else 0.0
-            for c in range(n):
-                x += A[i, c] * F[j, c]
-            for c in range(n, min(j, known)):
-                x += J[i, c - n] * F[j, c]
-            v[i] = x
-        for i in range(n):
-            F[j, i] = v[i]
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-def spread(F: Array, A: Array, W: Array, w: Array) -> None:
-    """Fill the first columns of W with A U and of w with D, of the leading states: what `orthogonalise` takes."""
-    n = A.shape[0]
-    for j in range(n):
-        for i in range(n):
-            x = A[i, j]
-            for c in range(j):
-                x += A[i, c] * F[j, c]
-            W[i, j] = x
-        w[j] = F[j, j]
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
-def propagate(F: Array, A: Array, J: Array, G: Array, W: Array, w: Array) -> None:
-    """Move P over one step of x⁺ = A x + J z + G noise, x the leading states and z those behind them, which stay.
-
-    The noise has covariance one. `W` (n_x, n_x + n_noise) and `w` (n_x + n_noise,) are scratch.
-    """
-    follow(F, A, J, w)
-    spread(F, A, W, w)
-    n = A.shape[0]
-    for j in range(G.shape[1]):
-        for i in range(n):
-            W[i, n + j] = G[i, j]
-        w[n + j] = 1.0
-    orthogonalise(W, w, F)
