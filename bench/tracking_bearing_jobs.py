@@ -11,8 +11,7 @@ import numpy as np
 from ambid.physics.loop import Noise
 from ambid.physics.models import model
 from ambid.physics.presets import preset
-from ambid.recursive.fusion import SensorFusion, free_motion
-from ambid.recursive.fusion_sensor import FusedSensor
+from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf
 from ambid.track.evidence import Samples
 from ambid.track.rpem import PhysicalRpem

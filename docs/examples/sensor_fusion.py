@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.fusion import SensorFusion, free_motion
-from ambid.recursive.fusion_sensor import FusedSensor
+from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
 
 RATE_HZ, SECONDS = 20_000.0, 2.0
 GAIN, NOISE = 4000.0, 2e-3  # V/m and V: 0.5 um

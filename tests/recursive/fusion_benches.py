@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.fusion import SensorFusion, free_motion
-from ambid.recursive.fusion_sensor import FusedSensor
+from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
 
 RATE = 20_000.0
 GAIN = 4000.0  # V/m

@@ -176,7 +176,7 @@ def test_a_sensor_that_stays_off_stays_out_until_an_operator_puts_it_back():
     assert [(e.kind, e.parameter) for e in fused.events] == [("excluded", "b")]
     fused.restore("b", offset_sd=20 * NOISE)
     fused.update(readings(vibration(10_000)) + np.array([0.0, 10 * NOISE, 0.0]))
-    assert [e.kind for e in fused.take_events()] == ["excluded", "restored"]
+    assert [e.kind for e in fused.events] == ["excluded", "restored"]
     assert fused.working == ("a", "b", "c")
     value, sd = fused.offsets[1] - fused.offsets[0] * [1.0, 0.0]
     assert value == pytest.approx(10 * NOISE, abs=2 * NOISE)

@@ -11,11 +11,10 @@ if TYPE_CHECKING:
     from ambid.recursive.arx import RecursiveIvArx as RecursiveIvArx
     from ambid.recursive.blocks import OnlineThreeBlocks as OnlineThreeBlocks
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
+    from ambid.recursive.fusion import FusedSensor as FusedSensor
     from ambid.recursive.fusion import Motion as Motion
     from ambid.recursive.fusion import SensorFusion as SensorFusion
     from ambid.recursive.fusion import free_motion as free_motion
-    from ambid.recursive.fusion import levitated_motion as levitated_motion
-    from ambid.recursive.fusion_sensor import FusedSensor as FusedSensor
     from ambid.recursive.instrumental import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
     from ambid.recursive.joint import JointEkf as JointEkf
     from ambid.recursive.joint import JointStart as JointStart

@@ -2,360 +2,111 @@
 
 State: motion, a slowly walking offset of each sensor, perhaps a temperature that all share. Each sensor is tested
 against the others at every sample; a faulty one is left out, its influence since the fault is taken back, and it is
-used again once it has agreed with the others long enough.
+used again once it has agreed with the others long enough. A sensor gives offset + gain x (+ warmth · temperature) +
+drift + noise, x positive in one direction for all: of a pair on opposite sides of the rotor one has a negative gain.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from copy import copy
+from copy import deepcopy
 from dataclasses import dataclass
-from math import isfinite, log
-from typing import Literal, Self
+from math import erf, inf, isfinite, log, sqrt
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.physics.discretise import zero_order_hold
-from ambid.recursive.estimator import as_block, check_channels
-from ambid.recursive.fusion_sensor import FusedSensor, reason, sensor_table
-from ambid.recursive.kalman import LinearState, constant_velocity, linear_state
-from ambid.recursive.lines import Event
+from ambid.recursive.estimator import as_block, check_channels, kernels
+from ambid.recursive.kalman import LinearState, constant_velocity
+from ambid.recursive.lines import Event, EventKind
 from ambid.recursive.square_root import covariance_of, factors_of, root_of
 
+_CONTINUOUS = 3.0  # equal values in succession that a signal without steps does not give
+_SECONDS = 2.0  # the longest run of equal values worth waiting for
 _TESTS = 4.0  # cumulative sums of each sensor
-_LOSS = 0.2  # part of the gain whose loss is looked for
 _STRIDE = 16.0
-_SPAN = 64  # samples between two states that are kept to go back to
-_GONE = 10.0  # values in succession that are missing or at a rail until a sensor is excluded
+_JUMPING = 0.3  # share of squared changes in squared residuals: a step 3 samples ago; 2 for white noise
 _MOST_EVENTS = 1000
 
 
-class SensorFusion:
-    """Kalman filter of several position sensors with detection and exclusion of faulty ones.
+_RULES = {
+    "gain": "finite and not 0",
+    "noise_sd": "positive",
+    "resolution": "at least 0",
+    "offset": "finite",
+    "offset_sd": "at least 0",
+    "drift_rate": "at least 0",
+    "warmth": "finite",
+}
 
-    **What cannot be seen.** If the position rises and all sensors' readings of it fall by the same, nothing changes:
-    the offset that all have in common (along `unobservable`) is known from calibration only (`offset_sd`) and from
-    then on grows as the sensors' drift allows. `sd` holds it; `relative_sd` is without it: of the position against the
-    mean of the working sensors' zeros. For a pair on opposite sides with equal `warmth` the shared temperature *is*
-    seen, in the sum of both, and its drift does not reach the position.
 
-    **Faults.** With three or more working sensors they are compared with each other alone, so that no shock to the
-    rotor accuses one: log-likelihood CUSUMs for a step, more noise and a loss of gain of each sensor, plus missing
-    values, rails and values that stand still. With two, the motion model takes part; where it does not decide, the
-    event says "one of", both are used, and the standard deviation covers either being right until they agree. One that
-    is alone is only excluded if it gives nothing, stands at a rail or stands still. A single value beyond 4 standard
-    deviations is not used. A fault that is slower than the sensor's drift is taken for drift.
-
-    **False alarms.** Each sum alarms in the mean no sooner than after e^h quiet samples; h follows from
-    `false_alarms_per_hour`. That needs noise that is white and no larger than stated; look at `levels`.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Sampling rate in Hz.
-    sensors : sequence of FusedSensor
-        Two or more, with distinct names.
-    motion : Motion
-        See `free_motion`, `levitated_motion`.
-    temperature_rate : float
-        The shared temperature walks: K/√s; used where a sensor has `warmth`.
-    false_alarms_per_hour : float
-        Of all sensors together, at most.
-    restore_s : float
-        Time for which an excluded sensor has to agree; doubled each time it fails soon again, up to 64 fold.
-    give : {"filtered", "instant"}
-        The filtered position, or that of each instant's values alone, less the offsets: noisier, and without any
-        dynamics of the filter. NaN with infinite standard deviation where no value of that instant can be used.
-
-    start_s : float
-        Time of the first sample, for events.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FusedSensor:
+    """One sensor; [u] is the unit of what it gives.
 
     Attributes
     ----------
-    names : tuple of str
-        Of the sensors.
-    n_samples, n_events : int
-        Taken in; events so far, of which the last 1000 are kept.
-
-    Raises
-    ------
-    EstimationError
-        If a setting does not fit.
+    name : str
+        Of its channel.
+    gain : float
+        [u]/m at the middle of its range; negative for one that looks from the other side.
+    noise_sd : float
+        Standard deviation of one value, [u], without rounding to `resolution`.
+    resolution : float
+        Smallest step of the values, [u]; 0 where they are continuous. A value that stands still is a fault only if
+        rounding does not explain it.
+    offset : float
+        What it gives at x = 0, [u].
+    offset_sd : float
+        What is not known of `offset` when fusion begins, [u].
+    drift_rate : float
+        The offset walks: standard deviation after one second, [u]/√s.
+    warmth : float
+        [u]/K: what a temperature that all sensors share adds. For drift of a pair that their sum shows.
+    limits : tuple of float
+        Rails, [u]: a value at or beyond one of them is no measurement.
     """
 
-    def __init__(
-        self,
-        rate_hz: float,
-        sensors: Sequence[FusedSensor],
-        *,
-        motion: Motion,
-        temperature_rate: float = 0.0,
-        false_alarms_per_hour: float = 0.1,
-        restore_s: float = 0.25,
-        give: Literal["filtered", "instant"] = "filtered",
-        start_s: float = 0.0,
-    ) -> None:
-        from ambid.recursive.fusion_kernels import fuse_scan
+    name: str
+    gain: float
+    noise_sd: float
+    resolution: float
+    offset: float = 0.0
+    offset_sd: float = 0.0
+    drift_rate: float = 0.0
+    warmth: float = 0.0
+    limits: tuple[float, float] = (-inf, inf)
 
-        check_channels("sensor fusion", rate_hz, len(sensors))
-        self.rate_hz, self.start_s, self.sensors, self.motion = rate_hz, start_s, tuple(sensors), motion
-        self.names = tuple(s.name for s in self.sensors)
-        _check(self.names, false_alarms_per_hour, restore_s, temperature_rate, give)
-        m, n, n_u = len(self.sensors), motion.state.A.shape[0], motion.state.B.shape[1]
-        warm = any(s.warmth for s in self.sensors) and temperature_rate > 0.0
-        self._n, self._m, self._n_u, self._first = n, m, n_u, n + warm  # first: row of the first offset
-        size = n + warm + m
-        quiet = rate_hz * 3600.0 / false_alarms_per_hour * m
-        self._table = sensor_table(self.sensors, rate_hz, quiet)
-        state = motion.state
-        self._model = np.concatenate([state.A.ravel(), state.B.ravel(), root_of(state.Q).ravel()])
-        self._settings = np.array(
-            [log(quiet * _TESTS), float(give == "instant"), max(1.0, restore_s * rate_hz),
-             n, rate_hz, _GONE, _LOSS, _SPAN, self._stride()]
-        )  # fmt: skip
-        self._memory = np.zeros((size + 1, size))
-        self._memory[size, :n] = motion.start
-        offsets = [max(abs(s.offset_sd / s.gain), 1e-6 * s.noise_sd / abs(s.gain)) ** 2 for s in self.sensors]
-        start_temperature = [max(temperature_rate**2 / rate_hz, 1e-12)] if warm else []
-        np.fill_diagonal(self._memory, [*motion.start_sd**2, *start_temperature, *offsets])
-        self._seen = np.zeros((m + 2, size))
-        self._seen[: m + 1, :n] = state.C[0]
-        self._seen[:m, n:] = np.hstack([self._table[:, 6:7], np.eye(m)]) if warm else np.eye(m)
-        walks = [*([temperature_rate**2 / rate_hz] if warm else []), *self._table[:, 5]]
-        self._walk = np.array(walks) * self._settings[8]
-        self._watch = np.zeros((m, 37))
-        self._watch[:, 1] = np.nan  # no value before the first
-        self._clock = np.zeros(10)
-        self._clock[3] = 1.0  # states to go back to begin with the first sample
-        self._ring = np.full((2 * _SPAN, 2 * m + n_u), np.nan)
-        self._kept = np.zeros((2, size + 1, size))
-        self._notes = np.zeros((2 * m + 2, 5))
-        self._scan = fuse_scan
-        self._none = np.empty((1, 0))
-        self._one = (np.empty((1, m)), np.empty((1, 2)))
-        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
-        self.n_events = 0
-
-    def update(self, measurement: ArrayLike, inputs: ArrayLike | None = None) -> Array:
-        """Take in one sample or a block; splitting a stream in another way changes no number.
-
-        Parameters
-        ----------
-        measurement : array_like, shape (n_sensors,), or (n_samples, n_sensors) for a block
-            Raw values in each sensor's unit. NaN where one is missing.
-        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), optional
-            Wanted where the motion has inputs: the current in A, held from each sample to the next.
-
-        Returns
-        -------
-        ndarray, shape (2,), or (n_samples, 2) for a block
-            Position and its standard deviation, m.
-
-        Raises
-        ------
-        EstimationError
-            If shapes do not fit, or an input is missing or not finite.
-        """
-        given = np.asarray(measurement, dtype=np.float64)
-        if given.ndim == 1 and given.size == self._m and inputs is None and self._n_u == 0:
-            y, out = self._one
-            y[0] = given
-            self._run(y, self._none, out)
-            return np.array(out[0])
-        y = as_block(given, self._m, "sensor fusion")
-        out = np.empty((y.shape[0], 2))
-        self._run(y, self._inputs(inputs, y.shape[0]), out)
-        return out[0] if given.ndim == 1 else out
-
-    def _stride(self) -> float:
-        """Samples in one step of the walking offsets: more than one where that is far below the noise."""
-        return _STRIDE if (self._table[:, 5] * _STRIDE <= 0.01 * self._table[:, 4]).all() else 1.0
-
-    def _run(self, y: Array, u: Array, out: Array) -> None:
-        done = 0
-        while done < y.shape[0]:
-            done = self._scan(
-                done, y, u, out, self._model, self._seen, self._walk, self._table, self._settings, self._memory,
-                self._watch, self._clock, self._ring, self._kept, self._notes,
-            )  # fmt: skip
-            for row in self._notes[: int(self._clock[6])]:
-                self._events.append(reason(row, self.sensors, self.working, self.rate_hz, self.start_s))
-                self.n_events += 1
-
-    @property
-    def n_samples(self) -> int:  # noqa: D102
-        return int(self._clock[0])
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """The last events: ``excluded``, ``restored`` and ``disturbed``, with time from `start_s` on."""
-        return tuple(self._events)
-
-    def take_events(self) -> tuple[Event, ...]:
-        """Return the events since the last call and forget them.
-
-        Returns
-        -------
-        tuple of Event
-        """
-        events = tuple(self._events)
-        self._events.clear()
-        return events
-
-    @property
-    def working(self) -> tuple[str, ...]:
-        """Names of the sensors that are used."""
-        return tuple(name for name, w in zip(self.names, self._watch, strict=True) if w[0] == 0.0)
-
-    @property
-    def doubtful(self) -> tuple[str, ...]:
-        """Names of the sensors one of which is at fault without it being known which."""
-        return tuple(name for name, w in zip(self.names, self._watch, strict=True) if w[32] > 0.0)
-
-    @property
-    def levels(self) -> Array:
-        """Root mean square of each sensor's residual against the others, shape (n_sensors,): 1 if its noise is right.
-
-        Since the first sample, while it was used; NaN before.
-        """
-        tested = np.where(self._watch[:, 30] > 0.0, self._watch[:, 30], np.nan)
-        return np.asarray(np.sqrt(self._watch[:, 31] / tested))
-
-    @property
-    def n_gated(self) -> Array:
-        """Single values of each working sensor that were not used because they did not fit, shape (n_sensors,)."""
-        return self._watch[:, 29].copy()
-
-    @property
-    def state(self) -> Array:
-        """Predicted state at the next sample: motion, temperature in K if modelled, offsets in m, shape (n_states,)."""
-        return np.asarray(self._memory[-1].copy())
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the error of `state`, shape (n_states, n_states)."""
-        return covariance_of(self._memory[:-1])
-
-    @property
-    def offsets(self) -> Array:
-        """How far each sensor's zero has walked and how sure that is, in its unit, shape (n_sensors, 2)."""
-        gains = np.array([s.gain for s in self.sensors])
-        sd = np.sqrt(np.diag(self.covariance)[self._first :]) * np.abs(gains)
-        return np.column_stack([self._memory[-1, self._first :] * gains, sd])
-
-    @property
-    def temperature(self) -> tuple[float, float]:
-        """Shared temperature since the start and its standard deviation, K; NaN where it is not modelled."""
-        if self._first == self._n:
-            return float("nan"), float("nan")
-        return float(self._memory[-1, self._n]), float(np.sqrt(self.covariance[self._n, self._n]))
-
-    @property
-    def unobservable(self) -> Array:
-        """Direction of the state that no sensor shows, shape (n_states,): the position up, all offsets down.
-
-        Without a motion that knows where the position is; with `levitated_motion` its slow force balances it.
-        """
-        c = self.motion.state.C[0]
-        out = np.zeros(self._memory.shape[1])
-        out[: self._n] = np.linalg.lstsq(np.vstack([self.motion.state.A - np.eye(self._n), c]), _last(self._n), None)[0]
-        out[self._first :] = -(c @ out[: self._n])
-        return out
-
-    @property
-    def relative_sd(self) -> float:
-        """Standard deviation of the next predicted position against the mean of the working sensors' zeros, m."""
-        h = np.zeros(self._memory.shape[1])
-        h[: self._n] = self.motion.state.C[0]
-        at_work = self._watch[:, 0] == 0.0
-        if at_work.any():
-            h[self._first :] = at_work / at_work.sum()
-            if self._first > self._n:
-                h[self._n] = float(self._table[at_work, 6].mean())
-        return float(np.sqrt(h @ self.covariance @ h))
-
-    def restore(self, name: str, *, offset_sd: float | None = None) -> None:
-        """Use a sensor again at once, as an operator may who has mended it.
-
-        Parameters
-        ----------
-        name : str
-        offset_sd : float, optional
-            What is not known of its zero now, in its unit, where it was moved; added to what was not known before.
-
-        Raises
-        ------
-        EstimationError
-            If there is no such sensor, or `offset_sd` is negative.
-        """
-        from ambid.recursive.fusion_watch_kernels import back
-
-        if name not in self.names or not (offset_sd is None or 0.0 <= offset_sd < np.inf):
-            raise EstimationError(
-                f"sensor fusion: restore({name!r}, offset_sd={offset_sd}); sensors are {', '.join(self.names)}, and "
-                "offset_sd is at least 0. Mend the call"
-            )
-        i = self.names.index(name)
-        P = self.covariance
-        P[self._first + i, self._first + i] += ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
-        self._memory[:-1] = factors_of(P)
-        back(i, self._watch, self._clock, self._notes)
-        self._events.append(
-            Event(
-                kind="restored",
-                t=self.start_s + self.n_samples / self.rate_hz,
-                why="ordered by the operator",
-                parameter=name,
-            )
-        )
-        self.n_events += 1
-
-    def copy(self) -> Self:
-        """Return an independent fusion in the same state.
-
-        Returns
-        -------
-        SensorFusion
-        """
-        other = copy(self)
-        for name in ("_memory", "_seen", "_watch", "_clock", "_ring", "_kept", "_notes"):
-            setattr(other, name, getattr(self, name).copy())
-        other._one = (self._one[0].copy(), self._one[1].copy())
-        other._events = self._events.copy()
-        return other
-
-    def _inputs(self, inputs: ArrayLike | None, n: int) -> Array:
-        given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
-        if given.size != n * self._n_u or not np.isfinite(given).all():
-            raise EstimationError(
-                f"sensor fusion: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are wanted. "
-                "Give all of them, or fuse with free_motion, which needs none"
-            )
-        return np.ascontiguousarray(given.reshape(n, self._n_u))
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sensor."""
+        for name, rule in _RULES.items():
+            value = getattr(self, name)
+            wrong = value <= 0.0 if rule == "positive" else value < 0.0 if rule == "at least 0" else False
+            if not isfinite(value) or wrong or (name == "gain" and value == 0.0):
+                raise EstimationError(f"sensor {self.name!r}: {name} is {value}; it must be {rule}. Mend it")
+        if not (len(self.limits) == 2 and self.limits[0] < self.limits[1]):
+            raise EstimationError(f"sensor {self.name!r}: limits {self.limits}; give (low, high) with low < high")
 
 
-def _last(n: int) -> Array:
-    out = np.zeros(n + 1)
-    out[n] = 1.0
-    return out
+def still_samples(sensor: FusedSensor, rate_hz: float, quiet_samples: float) -> float:
+    """Return how many values have to equal the one before them until that is a fault.
 
+    A sound sensor at rest gives the same step again with probability p of at most erf(step/(2 √2 noise)), wherever in
+    the step it stands; p^n is brought below one in `quiet_samples`.
 
-def _check(names: tuple[str, ...], alarms: float, restore_s: float, temperature_rate: float, give: str) -> None:
-    if len(names) < 2 or len(set(names)) < len(names):
-        raise EstimationError(
-            f"sensor fusion: sensors {names}; it wants two or more with distinct names. Mend the list"
-        )
-    if not (0.0 < alarms < np.inf and isfinite(restore_s) and restore_s > 0.0 and 0.0 <= temperature_rate < np.inf):
-        raise EstimationError(
-            f"sensor fusion: false_alarms_per_hour {alarms}, restore_s {restore_s}, temperature_rate "
-            f"{temperature_rate}; the first two must be positive, the last at least 0. Mend them"
-        )
-    if give not in ("filtered", "instant"):
-        raise EstimationError(f"sensor fusion: give {give!r}; it is 'filtered' or 'instant'. Choose one of them")
+    Returns 0 where the steps are so coarse that standing still says nothing within two seconds.
+    """
+    if sensor.resolution == 0.0:
+        return _CONTINUOUS
+    p = erf(sensor.resolution / (2.0 * sqrt(2.0) * sensor.noise_sd))
+    if p >= 1.0:
+        return 0.0
+    n = np.ceil(max(_CONTINUOUS, log(quiet_samples) / -log(p)))
+    return float(n) if n <= _SECONDS * rate_hz else 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -365,7 +116,7 @@ class Motion:
     Attributes
     ----------
     state : LinearState
-        Its one output is the position in m; R is not used. Inputs, if any, are measured signals.
+        Its one output is the position in m; R is not used, and it has no inputs.
     start : ndarray, shape (n_states,)
     start_sd : ndarray, shape (n_states,)
         All positive.
@@ -379,8 +130,11 @@ class Motion:
         """Refuse what fusion cannot start from."""
         n = self.state.A.shape[0]
         start, sd = np.array(self.start, dtype=np.float64), np.array(self.start_sd, dtype=np.float64)
-        if self.state.C.shape[0] != 1:
-            raise EstimationError(f"motion: {self.state.C.shape[0]} outputs; fusion wants one, the position. Give one")
+        outputs, inputs = self.state.C.shape[0], self.state.B.shape[1]
+        if outputs != 1 or inputs:
+            raise EstimationError(
+                f"motion: {outputs} outputs and {inputs} inputs; fusion wants one output, the position, and no input"
+            )
         if start.shape != (n,) or sd.shape != (n,) or not (np.isfinite(start).all() and np.isfinite(sd).all()):
             raise EstimationError(
                 f"motion: start and start_sd must be {n} finite numbers each. Give one for each state"
@@ -419,62 +173,416 @@ def free_motion(
     return Motion(state=state, start=np.asarray(start), start_sd=np.asarray(start_sd))
 
 
-def levitated_motion(
-    rate_hz: float,
-    *,
-    m: float,
-    k_i: float,
-    k_x: float,
-    c: float = 0.0,
-    force: float,
-    force_walk: float,
-    start_sd: ArrayLike = (1e-3, 1.0, 100.0),
-    start: ArrayLike = (0.0, 0.0, 0.0),
-) -> Motion:
-    """Return the bench's own motion with the measured current as input, exactly sampled (held from sample to sample).
+class SensorFusion:
+    """Kalman filter of several position sensors with detection and exclusion of faulty ones.
 
-    The third state is a slow force per mass, m/s²: gravity, the bias of the current, a load. Without it the model
-    would take the offset that all sensors share for an unbalanced force.
+    **What cannot be seen.** If the position rises and all sensors' readings of it fall by the same, nothing changes:
+    the offset that all have in common (along `unobservable`) is known from calibration only (`offset_sd`) and from
+    then on grows as the sensors' drift allows. `sd` holds it; `relative_sd` is without it: of the position against the
+    mean of the working sensors' zeros. For a pair on opposite sides with equal `warmth` the shared temperature *is*
+    seen, in the sum of both, and its drift does not reach the position.
+
+    **Faults.** With three or more working sensors they are compared with each other alone, so that no shock to the
+    rotor accuses one: log-likelihood CUSUMs for a step, more noise and a loss of gain of each sensor, plus missing
+    values, rails and values that stand still. With two, the motion model takes part; where it does not decide, the
+    event says "one of", both are used, and the standard deviation covers either being right until they agree. One that
+    is alone is only excluded if it gives nothing, stands at a rail or stands still. A single value beyond 4 standard
+    deviations is not used. A fault that is slower than the sensor's drift is taken for drift.
+
+    **False alarms.** Each sum alarms in the mean no sooner than after e^h quiet samples; h follows from
+    `false_alarms_per_hour`. That needs noise that is white and no larger than stated; look at `levels`.
 
     Parameters
     ----------
     rate_hz : float
         Sampling rate in Hz.
-    m, k_i, k_x, c : float
-        Mass kg, N/A, N/m (negative for an attracting magnet), N s/m.
-    force : float
-        Density of the white force that the model does not know, N/√Hz (two-sided), from inaccurate parameters too.
-    force_walk : float
-        The slow force walks: standard deviation after one second, N/√s; over 0.
-    start_sd, start : array_like, shape (3,)
-        In m, m/s, m/s².
+    sensors : sequence of FusedSensor
+        Two or more, with distinct names.
+    motion : Motion
+        See `free_motion`.
+    temperature_rate : float
+        The shared temperature walks: K/√s; used where a sensor has `warmth`.
+    false_alarms_per_hour : float
+        Of all sensors together, at most.
+    restore_s : float
+        Time for which an excluded sensor has to agree; doubled each time it fails soon again, up to 64 fold.
+    give : {"filtered", "instant"}
+        The filtered position, or that of each instant's values alone, less the offsets: noisier, and without any
+        dynamics of the filter. NaN with infinite standard deviation where no value of that instant can be used.
 
-    Returns
-    -------
-    Motion
+    start_s : float
+        Time of the first sample, for events.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the sensors.
+    n_samples, n_events : int
+        Taken in; events so far, of which the last 1000 are kept.
 
     Raises
     ------
     EstimationError
-        If a number is not finite, or mass or noise not positive.
+        If a setting does not fit.
     """
-    numbers = np.array([rate_hz, m, k_i, k_x, c, force, force_walk])
-    if not (np.isfinite(numbers).all() and min(rate_hz, m, force, force_walk) > 0.0):
+
+    def __init__(
+        self,
+        rate_hz: float,
+        sensors: Sequence[FusedSensor],
+        *,
+        motion: Motion,
+        temperature_rate: float = 0.0,
+        false_alarms_per_hour: float = 0.1,
+        restore_s: float = 0.25,
+        give: Literal["filtered", "instant"] = "filtered",
+        start_s: float = 0.0,
+    ) -> None:
+        check_channels("sensor fusion", rate_hz, len(sensors))
+        self.rate_hz, self.start_s, self.sensors, self.motion = rate_hz, start_s, tuple(sensors), motion
+        self.names = tuple(s.name for s in self.sensors)
+        _check(self.names, false_alarms_per_hour, restore_s, temperature_rate, give)
+        at, m, n = self._at, len(self.sensors), motion.state.A.shape[0]
+        warm = any(s.warmth for s in self.sensors) and temperature_rate > 0.0
+        self._n, self._m, self._first = n, m, n + warm  # first: row of the first offset
+        size = n + warm + m
+        gain, noise, step, drift, offset, warmth = np.array(
+            [(s.gain, s.noise_sd, s.resolution, s.drift_rate, s.offset_sd, s.warmth) for s in self.sensors]
+        ).T
+        variance = (noise**2 + step**2 / 12.0) / gain**2
+        quiet = rate_hz * 3600.0 / false_alarms_per_hour * m
+        still = [still_samples(s, rate_hz, quiet) for s in self.sensors]
+        rails = np.array([s.limits for s in self.sensors]).T
+        self._table = np.column_stack([1.0 / gain, [s.offset for s in self.sensors], variance, *rails, still])
+        walks = np.append(np.full(int(warm), temperature_rate**2), (drift / gain) ** 2) / rate_hz
+        # the walking offsets go in steps of several samples where they are far below the noise
+        stride = _STRIDE if (walks[-m:] * _STRIDE <= 0.01 * variance).all() else 1.0
+        self._walk = walks * stride
+        self._settings = np.array([log(quiet * _TESTS), give == "instant", max(1.0, restore_s * rate_hz), stride])
+        self._A, self._G = np.ascontiguousarray(motion.state.A), np.ascontiguousarray(root_of(motion.state.Q))
+        offsets = np.maximum(np.abs(offset / gain), 1e-6 * noise / np.abs(gain)) ** 2
+        begin = np.full(int(warm), max(temperature_rate**2 / rate_hz, 1e-12))
+        self._memory = np.zeros((size + 1, size))
+        self._memory[size, :n] = motion.start
+        np.fill_diagonal(self._memory, [*motion.start_sd**2, *begin, *offsets])
+        self._H = np.zeros((m + 2, size))
+        self._H[: m + 1, :n] = motion.state.C[0]
+        self._H[:m, n:] = np.hstack([(warmth / gain)[:, None], np.eye(m)]) if warm else np.eye(m)
+        self._watch, self._clock = np.zeros((m, at.COLUMNS)), np.zeros(10)
+        self._watch[:, at.LAST] = np.nan  # no value before the first
+        self._clock[at.FRESH] = 1.0  # states to go back to begin with the first sample
+        self._ring, self._kept = np.full((2 * at.SPAN, m), np.nan), np.zeros((2, size + 1, size))
+        self._now, self._one = np.zeros((5 + m, m)), (np.empty((1, m)), np.empty((1, 2)))
+        self._held = 0.0  # sample until which a disturbance is not told again
+        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self.n_events = 0
+
+    @property
+    def _at(self) -> Any:
+        """The compiled loops, which also know where the numbers lie."""
+        return kernels("fusion")
+
+    def update(self, measurement: ArrayLike) -> Array:
+        """Take in one sample or a block; splitting a stream in another way changes no number.
+
+        Parameters
+        ----------
+        measurement : array_like, shape (n_sensors,), or (n_samples, n_sensors) for a block
+            Raw values in each sensor's unit. NaN where one is missing.
+
+        Returns
+        -------
+        ndarray, shape (2,), or (n_samples, 2) for a block
+            Position and its standard deviation, m.
+
+        Raises
+        ------
+        EstimationError
+            If shapes do not fit.
+        """
+        given = np.asarray(measurement, dtype=np.float64)
+        if given.ndim == 1 and given.size == self._m:
+            y, out = self._one
+            y[0] = given
+            self._run(y, out)
+            return np.array(out[0])
+        y = as_block(given, self._m, "sensor fusion")
+        out = np.empty((y.shape[0], 2))
+        self._run(y, out)
+        return out[0] if given.ndim == 1 else out
+
+    def _run(self, y: Array, out: Array) -> None:
+        """Run the compiled scan, and decide where it stops."""
+        at, clock, done = self._at, self._clock, 0
+        while done < y.shape[0]:
+            done = at.fuse_scan(
+                done, y, out, self._A, self._G, self._H, self._walk, self._table, self._settings, self._memory,
+                self._watch, clock, self._ring, self._kept, self._now,
+            )  # fmt: skip
+            stage = clock.item(at.STAGE)
+            if stage == at.TEST:
+                self._test_alone()
+            elif stage == at.TAKE:
+                self._judge()
+            elif stage == at.RETURN:
+                self._take_back()
+
+    def _test_alone(self) -> None:
+        """Exclude sensors that give nothing, stand at a rail or stand still."""
+        at, watch, now = self._at, self._watch, self.n_samples
+        found: list[tuple[int, float, str, str, dict[str, float]]] = []
+        for i in map(int, np.flatnonzero(watch[:, at.OUT] == 0.0)):
+            gone, railed, same = watch[i, [at.GONE, at.RAILED, at.SAME]]
+            value = {"value": float(watch[i, at.LAST])}
+            if gone >= at.GONE_N:
+                found.append((i, now - gone + 1.0, "its values are missing", "missing", {}))
+            elif railed >= at.GONE_N:
+                found.append((i, now - railed + 1.0, f"at its rail, {value['value']:.4g}", "rail", value))
+            elif same >= self._table[i, at.STUCK] > 0.0:
+                found.append((i, now - same, f"stands still at {value['value']:.4g}", "stuck", value))
+        for i, onset, *_ in found:
+            self._exclude(i, onset)
+        for i, onset, why, cause, values in found:
+            self._tell("excluded", onset, why + self._left(), cause, self.names[i], **values)
+
+    def _judge(self) -> None:
+        """Exclude the sensor that an alarm points at, or say that one of several is at fault, or that the rotor is."""
+        at, watch, clock, high = self._at, self._watch, self._clock, self._settings[0]
+        now, used = self.n_samples, watch[:, at.OUT] == 0.0
+        apart, disputed = used.sum() > 2, clock[at.DISPUTED] > 0.0
+        sums = watch[:, at.UP : at.LOSS + 1]
+        alarm = sums.max(axis=1)
+        points = np.where(used, np.maximum(alarm, watch[:, at.EVIDENCE]), -inf)
+        worst = int(np.argmax(np.where(alarm > high, points, -inf)))
+        most, second = points[worst], max(0.0, *np.delete(points, worst))
+        onset, shift = watch[worst, at.UP_0 + np.argmax(sums[worst])], float(watch[worst, at.MEAN_R])
+        moved = clock[at.COMPARED] < 2.0 or (not apart and clock[at.COMMON] > most - at.MARGIN)
+        # of two sensors the motion can only name one that jumps: a slow difference draws the filter after it first
+        shown = apart or watch[worst, at.JUMPS] > _JUMPING * watch[worst, at.SUM_TT]
+        if not (disputed or moved) and shown and second < most - at.MARGIN * (1.0 if apart else 2.0):
+            x = float(self._H[self._m] @ self._memory[-1])
+            cause, why, values = self._looks(worst, shift, x)
+            self._exclude(worst, onset)
+            self._tell("excluded", onset, why + self._left(), cause, self.names[worst], **values)
+            return
+        if apart and most < 3.0 * high:
+            return
+        if now >= self._held and (moved or not disputed):
+            both = self.working
+            if moved:
+                why = (
+                    f"the rotor moved as the motion model does not allow, or {' and '.join(both)} are at fault together"
+                )
+            else:
+                why = f"one of {', '.join(both)} is at fault, which cannot be told: both are used, sd covers either"
+            self._tell("disturbed", onset, why, "motion" if moved else "one_of", shift=shift)
+            self._held = now + self.rate_hz
+        if not (moved or disputed):
+            clock[at.DISPUTED], clock[at.AGREED] = 1.0, 0.0
+            able = used & (points >= most - 3.0 * at.MARGIN)  # those that could have done it
+            watch[able, at.DOUBT], watch[able, at.BETWEEN] = 1.0, watch[able, at.SQUARE_R]
+            watch[:, at.ZERO] = self._H[: self._m, self._n :] @ self._kept[0, -1, self._n :]
+        self._begin_tests(now)
+
+    def _looks(self, i: int, shift: float, x: float) -> tuple[str, str, dict[str, float]]:
+        """Return what says most of the sums that are near the highest: a name, words and numbers."""
+        at, w = self._at, self._watch[i]
+        step = max(w[at.UP], w[at.DOWN])
+        cause = "noise"
+        if w[at.LOSS] >= max(step, w[at.LOUD]):
+            cause = "gain"
+        elif step >= w[at.LOUD] or abs(w[at.SUM_T]) > 0.9 * w[at.SUM_ABS]:
+            cause = "step"
+        if cause == "noise":
+            return cause, "noisier than it should be", {}
+        words = "it stepped" if cause == "step" else "its gain fell"
+        why = f"{words}: {shift * 1e6:+.3g} um off the others at {x * 1e6:.3g} um"
+        return cause, why, {"shift": shift, "position": x}
+
+    def _exclude(self, i: int, onset: float) -> None:
+        """Leave sensor i out, from its fault on as far as the filter can go back.
+
+        The sooner after its return, the longer it has to agree before the next.
+        """
+        at, w, clock, now = self._at, self._watch[i], self._clock, self.n_samples
+        again = w[at.NEED] > 0.0 and now - w[at.SINCE] < 10.0 * w[at.NEED]
+        need = self._settings[at.RESTORE_N]
+        w[at.NEED] = min(2.0 * w[at.NEED], 64.0 * need) if again else need
+        w[at.OUT], w[at.SINCE], w[at.DOUBT], w[at.COUNT : at.XX + 1] = 1.0, now, 0.0, 0.0
+        self._now[at.USED, i] = min(self._now[at.USED, i], 0.0)
+        self._begin_tests(now)
+        late = int(clock[at.NEW] <= onset)
+        self._memory[:] = self._kept[late]
+        n, size = self._n, self._memory.shape[1]
+        M, b, f = np.empty((n, 2 * n)), np.empty(max(2 * n, size)), np.empty(size)
+        out = self._watch[:, at.OUT] > 0.0
+        for k in range(int(clock[at.NEW if late else at.OLD]), now):
+            z = np.where(out, np.nan, self._ring[k % len(self._ring)])
+            at.absorb(z, self._table, self._memory, self._H, f, b)
+            at.advance(self._memory, self._A, self._G, self._walk, int(self._settings[at.STRIDE]), k, M, b)
+        clock[at.FRESH] = 1.0
+
+    def _take_back(self) -> None:
+        """Use the sensors again that have agreed long enough, and end a doubt when all do."""
+        at, watch, clock, now = self._at, self._watch, self._clock, self.n_samples - 1
+        clock[at.STAGE] = at.READ
+        for i in map(int, np.flatnonzero(watch[:, at.BACK])):
+            out_s = (now - watch[i, at.SINCE]) / self.rate_hz
+            self._restore(i, now)
+            why = f"agrees with the others again, after {out_s:.3g} s"
+            self._tell("restored", now, why, "restored", self.names[i], out_s=out_s)
+        need = self._settings[at.RESTORE_N]
+        if clock[at.DISPUTED] > 0.0 and clock[at.AGREED] >= need:
+            watch[:, at.DOUBT] = clock[at.DISPUTED] = 0.0
+            why = f"{', '.join(self.working)} agree again, for {need / self.rate_hz:.3g} s"
+            self._tell("restored", now, why, "agreement")
+
+    def _restore(self, i: int, now: int) -> None:
+        at, watch, clock = self._at, self._watch, self._clock
+        watch[i, at.OUT], watch[i, at.BACK], watch[i, at.SINCE] = 0.0, 0.0, now
+        self._begin_tests(now)
+        if (watch[:, at.OUT] == 0.0).sum() > 2:
+            watch[:, at.DOUBT] = clock[at.DISPUTED] = 0.0
+        clock[at.FRESH] = 1.0
+
+    def _begin_tests(self, now: int) -> None:
+        """Begin the tests of all sensors anew."""
+        at = self._at
+        self._watch[:, at.UP : at.EVIDENCE + 1] = 0.0
+        self._watch[:, at.UP_0 : at.LOSS_0 + 1] = now
+        self._watch[:, at.SUM_T : at.JUMPS + 1] = 0.0
+        self._clock[at.COMMON] = 0.0
+
+    def _left(self) -> str:
+        if not self.working:
+            return "; no sensor is left, the position is predicted only"
+        return f"; left: {', '.join(self.working)}"
+
+    def _tell(
+        self, kind: EventKind, sample: float, why: str, cause: str, who: str | None = None, **values: float
+    ) -> None:
+        t = self.start_s + sample / self.rate_hz
+        named = {f"cause_{cause}": 1.0, **values} if cause else values
+        self._events.append(Event(kind=kind, t=t, why=why, parameter=who, values=named))
+        self.n_events += 1
+
+    def _named(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
+        return tuple(name for name, this in zip(self.names, which, strict=True) if this)
+
+    @property
+    def n_samples(self) -> int:  # noqa: D102
+        return int(self._clock[self._at.NOW])
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """The last events: ``excluded``, ``restored`` and ``disturbed``, with time from `start_s` on."""
+        return tuple(self._events)
+
+    @property
+    def working(self) -> tuple[str, ...]:
+        """Names of the sensors that are used."""
+        return self._named(self._watch[:, self._at.OUT] == 0.0)
+
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """Names of the sensors one of which is at fault without it being known which."""
+        return self._named(self._watch[:, self._at.DOUBT] > 0.0)
+
+    @property
+    def levels(self) -> Array:
+        """Root mean square of each sensor's residual against the others, shape (n_sensors,): 1 if its noise is right.
+
+        Since the first sample, while it was used; NaN before.
+        """
+        tested, squares = self._watch[:, self._at.TESTED], self._watch[:, self._at.SQUARES]
+        return np.sqrt(squares / np.where(tested > 0.0, tested, np.nan))
+
+    @property
+    def n_gated(self) -> Array:
+        """Single values of each working sensor that were not used because they did not fit, shape (n_sensors,)."""
+        return self._watch[:, self._at.GATED].copy()
+
+    @property
+    def state(self) -> Array:
+        """Predicted state at the next sample: motion, temperature in K if modelled, offsets in m, shape (n_states,)."""
+        return np.array(self._memory[-1])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the error of `state`, shape (n_states, n_states)."""
+        return covariance_of(self._memory[:-1])
+
+    @property
+    def offsets(self) -> Array:
+        """How far each sensor's zero has walked and how sure that is, in its unit, shape (n_sensors, 2)."""
+        gains = np.array([s.gain for s in self.sensors])
+        sd = np.sqrt(np.diag(self.covariance)[self._first :]) * np.abs(gains)
+        return np.column_stack([self._memory[-1, self._first :] * gains, sd])
+
+    @property
+    def temperature(self) -> tuple[float, float]:
+        """Shared temperature since the start and its standard deviation, K; NaN where it is not modelled."""
+        if self._first == self._n:
+            return float("nan"), float("nan")
+        return float(self._memory[-1, self._n]), float(np.sqrt(self.covariance[self._n, self._n]))
+
+    @property
+    def relative_sd(self) -> float:
+        """Standard deviation of the next predicted position against the mean of the working sensors' zeros, m."""
+        h = np.zeros(self._memory.shape[1])
+        h[: self._n] = self.motion.state.C[0]
+        at_work = self._watch[:, self._at.OUT] == 0.0
+        if at_work.any():
+            h[self._first :] = at_work / at_work.sum()
+            if self._first > self._n:
+                h[self._n] = float(self._H[: self._m, self._n][at_work].mean())
+        return float(np.sqrt(h @ self.covariance @ h))
+
+    def restore(self, name: str, *, offset_sd: float | None = None) -> None:
+        """Use a sensor again at once, as an operator may who has mended it.
+
+        Parameters
+        ----------
+        name : str
+        offset_sd : float, optional
+            What is not known of its zero now, in its unit, where it was moved; added to what was not known before.
+
+        Raises
+        ------
+        EstimationError
+            If there is no such sensor, or `offset_sd` is negative.
+        """
+        if name not in self.names or not (offset_sd is None or 0.0 <= offset_sd < np.inf):
+            raise EstimationError(
+                f"sensor fusion: restore({name!r}, offset_sd={offset_sd}); sensors are {', '.join(self.names)}, and "
+                "offset_sd is at least 0. Mend the call"
+            )
+        i = self.names.index(name)
+        P = self.covariance
+        P[self._first + i, self._first + i] += ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
+        self._memory[:-1] = factors_of(P)
+        self._restore(i, self.n_samples)
+        self._tell("restored", self.n_samples, "ordered by the operator", "", name)
+
+    def copy(self) -> Self:
+        """Return an independent fusion in the same state.
+
+        Returns
+        -------
+        SensorFusion
+        """
+        return deepcopy(self)
+
+
+def _check(names: tuple[str, ...], alarms: float, restore_s: float, temperature_rate: float, give: str) -> None:
+    if len(names) < 2 or len(set(names)) < len(names):
         raise EstimationError(
-            "levitated motion: rate, m, force and force_walk must be positive, k_i, k_x and c finite. Mend them"
+            f"sensor fusion: sensors {names}; it wants two or more with distinct names. Mend the list"
         )
-    F = np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, 1.0], [0.0, 0.0, 0.0]])
-    A, B, Q = _sampled(F, np.array([[0.0], [k_i / m], [0.0]]), np.diag([0.0, force**2, force_walk**2]) / m**2, rate_hz)
-    state = linear_state(A, [[1.0, 0.0, 0.0]], Q, [[1.0]], B=B)
-    return Motion(state=state, start=np.asarray(start), start_sd=np.asarray(start_sd))
-
-
-def _sampled(F: Array, G: Array, intensity: Array, rate_hz: float) -> tuple[Array, Array, Array]:
-    """Exact step, held input and noise covariance (Van Loan 1978)."""
-    from scipy.linalg import expm
-
-    n = F.shape[0]
-    A, B = zero_order_hold(F, G, 1.0 / rate_hz)
-    both = expm(np.block([[-F, intensity], [np.zeros((n, n)), F.T]]) / rate_hz)
-    Q = A @ both[:n, n:]
-    return A, B, (Q + Q.T) / 2.0
+    if not (0.0 < alarms < np.inf and isfinite(restore_s) and restore_s > 0.0 and 0.0 <= temperature_rate < np.inf):
+        raise EstimationError(
+            f"sensor fusion: false_alarms_per_hour {alarms}, restore_s {restore_s}, temperature_rate "
+            f"{temperature_rate}; the first two must be positive, the last at least 0. Mend them"
+        )
+    if give not in ("filtered", "instant"):
+        raise EstimationError(f"sensor fusion: give {give!r}; it is 'filtered' or 'instant'. Choose one of them")

@@ -1,25 +1,52 @@
-"""Compiled fusion of position sensors: a Kalman filter with tests of every sensor against the others.
+"""Compiled fusion of position sensors: a Kalman filter, and tests of every sensor against the others.
 
 The state is [motion, temperature (if modelled), one offset of each sensor]; `memory` (n + 1, n) holds the factors of
 its covariance and, in the last row, its mean. Offsets come last, so that moving the motion one sample on leaves their
-part of the factors alone.
+part of the factors alone. What happens seldom is decided in `ambid.recursive.fusion`: the scan stops where a decision
+is due, and goes on from there.
 """
 
 from __future__ import annotations
 
-from math import inf, isfinite, nan, sqrt
+from math import inf, isfinite, log, nan, sqrt
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive import fusion_watch_kernels as watching
-from ambid.recursive.fusion_watch_kernels import GATED_OUT, LOOKED_AT, NEW, NOW, OLD, OUT
 from ambid.recursive.square_root_kernels import project, propagate, shrink, size, widen
+
+# columns of `sensors`
+PER_GAIN, OFFSET, NOISE, LOW, HIGH, STUCK = range(6)
+# columns of `watch`, a row for each sensor
+OUT, LAST, SAME, GONE, RAILED, UP, DOWN, LOUD, LOSS, EVIDENCE, UP_0, DOWN_0, LOUD_0, LOSS_0 = range(14)
+SUM_T, SUM_ABS, SUM_TT, JUMPS, LAST_T, MEAN_R, SQUARE_R, NEED, SINCE, BACK = range(14, 24)
+COUNT, R, RR, RX, X, XX, GATED, TESTED, SQUARES, DOUBT, WAS_OUT, ZERO, BETWEEN, COLUMNS = range(24, 38)
+# rows of `now`, the sample in work: displacement, whether it is used, innovation, residual against the others over its
+# standard deviation, and one over that; then come the rows of the innovations' covariance
+Z, USED, E, T, PER, S_0 = range(6)
+# entries of `settings` and of `clock`
+HEIGHT, INSTANT, RESTORE_N, STRIDE = range(4)
+NOW, OLD, NEW, FRESH, COMMON, COMPARED, DISPUTED, STREAK, AGREED, STAGE = range(10)
+# what is to be done of the sample in work
+READ, TEST, TAKE, RETURN = range(4)
+# what `USED` says of a value beside 1 (used) and 0 (none): of an excluded sensor, and of one that does not fit
+LOOKED_AT, GATED_OUT = -1.0, -2.0
+
+SPAN = 64  # samples between two states that are kept to go back to
+GONE_N = 10.0  # values in succession that are missing or at a rail until a sensor is excluded
+MARGIN = 7.0  # log odds (1000 to 1) by which a fault has to be more likely than the next explanation
+_LOSS_PART = 0.2  # part of the gain whose loss is looked for
+_GATE = 4.0  # standard deviations beyond which a single value is not used
+_CLIP = 5.0  # the most that one value weighs in the tests, so that a glitch is no fault
+_CLEAR = 6.0  # difference of squared residuals beyond which a single value is told from another
+_LN2 = log(2.0)
+_SOON = 20.0  # samples after which the first of several lost sensors is used again
+_SLOW = 1.0 / 16.0  # weight of the newest residual in its running mean
 
 
 @compiled(fastmath={"contract"})
-def _row(memory: Array, H: Array, i: int, f: Array) -> float:
+def _see(memory: Array, H: Array, i: int, f: Array) -> float:
     """Fill f with Uᵀ h, h being row i of H, and return h · mean."""
     n, mean = memory.shape[1], 0.0
     for j in range(n):
@@ -29,19 +56,19 @@ def _row(memory: Array, H: Array, i: int, f: Array) -> float:
 
 
 @compiled(fastmath={"contract"})
-def _absorb(memory: Array, f: Array, b: Array, e: float, r: float) -> None:
-    """Take in one innovation e of noise variance r that sees f = Uᵀ h."""
+def absorb(z: Array, sensors: Array, memory: Array, H: Array, f: Array, b: Array) -> None:
+    """Take in the displacements of one instant, NaN where there is none."""
     n = memory.shape[1]
-    gain = e / shrink(memory, f, r, b)
-    for j in range(n):
-        memory[n, j] += gain * b[j]
+    for i in range(z.size):
+        if isfinite(z[i]):
+            e = z[i] - _see(memory, H, i, f)
+            gain = e / shrink(memory, f, sensors[i, NOISE], b)
+            for j in range(n):
+                memory[n, j] += gain * b[j]
 
 
 @compiled(fastmath={"contract"})
-def _advance(
-    memory: Array, A: Array, B: Array, G: Array, walk: Array, stride: int, now: int, u: Array, k: int, column: int,
-    W: Array, w: Array,
-) -> None:  # fmt: skip
+def advance(memory: Array, A: Array, G: Array, walk: Array, stride: int, now: int, W: Array, w: Array) -> None:
     """Move mean and covariance one sample on.
 
     `walk` (n_states - n,) is what temperature and offsets walk in `stride` samples, and they do so in such steps.
@@ -51,160 +78,306 @@ def _advance(
         x = 0.0
         for a in range(n):
             x += A[i, a] * memory[last, a]
-        for a in range(B.shape[1]):
-            x += B[i, a] * u[k, column + a]
         w[i] = x
-    memory[last, :n] = w[:n]
+    for i in range(n):
+        memory[last, i] = w[i]
     propagate(memory[:last], A, np.empty((n, 0)), G, W, w)
     if now % stride == 0:
-        for i in range(last - n):
-            if walk[i] > 0.0:
-                w[: n + i] = 0.0
-                w[n + i] = 1.0
-                widen(memory, w[: n + i + 1], walk[i])
+        for i in range(n, last):
+            if walk[i - n] > 0.0:
+                for j in range(i):
+                    w[j] = 0.0
+                w[i] = 1.0
+                widen(memory, w[: i + 1], walk[i - n])
+
+
+@compiled(fastmath={"contract"})
+def _compare(now: Array, W: Array, apart: bool) -> tuple[float, int]:
+    """Find each used sensor's residual against the others, over its standard deviation 1/per.
+
+    t = (W e)/√diag W, W = S⁻¹ (Basseville and Nikiforov 1993, sec. 7.2). With `apart`, what all have in common is
+    taken off first: W = S⁻¹ - S⁻¹ 1 1ᵀ S⁻¹/(1ᵀ S⁻¹ 1), and no motion of the rotor enters. Also the squared residual
+    of all together, and how many were compared. `W` becomes -S⁻¹ of those that are used.
+    """
+    used, e, t, per, S = now[USED], now[E], now[T], now[PER], now[S_0:]
+    m, count = e.size, 0
+    for i in range(m):
+        for j in range(m):
+            W[i, j] = S[i, j] if used[i] > 0.0 and used[j] > 0.0 else 0.0
+    for k in range(m):  # sweep
+        if used[k] <= 0.0:
+            continue
+        count += 1
+        part = 1.0 / W[k, k]
+        for i in range(m):
+            if i != k and used[i] > 0.0:
+                along = W[i, k] * part
+                for j in range(m):
+                    if j != k:
+                        W[i, j] -= along * W[k, j]
+        for i in range(m):
+            if i != k:
+                W[i, k] *= part
+                W[k, i] *= part
+        W[k, k] = -part
+    total = common = 0.0
+    for i in range(m):
+        if used[i] > 0.0:
+            row = dot = 0.0
+            for j in range(m):
+                if used[j] > 0.0:
+                    row -= W[i, j]
+                    dot -= W[i, j] * e[j]
+            per[i], t[i] = row, dot
+            total += row
+            common += dot
+    for i in range(m):
+        if used[i] > 0.0:
+            own = -W[i, i] - (per[i] * per[i] / total if apart else 0.0)
+            dot = t[i] - (per[i] * common / total if apart else 0.0)
+            sure = own > 1e-12 * -W[i, i]  # the only one has nothing to be compared with
+            per[i] = sqrt(own) if sure else 0.0
+            t[i] = dot / per[i] if sure else 0.0
+    return (common * common / total if count else 0.0), count
+
+
+@compiled(fastmath={"contract"})
+def _gate(now: Array, W: Array, watch: Array, clock: Array, apart: bool) -> int:
+    """Leave out values that do not fit the others; where it cannot be told which, both of them."""
+    used, t = now[USED], now[T]
+    m, clear = t.size, _CLEAR if apart else 2.0 * MARGIN
+    common, count = _compare(now, W, apart)
+    tested = count
+    if not apart and count > 0:
+        clock[COMMON] = max(0.0, clock[COMMON] + 0.375 * common - _LN2)
+    tied = False
+    while count > 1:
+        worst, best, second = -1, _GATE * _GATE, 0.0
+        for i in range(m):
+            if used[i] > 0.0 and t[i] * t[i] > best:
+                worst, best = i, t[i] * t[i]
+        if worst < 0 or (not apart and common > best - clear):
+            break
+        new = abs(t[worst] - watch[worst, LAST_T]) > _GATE or watch[worst, WAS_OUT] > 0.0
+        if not (apart or new):  # what grew slowly has drawn the filter after it: which of the two is wrong is not seen
+            break
+        for i in range(m):
+            if used[i] > 0.0 and i != worst:
+                second = max(second, t[i] * t[i])
+        tied = second > best - clear
+        if tied and clock[STREAK] >= 2.0:  # no glitch any more: without them all the filter would go astray
+            break
+        for i in range(m):
+            if used[i] > 0.0 and t[i] * t[i] >= best - (clear if tied else 0.0):
+                used[i] = GATED_OUT
+                watch[i, GATED] += 1.0
+        if tied:
+            break
+        common, count = _compare(now, W, apart)
+    for i in range(m):
+        watch[i, WAS_OUT] = 1.0 if used[i] == GATED_OUT else 0.0
+    clock[STREAK] = clock[STREAK] + 1.0 if tied else 0.0
+    return tested
 
 
 @compiled
-def _without(
-    i: int, memory: Array, A: Array, B: Array, G: Array, H: Array, walk: Array, stride: int, watch: Array,
-    clock: Array, ring: Array, kept: Array, f: Array, W: Array, w: Array,
-) -> None:  # fmt: skip
-    """Run the filter again without sensor i over the samples since its fault, as far as they are kept."""
-    m, which = watch.shape[0], 1 if clock[NEW] <= watch[i, watching.ONSET] else 0
-    memory[:] = kept[which]
-    for k in range(int(clock[NEW if which == 1 else OLD]), int(clock[NOW])):
-        at = k % ring.shape[0]
-        for j in range(m):
-            if watch[j, OUT] == 0.0 and isfinite(ring[at, j]):
-                e = ring[at, j] - _row(memory, H, j, f[0])
-                _absorb(memory, f[0], w, e, ring[at, m + j])
-        _advance(memory, A, B, G, walk, stride, k, ring, at, 2 * m, W, w)
-    clock[watching.FRESH] = 1.0
+def _sum_up(watch: Array, i: int, t: float, per: float, x: float, now: float) -> None:
+    """Cumulative sums of the log likelihood ratios of a step either way, more noise, and a lower gain.
 
-
-@compiled(fastmath={"contract"})
-def _residuals(memory: Array, H: Array, z: Array, r: Array, used: Array, e: Array, f: Array, S: Array) -> None:
-    """Fill the innovations e and their covariance S; row i of `f` becomes Uᵀ h of sensor i."""
-    for i in range(e.shape[0]):
-        if used[i] > 0.0:
-            e[i] = z[i] - _row(memory, H, i, f[i])
-            for j in range(i + 1):
-                if used[j] > 0.0:
-                    total = r[i] if i == j else 0.0
-                    for a in range(memory.shape[1]):
-                        total += f[i, a] * memory[a, a] * f[j, a]
-                    S[i, j] = S[j, i] = total
-
-
-@compiled(fastmath={"contract"})
-def _instant(
-    memory: Array, H: Array, z: Array, r: Array, used: Array, S: Array, W: Array, e: Array, f: Array, n: int
-) -> float:
-    """Make row m + 1 of H the mean of this instant's values, weighted by S⁻¹ 1; return the variance of their noise.
-
-    Position = Σ w (z - offset as predicted): the motion has no part in it but for the weights.
+    Each passes h on the mean no sooner than after e^h quiet samples (Lorden 1971).
     """
-    m, total, noise = z.shape[0], 0.0, 0.0
-    _, _ = watching.compare(e, used, S, W, f[m], f[m + 1], n < 0)
-    for i in range(m):
-        f[m, i] = 0.0
-        for j in range(m):
-            if used[i] > 0.0 and used[j] > 0.0:
-                f[m, i] -= W[i, j]
-        total += f[m, i]
-    for j in range(memory.shape[1]):
+    s = min(max(t, -_CLIP), _CLIP)
+    phi = min(max(-_LOSS_PART * x * per, -2.0), 2.0)
+    watch[i, UP] += s - 0.5
+    watch[i, DOWN] -= s + 0.5
+    watch[i, LOUD] += 0.375 * s * s - _LN2
+    watch[i, LOSS] += phi * (s - 0.5 * phi)
+    watch[i, EVIDENCE] = max(0.0, watch[i, EVIDENCE] + 0.375 * t * t - _LN2)
+    watch[i, SUM_T] += t
+    watch[i, SUM_ABS] += abs(t)
+    watch[i, JUMPS] += (t - watch[i, LAST_T]) ** 2
+    watch[i, SUM_TT] += t * t
+    watch[i, LAST_T] = t
+    for k in range(4):
+        if watch[i, UP + k] <= 0.0:
+            watch[i, UP + k] = 0.0
+            watch[i, UP_0 + k] = now + 1.0
+            if k == 2:
+                watch[i, SUM_T] = watch[i, SUM_ABS] = watch[i, JUMPS] = watch[i, SUM_TT] = 0.0
+    if per > 0.0:
+        res = t / per
+        begun = watch[i, UP_0] if watch[i, UP] >= watch[i, DOWN] else watch[i, DOWN_0]
+        gain = max(_SLOW, 1.0 / max(now + 1.0 - begun, 1.0))  # since the larger sum began, or the last samples of it
+        watch[i, MEAN_R] += gain * (res - watch[i, MEAN_R])
+        watch[i, SQUARE_R] += gain * (res * res - watch[i, SQUARE_R])
+    watch[i, TESTED] += 1.0
+    watch[i, SQUARES] += s * s
+
+
+@compiled
+def _agree(watch: Array, i: int, res: float, s: float, r: float, x: float, other: float, working: int) -> bool:
+    """Say whether an excluded sensor has agreed with the others long enough: level, noise and gain."""
+    watch[i, COUNT] += 1.0
+    watch[i, R] += res
+    watch[i, RR] += res * res
+    watch[i, RX] += res * x
+    watch[i, X] += x
+    watch[i, XX] += x * x
+    n, near = watch[i, COUNT], res * res <= 36.0 * s
+    if near and n < (watch[i, NEED] if working > 0 else min(_SOON, watch[i, NEED])):
+        return False
+    mean = watch[i, R] / n
+    spread_x = max(watch[i, XX] - watch[i, X] * watch[i, X] / n, 0.0)
+    noise = r + (other if working > 0 else s)
+    level = mean * mean <= 9.0 * (s - r + noise / n)
+    calm = watch[i, RR] - n * mean * mean <= noise * (n + 4.0 * sqrt(2.0 * n))
+    gain = abs(watch[i, RX] - mean * watch[i, X]) <= 0.05 * spread_x + 3.0 * sqrt(noise * spread_x)
+    for k in range(COUNT, XX + 1):  # the proof begins anew
+        watch[i, k] = 0.0
+    return bool(near and level and calm and gain)
+
+
+@compiled(fastmath={"contract"})
+def _read(y: Array, sensors: Array, watch: Array, now: Array) -> bool:
+    """Turn raw values into displacements; return whether a working sensor gives nothing, stands at a rail or still."""
+    fault = False
+    for i in range(y.size):
+        v = y[i]
+        good = isfinite(v)
+        railed = good and (v <= sensors[i, LOW] or v >= sensors[i, HIGH])
+        watch[i, GONE] = 0.0 if good else watch[i, GONE] + 1.0
+        watch[i, RAILED] = watch[i, RAILED] + 1.0 if railed else 0.0
+        watch[i, SAME] = watch[i, SAME] + 1.0 if good and v == watch[i, LAST] and not railed else 0.0
+        if good:
+            watch[i, LAST] = v
+        sound = good and not railed
+        now[Z, i] = (v - sensors[i, OFFSET]) * sensors[i, PER_GAIN] if sound else nan
+        now[USED, i] = 0.0 if not sound else 1.0 if watch[i, OUT] == 0.0 else LOOKED_AT
+        stuck = sensors[i, STUCK] > 0.0 and watch[i, SAME] >= sensors[i, STUCK]
+        if watch[i, GONE] >= GONE_N or watch[i, RAILED] >= GONE_N or stuck:
+            fault = fault or watch[i, OUT] == 0.0
+            if watch[i, OUT] > 0.0:
+                now[USED, i] = 0.0
+                for k in range(COUNT, XX + 1):  # the proof begins anew
+                    watch[i, k] = 0.0
+    return fault
+
+
+@compiled(fastmath={"contract"})
+def _instant(memory: Array, H: Array, sensors: Array, now: Array, W: Array, f: Array, n: int) -> tuple[float, float]:
+    """Return the mean of this instant's values, weighted by S⁻¹ 1, less the offsets as predicted; and its variance.
+
+    The motion has no part in it but for the weights. Row m + 1 of H becomes how it sees the state.
+    """
+    (m, last), used, total, noise, x = (H.shape[0] - 2, H.shape[1]), now[USED], 0.0, 0.0, 0.0
+    _compare(now, W, False)
+    for j in range(last):
         H[m + 1, j] = 0.0
     for i in range(m):
-        weight = f[m, i] / total if used[i] > 0.0 else 0.0
-        noise += weight * weight * r[i]
-        for j in range(n, memory.shape[1]):
-            H[m + 1, j] += weight * H[i, j]
-        f[m, i] = weight
-    return noise
+        for j in range(m):
+            total -= W[i, j] if used[i] > 0.0 and used[j] > 0.0 else 0.0
+    for i in range(m):
+        if used[i] > 0.0:
+            weight = 0.0
+            for j in range(m):
+                weight -= W[i, j] / total if used[j] > 0.0 else 0.0
+            x += weight * now[Z, i]
+            noise += weight * weight * sensors[i, NOISE]
+            for j in range(n, last):
+                H[m + 1, j] += weight * H[i, j]
+    x -= _see(memory, H, m + 1, f)
+    return x, noise + size(memory, f)
 
 
 @compiled(fastmath={"contract"})
 def fuse_scan(
-    start: int, y: Array, u: Array, out: Array, motion: Array, H: Array, walk: Array, sensors: Array, settings: Array,
-    memory: Array, watch: Array, clock: Array, ring: Array, kept: Array, notes: Array,
+    k: int, y: Array, out: Array, A: Array, G: Array, H: Array, walk: Array, sensors: Array, settings: Array,
+    memory: Array, watch: Array, clock: Array, ring: Array, kept: Array, now: Array,
 ) -> int:  # fmt: skip
-    """Run over a block from sample `start`, and stop after a sample of which there is something to tell.
+    """Run over a block from sample k; return where it stopped, `clock[STAGE]` saying what is to be done there.
 
-    `motion`: A, B and G with Q = G Gᵀ, one behind the other. `H` (m + 2, n_states): how each sensor sees the state,
-    position, scratch. `out` (n_samples, 2): position and its standard deviation. `ring` (2 span, 2 m + n_u):
-    displacements that were used (else NaN), their noise, and inputs. `kept`: the filter as it was before the two last
-    whole spans.
-    Returns how many samples of the block are done.
+    `H` (m + 2, n_states): how each sensor sees the state, position, scratch. `out` (n_samples, 2): position and its
+    standard deviation. `ring` (2 span, m): displacements that were used, else NaN. `kept`: the filter as it was before
+    the two last whole spans.
     """
-    m, n, stride = sensors.shape[0], int(settings[watching.STATES]), int(settings[watching.STRIDE])
-    at, to = n * n, n * (n + u.shape[1])
-    A, B, G = motion[:at].reshape(n, n), motion[at:to].reshape(n, u.shape[1]), motion[to:].reshape(n, n)
-    z, r, used, e, t, per = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    f, S, W = np.empty((m + 2, memory.shape[1])), np.empty((m, m)), np.empty((m, m))
-    M, b, first = np.empty((n, 2 * n)), np.empty(max(2 * n, memory.shape[1])), start - start
-    clock[watching.NOTES] = 0.0
-    for k in range(start, y.shape[0]):
-        now = clock[NOW]
-        fresh = clock[watching.FRESH] > 0.0
-        if fresh or int(now) % int(settings[watching.SPAN]) == 0:
-            kept[0] = memory if fresh else kept[1]
-            kept[1] = memory
-            clock[OLD] = now if fresh else clock[NEW]
-            clock[NEW], clock[watching.FRESH] = now, 0.0
-        watching.read(y, k, sensors, watch, z, r, used)
-        working = watching.self_test(sensors, settings, watch, clock, notes, used)
-        _residuals(memory, H, z, r, used, e, f, S)
-        x = _row(memory, H, m, f[m])
-        apart = working > 2
-        tested = watching.gate(e, used, S, W, t, per, watch, clock, apart)
+    m, last, n, stride = sensors.shape[0], memory.shape[1], A.shape[0], int(settings[STRIDE])
+    z, used, e, S = now[Z], now[USED], now[E], now[S_0:]
+    f, W = np.empty((m + 1, last)), np.empty((m, m))
+    M, b = np.empty((n, 2 * n)), np.empty(max(2 * n, last))
+    while k < y.shape[0]:
+        t, at = clock[NOW], int(clock[NOW]) % ring.shape[0]
+        if clock[STAGE] == READ:
+            fresh = clock[FRESH] > 0.0
+            if fresh or int(t) % SPAN == 0:
+                for i in range(last + 1):
+                    for j in range(last):
+                        kept[0, i, j] = memory[i, j] if fresh else kept[1, i, j]
+                        kept[1, i, j] = memory[i, j]
+                clock[OLD] = t if fresh else clock[NEW]
+                clock[NEW], clock[FRESH] = t, 0.0
+            clock[STAGE] = TEST
+            if _read(y[k], sensors, watch, now):
+                return k
+        working = 0
         for i in range(m):
-            if used[i] > 0.0 or used[i] == GATED_OUT:
-                watching.sums(watch, i, t[i], per[i], x, settings[watching.LOSS_PART], now)
-        fault = watching.judge(settings, watch, clock, notes, tested, apart, x)
-        if fault == watching.OPENED:
+            working += watch[i, OUT] == 0.0
+        if clock[STAGE] == TEST:
             for i in range(m):
-                watch[i, watching.ZERO] = 0.0
-                for a in range(n, memory.shape[1]):
-                    watch[i, watching.ZERO] += H[i, a] * kept[0, memory.shape[1], a]
-        for i in range(m):
-            if watch[i, OUT] > 0.0 and watch[i, watching.SINCE] == now:
-                used[i] = min(used[i], 0.0)
-                _without(i, memory, A, B, G, H, walk, stride, watch, clock, ring, kept, f, M, b)
-        instant = settings[watching.INSTANT] > 0.0
-        noise, at, quietest, seen = 0.0, int(now) % ring.shape[0], inf, 0
-        for i in range(m):
-            seen += used[i] > 0.0
-        if instant and seen > 0:
-            noise = _instant(memory, H, z, r, used, S, W, e, f, n)
-            x = -_row(memory, H, m + 1, f[m + 1])
-            noise += size(memory, f[m + 1])
+                if used[i] > 0.0:
+                    e[i] = z[i] - _see(memory, H, i, f[i])
+                    for j in range(i + 1):
+                        if used[j] > 0.0:
+                            total = sensors[i, NOISE] if i == j else 0.0
+                            for a in range(last):
+                                total += f[i, a] * memory[a, a] * f[j, a]
+                            S[i, j] = S[j, i] = total
+            x = _see(memory, H, m, f[m])
+            clock[COMPARED] = _gate(now, W, watch, clock, working > 2)
+            clock[STAGE], alarm = TAKE, False
             for i in range(m):
-                x += f[m, i] * z[i] if used[i] > 0.0 else 0.0
+                if used[i] > 0.0 or used[i] == GATED_OUT:
+                    _sum_up(watch, i, now[T, i], now[PER, i], x, t)
+                for j in range(UP, LOSS + 1):
+                    alarm = alarm or (watch[i, OUT] == 0.0 and watch[i, j] > settings[HEIGHT])
+            if alarm:
+                return k
+        quietest, seen, noise, x = inf, 0, inf, nan
         for i in range(m):
-            ring[at, i], ring[at, m + i] = z[i] if used[i] > 0.0 else nan, r[i]
+            ring[at, i] = z[i] if used[i] > 0.0 else nan
             if used[i] > 0.0:
-                _absorb(memory, f[0], b, z[i] - _row(memory, H, i, f[0]), r[i])
-                quietest = min(quietest, r[i])
-        filtered = _row(memory, H, m, f[m])
-        variance = size(memory, f[m])
+                seen += 1
+                quietest = min(quietest, sensors[i, NOISE])
+        if settings[INSTANT] > 0.0 and seen > 0:
+            x, noise = _instant(memory, H, sensors, now, W, f[0], n)
+        absorb(ring[at], sensors, memory, H, f[0], b)
+        filtered = _see(memory, H, m, f[m])
+        variance, stop = size(memory, f[m]), False
         for i in range(m):
             if used[i] == LOOKED_AT:
-                residual = z[i] - _row(memory, H, i, f[0])
-                s = size(memory, f[0]) + r[i]
-                if watching.agree(watch, i, residual, s, r[i], filtered, quietest, working):
-                    watching.back(i, watch, clock, notes)
-        if clock[watching.DISPUTED] > 0.0:
-            extra = watching.doubt(z, r, filtered, settings, watch, clock, notes)
+                residual = z[i] - _see(memory, H, i, f[0])
+                s = size(memory, f[0]) + sensors[i, NOISE]
+                watch[i, BACK] = _agree(watch, i, residual, s, sensors[i, NOISE], filtered, quietest, working)
+                stop = stop or watch[i, BACK] > 0.0
+        if clock[DISPUTED] > 0.0:  # either may be right: each one's position is by its zero from before the fault
+            extra, agreed = 0.0, True
+            for i in range(m):
+                if watch[i, DOUBT] > 0.0:
+                    if isfinite(z[i]):
+                        between = z[i] - watch[i, ZERO] - filtered
+                        watch[i, BETWEEN] += _SLOW * (between * between - watch[i, BETWEEN])
+                    extra = max(extra, watch[i, BETWEEN] - sensors[i, NOISE])
+                    agreed = agreed and watch[i, BETWEEN] < 2.0 * sensors[i, NOISE]
+            clock[AGREED] = clock[AGREED] + 1.0 if agreed else 0.0
+            stop = stop or clock[AGREED] >= settings[RESTORE_N]
             variance += extra
             noise += extra
-        if instant:
-            out[k, 0], out[k, 1] = (x, sqrt(noise)) if seen > 0 else (nan, inf)
+        if settings[INSTANT] > 0.0:
+            out[k, 0], out[k, 1] = x, sqrt(noise)
         else:
             out[k, 0], out[k, 1] = filtered, sqrt(variance)
-        for a in range(u.shape[1]):
-            ring[at, 2 * m + a] = u[k, a]
-        _advance(memory, A, B, G, walk, stride, int(now), u, k, first, M, b)
-        clock[NOW] = now + 1.0
-        if clock[watching.NOTES] > 0.0:
-            return k + 1
-    return int(y.shape[0])
+        advance(memory, A, G, walk, stride, int(t), M, b)
+        clock[NOW], clock[STAGE] = t + 1.0, RETURN if stop else READ
+        k += 1
+        if stop:
+            break
+    return k
