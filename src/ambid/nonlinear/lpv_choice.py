@@ -32,6 +32,8 @@ _LEAST, _MOST = 10.0, 0.2  # low-pass: samples at least, part of the shortest re
 _GRID = 3.0
 _CLEAR = 10.0  # difference of the criterion from which a faster set point is taken
 _LONG, _ROWS = 4, 20  # lags of the long regression, times the order of C; samples for each of its numbers
+_STEP = 1e-3  # of a logarithm, for a slope by differences
+_EVEN = np.linspace(-1.0, 1.0, 33)
 DEGREES = (0, 1, 2, 3)
 _FEWEST = 20  # predictions that the shortest record has to leave for a form to be tried
 _ENOUGH = 0.5  # gain of a candidate's criterion by an iteration below which it is compared
@@ -47,6 +49,9 @@ class LpvProblem:
     parts: tuple[Part, ...]  # by record
     first: int  # errors count from this sample on
     weight: float = 1.0  # one over the standard deviation of the errors
+    # by record: the same with set points a little slower and faster, where the logarithm of their time constant counts
+    # as one more number
+    beside: tuple[tuple[Part, Part], ...] = ()
 
     @property
     def n_errors(self) -> int:
@@ -73,13 +78,16 @@ class LpvProblem:
     def triangle(self, theta: Array) -> Array:
         """Return the triangle of [J | e] without what the starts explain; NaN where the predictor diverges."""
         P, k, rows = self.shape.n_theta, self.shape.n_start, list[Array]()
-        for part in self.parts:
+        for r, part in enumerate(self.parts):
             start, e = self._project(part, theta)
             found = None if e is None else errors(self.shape, part, theta, start, slopes=2)
             if found is None or not found.finite:
-                return np.full((P + 1, P + 1), np.nan)
-            J = found.J[self.first :]
-            R = triangle_of([np.column_stack([J[:, P:], J[:, :P], found.e[self.first :]])])
+                return np.full((P + 1, P + 1 + bool(self.beside)), np.nan)
+            J = [found.J[:, P:], found.J[:, :P]]
+            for slower, faster in self.beside[r : r + 1]:
+                later, sooner = (errors(self.shape, x, theta, start).g for x in (slower, faster))
+                J.append((later - sooner)[:, None] / (2.0 * _STEP))
+            R = triangle_of([np.column_stack([*J, found.e])[self.first :]])
             rows.append(np.asarray(np.linalg.qr(R, mode="r"))[k:, k:])
         return triangle_of(rows) * self.weight
 
@@ -98,6 +106,34 @@ class LpvProblem:
         R = triangle_of([np.column_stack([J, e])])
         start = np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=1e-9)[0], dtype=np.float64)
         return start, e - J @ start
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LevelProblem:
+    """The same with the logarithm of the set point's time constant as the last number; the range of p stays."""
+
+    fitting: Fitting
+    shape: LpvShape
+    weight: float
+
+    def cost(self, v: Array) -> float:
+        """As `LpvProblem.cost`."""
+        return self._at(v).cost(v[:-1])
+
+    def triangle(self, v: Array) -> Array:
+        """As `LpvProblem.triangle`."""
+        return self._at(v).triangle(v[:-1])
+
+    def move(self, v: Array, step: Array) -> Array:
+        """Take a step, within the limits of the time constant."""
+        v = v + step
+        low, high = (math.log(x) for x in self.fitting.limits)
+        v[-1] = min(max(v[-1], low), high)
+        return v
+
+    def _at(self, v: Array) -> LpvProblem:
+        of = replace(self.fitting.schedule, time_constant=float(np.exp(v[-1])))
+        return replace(self.fitting.problem(self.shape, of, beside=True), weight=self.weight)
 
 
 # --- starts by least squares ------------------------------------------------------------------------------------------
@@ -140,15 +176,15 @@ def from_earlier(
     return start, cost
 
 
-def carry_over(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
+def carry_over(shape: LpvShape, old: LpvShape, theta: Array, at: Array = _EVEN, earlier: Array = _EVEN) -> Array:
     """Carry a model over to one with other functions of p, or with another error model.
 
-    Coefficients are as near as can be over the range of p; zeros where the old model has none.
+    Coefficients are as near as can be over the range of p; zeros where the old model has none. `at` are scaled values
+    of p, and `earlier` those that the old model has for them.
     """
-    grid = np.linspace(-1.0, 1.0, 33)
 
     def carried(values: Array, n: int) -> Array:
-        before, after = (basis_values(grid, k, shape.basis) for k in (values.size, n))
+        before, after = basis_values(earlier, values.size, shape.basis), basis_values(at, n, shape.basis)
         return np.asarray(np.linalg.lstsq(after, before @ values, rcond=None)[0], dtype=np.float64)
 
     out = np.zeros(shape.n_theta)
@@ -157,7 +193,7 @@ def carry_over(shape: LpvShape, old: LpvShape, theta: Array) -> Array:
         if name in known:
             source, target = theta[old.place(known[name])], shape.place(k)
             n = target.stop - target.start
-            out[target] = source if n == source.size else carried(source, n)
+            out[target] = source if n == source.size and at is earlier else carried(source, n)
     return out
 
 
@@ -214,6 +250,7 @@ class Fitting:
     theta: Array  # (n_theta,), scaled
     first: int  # errors count from this sample on
     most: int  # iterations of a search
+    limits: tuple[float, float] = (0.0, 0.0)  # of the set point's time constant, s, where it is estimated
     status: Literal["converged", "stalled"] = "converged"
     curves: list[LearningCurve] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -228,9 +265,34 @@ class Fitting:
             for x, (y, u) in zip(self.records, self.data.parts, strict=True)
         )
 
-    def problem(self, shape: LpvShape) -> LpvProblem:
-        """Return what is searched in for a shape."""
-        return LpvProblem(shape=shape, parts=self.parts(shape), first=self.first)
+    def problem(self, shape: LpvShape, schedule: Schedule | None = None, *, beside: bool = False) -> LpvProblem:
+        """Return what is searched in for a shape; with slopes by the set point's time constant if `beside`."""
+        of = schedule or self.schedule
+        near = [
+            self.parts(shape, replace(of, time_constant=of.time_constant * np.exp(x)))
+            for x in (_STEP, -_STEP)
+            if beside
+        ]
+        parts = self.parts(shape, of)
+        return LpvProblem(shape=shape, parts=parts, first=self.first, beside=tuple(zip(*near, strict=True)))
+
+    def refine_level(self, best: Candidate, tick: Tick | None) -> Array:
+        """Estimate the set point's time constant with everything else, and return the parameters for its range of p."""
+        weight = float(np.sqrt(best.n / best.cost))
+        problem = LevelProblem(fitting=self, shape=best.shape, weight=weight)
+        start = np.append(best.theta, np.log(self.schedule.time_constant))
+        found = search(
+            problem, start, stage="set point", most=self.most, tolerance=1e-9, enough=0.01, move=problem.move, tick=tick
+        ).theta
+        old, self.schedule = self.schedule, self.schedule.over(self.records, float(np.exp(found[-1])))
+        earlier = old.scaled(self.schedule.middle + self.schedule.half * _EVEN)
+        self.tried = [replace(x, theta=carry_over(x.shape, x.shape, x.theta, _EVEN, earlier)) for x in self.tried]
+        return carry_over(best.shape, best.shape, found[:-1], _EVEN, earlier)
+
+    @property
+    def level_counts(self) -> bool:
+        """Whether the set point's time constant was estimated, and is within its limits."""
+        return self.shape.degree > 0 and self.limits[0] < self.schedule.time_constant < self.limits[1]
 
     def by_equations(self, shape: LpvShape) -> Array:
         """Return the start of a shape without an error model, by least squares."""
@@ -274,7 +336,7 @@ class Fitting:
 
         found = search(
             replace(problem, weight=weight), start, stage=stage, most=self.most, tolerance=1e-9,
-            enough=1e-4 if last else _ENOUGH, tick=tick, keep=keep,
+            enough=1e-8 if last else _ENOUGH, tick=tick, keep=keep,
         )  # fmt: skip
         if last:
             self.theta, self.status = found.theta, "converged" if found.converged else "stalled"
@@ -352,6 +414,7 @@ def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | 
     for of in tried if len(grid) > 1 and np.isfinite(model.cost) else ():
         found = from_earlier(trial, fitting.parts(trial, of), fitting.first, shape, model.theta, earlier)
         values.append(np.inf if found is None else information("bic", found[1], model.n, trial.n_theta))
+    fitting.limits = grid[0], max(dt * _MOST * shortest, grid[-1])
     chosen = slowest_that_does(grid, values) if values and np.isfinite(min(values)) else grid[0]
     return tried[grid.index(chosen)]
 

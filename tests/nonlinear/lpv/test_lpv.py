@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.lpv import lpv
 from ambid.validate.nonlinear import judge
@@ -305,3 +306,36 @@ def test_feedback_without_an_error_model_is_warned_of():
     assert not any("biased" in w for w in lpv([data], KNOWN).warnings)
     told = replace(data, open_loop=True)
     assert not any("biased" in w for w in lpv([told], {**KNOWN, "error_order": 0}).warnings)
+
+
+def follows(seed, n=2000, time_constant=1.2):
+    """A plant whose coefficients follow its own output, low-passed."""
+    rng = np.random.default_rng(seed)
+    share = 1 - np.exp(-0.01 / time_constant)
+    slow = 0.2 * np.sin(2 * np.pi * np.arange(n) / 1000 + rng.uniform(0, 6))
+    u, e = 0.25 * rng.standard_normal(n) + slow, 0.05 * rng.standard_normal(n)
+    y, v, level = np.zeros(n), np.zeros(n), 0.0
+    for k in range(n):
+        if k >= 2:
+            a, b = damped(0.5 + 0.5 * level)
+            v[k] = 0.8 * v[k - 1] - 0.2 * v[k - 2] + e[k]
+            y[k] = -a[0] * y[k - 1] - a[1] * y[k - 2] + b[0] * u[k - 1] + b[1] * u[k - 2] + v[k]
+        level += max(share, 1 / (k + 1)) * (y[k] - level)
+    return IOData(
+        u=u[:, None], y=y[:, None], dt=0.01, inputs=("u",), outputs=("y",), units={"u": "V", "y": "m"}, open_loop=True
+    )
+
+
+def test_the_time_constant_of_the_set_point_is_estimated_and_counted():
+    """Chosen from a grid alone, 95 % intervals of such a plant held the truth 88 times in 100."""
+    found, taus = [], []
+    for seed in range(30):
+        fit = lpv([follows(seed)], {"degree": 2, "form": "equation", "error_form": "ar"})
+        taus.append(fit.settings["time_constant"])
+        for level in (-0.2, 0.2):
+            at = fit.model.at(level, fit.covariance)
+            a, b, _, gain = truth(0.5 + 0.5 * level)
+            z = [*(at.a[1:] - a) / at.a_sd[1:], *(at.b[0] - b) / at.b_sd[0], (at.dc_gain[0] - gain) / at.dc_gain_sd[0]]
+            found.append(z)
+    assert 0.905 < np.mean(np.abs(found) < 1.96) < 0.985
+    assert np.median(taus) == pytest.approx(1.2, rel=0.15)
