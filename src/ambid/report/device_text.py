@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ambid.report.text import WIDTH, Paint, columns, joined, plain, wrapped
+from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain, wrapped
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
 _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
-_INDENT = "  "
 _NEXT = {
     "self-test": "put right what the self-test names; nothing was switched on",
     "rest": "put sensors, wiring or calibrations right; nothing was switched on",
@@ -145,9 +144,11 @@ def step_text(
 ) -> str:
     """Write a step that was done; `place` says which of how many it is, such as ``"2/9"``."""
     mark = paint("✗", "bad") if reasons else paint("✓", "good")
-    lines = [f"{mark} {place} {paint(name, 'strong')}", *_wrapped(findings, width)]
-    lines += [paint(line, "dim") for line in _wrapped([f"note: {c}" for c in cautions], width)]
-    lines += [paint(line, "bad") for line in _wrapped([f"stopped: {r}" for r in reasons], width)]
+    lines = [f"{mark} {place} {paint(name, 'strong')}"]
+    said: list[tuple[str, Style | None]] = [(x, None) for x in findings if x]
+    said += [(f"note: {c}", "dim") for c in cautions] + [(f"stopped: {r}", "bad") for r in reasons]
+    for text, style in said:
+        lines += [line if style is None else paint(line, style) for line in hanging("  ", text, width, 4, 2)]
     return "\n".join(lines)
 
 
@@ -170,11 +171,3 @@ def next_text(passed: bool, step: str, number: int, of: int, folder: str, *, wid
             " Then commission again, into another folder.",
         ]
     return "\n".join(line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False))
-
-
-def _wrapped(texts: Sequence[str], width: int) -> list[str]:
-    lines: list[str] = []
-    for text in texts:
-        if text:
-            lines += textwrap.wrap(text, width, initial_indent=_INDENT, subsequent_indent=2 * _INDENT)
-    return lines

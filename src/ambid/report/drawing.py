@@ -30,7 +30,7 @@ MEASURED, PREDICTED, BAND, BOUND = "#444444", "#0b6fb8", "#9ecae8", "#c0392b"
 NORMAL_95, NORMAL_99 = 1.959963984540054, 2.5758293035489004
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 _CHI2_95 = 5.991464547107979  # of two degrees of freedom
-_PIXELS = 1200  # samples from which a curve is drawn as the band of its extremes
+PIXELS = 1200  # samples from which a curve is drawn as the band of its extremes
 _ZOOM = 240  # samples of a close view
 _LAGS = 50
 MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
@@ -76,15 +76,32 @@ def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = No
     figure.savefig(target, dpi=130, format=ending, metadata=dates.get(ending))
 
 
-def curve(axes: Axes, t: Array, y: Array, color: str, label: str | None) -> None:
+def curve(
+    axes: Axes,
+    t: Array,
+    y: Array,
+    color: str,
+    label: str | None,
+    *,
+    linewidth: float = 0.8,
+    alpha: float = 0.75,
+    zorder: float | None = None,
+) -> None:
     """Draw a curve, or, where there are more samples than the paper shows, the band between its extremes."""
-    options: dict[str, Any] = {} if label is None else {"label": label}
-    if y.size <= 2 * _PIXELS:
-        axes.plot(t, y, color=color, linewidth=0.8, **options)
-        return
-    edges = np.linspace(0, y.size, _PIXELS + 1).astype(int)[:-1]
-    low, high = np.minimum.reduceat(y, edges), np.maximum.reduceat(y, edges)
-    axes.fill_between(t[edges], low, high, color=color, linewidth=0.4, alpha=0.75, **options)
+    options: dict[str, Any] = {"color": color} | ({} if label is None else {"label": label})
+    options |= {} if zorder is None else {"zorder": zorder}
+    if y.size <= 2 * PIXELS:
+        axes.plot(t, y, linewidth=linewidth, **options)
+    else:
+        axes.fill_between(*extremes(t, y, y), linewidth=linewidth / 2, alpha=alpha, **options)
+
+
+def extremes(t: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
+    """Return a band as the extremes of as many stretches as the paper shows, where it has more samples."""
+    if t.size <= 2 * PIXELS:
+        return t, low, high
+    edges = np.linspace(0, t.size, PIXELS + 1).astype(int)[:-1]
+    return t[edges], np.fmin.reduceat(low, edges), np.fmax.reduceat(high, edges)
 
 
 def worst_stretch(e: Array) -> tuple[int, int]:

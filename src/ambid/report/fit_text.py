@@ -17,7 +17,7 @@ from ambid.blackbox.model import pole_covariance
 from ambid.blackbox.structures import any_structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.report.estimate_text import frequency_lines
+from ambid.report.estimate_text import frequency_lines, names_words
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.text import (
     WIDTH,
@@ -62,15 +62,16 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
     """Write a fit for people; colour does not change the layout. Of a failed fit the settings and the reason."""
     trainings: list[str] = []
     if isinstance(fit, BlackBoxFit):
-        own = [_linear_header(fit, width, paint), coefficient_lines(fit), pole_lines(fit, paint=paint)]
+        own = [coefficient_lines(fit), pole_lines(fit, paint=paint)]
         none = "none (unstable, or no input)"
     else:
-        own = [*_nonlinear_header(fit, width, paint), _number_lines(fit, width)]
+        own = [textwrap.wrap(f"no model: {fit.reason}", width) if fit.reason else [], _number_lines(fit, width)]
         none = "none (diverges, or no input)"
         trainings = wrapped(curve_lines(fit.curves), width, "  ")
     second = [] if fit.validation is None else [paint("on the second record", "strong"), *second_lines(fit.validation)]
     return joined(
         [
+            _header(fit, width, paint),
             *own,
             columns(fit_rows(fit.fit, fit.units, none)) if fit.fit else [],
             second,
@@ -83,28 +84,25 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
     )
 
 
-def _linear_header(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
-    orders = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.orders.items())
-    samples = int(str(fit.record["samples"]))
-    first = title_line(fit.record.get("file"), fit.structure, samples, 1 / fit.dt, fit.status, paint)
-    about = f"{any_structure(fit.structure).summary}; {orders}; {_signals(fit)}"
-    return [first, *textwrap.wrap(about, width)]
+def _header(fit: BlackBoxFit | NonlinearFit, width: int, paint: Paint) -> list[str]:
+    """Say what was fitted to which records, with which settings."""
+    signals = (f"from {', '.join(fit.inputs)} to " if fit.inputs else "of ") + ", ".join(fit.outputs)
+    if isinstance(fit, BlackBoxFit):
+        records: Sequence[Mapping[str, object]] = [fit.record]
+        about = [f"{any_structure(fit.structure).summary}; {settings_text(fit.orders)}; {signals}"]
+    else:
+        records = fit.records
+        about = [f"{nonlinear_structure(fit.structure).summary}; {signals}"]
+        about += [f"settings: {settings_text(fit.settings)}; seed {fit.seed}"]
+    names = [str(x.get("file") or "record") for x in records]
+    total = sum(int(str(x["samples"])) for x in records)
+    first = title_line(names_words(names), fit.structure, total, 1 / fit.dt, fit.status, paint)
+    return [first, *wrapped([", ".join(names)] if len(names) > 1 else [], width), *wrapped(about, width)]
 
 
-def _nonlinear_header(fit: NonlinearFit, width: int, paint: Paint) -> list[list[str]]:
-    names = [str(x.get("file") or "record") for x in fit.records]
-    name = names[0] if len(names) == 1 else f"{len(names)} records"
-    total = sum(int(str(x["samples"])) for x in fit.records)
-    settings = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.settings.items())
-    lines = [title_line(name, fit.structure, total, 1 / fit.dt, fit.status, paint)]
-    lines += textwrap.wrap(", ".join(names), width) if len(names) > 1 else []
-    lines += textwrap.wrap(f"{nonlinear_structure(fit.structure).summary}; {_signals(fit)}", width)
-    lines += textwrap.wrap(f"settings: {settings}; seed {fit.seed}", width)
-    return [lines, textwrap.wrap(f"no model: {fit.reason}", width) if fit.reason else []]
-
-
-def _signals(fit: BlackBoxFit | NonlinearFit) -> str:
-    return (f"from {', '.join(fit.inputs)} to " if fit.inputs else "of ") + ", ".join(fit.outputs)
+def settings_text(settings: Mapping[str, object]) -> str:
+    """Write orders or settings with their names."""
+    return ", ".join(f"{k} = {setting_text(v)}" for k, v in settings.items())
 
 
 def setting_text(value: object) -> str:
@@ -424,8 +422,8 @@ def _decibel(x: float, beside: float) -> str:
 
 
 def _response_fit_lines(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]:
-    orders = ", ".join(f"{k} = {setting_text(v)}" for k, v in fit.orders.items())
-    about = f"{fit.structure}: {any_structure(fit.structure).summary}; {orders}{status_words(fit.status)}"
+    summary = any_structure(fit.structure).summary
+    about = f"{fit.structure}: {summary}; {settings_text(fit.orders)}{status_words(fit.status)}"
     lines = textwrap.wrap(about, width)
     lines[0] = lines[0].replace(fit.structure, paint(fit.structure, "strong"), 1)
     if fit.structure == "frf-ml":  # states are in coordinates of the method's own: their numbers say nothing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,6 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate
-from ambid.estimation.parts import Check, EstimatedParameter
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.models import model
 from ambid.report.drawing import save
@@ -26,8 +25,7 @@ from ambid.report.estimate_text import (
     validation_rows,
 )
 from ambid.report.figures import BearingEvidence, Evidence, figures
-from ambid.report.numbers import quantity
-from ambid.report.text import checks_of, interval_words, other_warnings, style_of, verdict
+from ambid.report.text import other_warnings, parameter_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,9 +75,8 @@ def _content(evidence: Evidence | BearingEvidence, made: str) -> dict[str, Any]:
     e = evidence.estimate
     meaning = {spec.name: spec.meaning for spec in (*model(e.model).parameters, *BEARING_NUMBERS)}
     about = _about_record(e) if isinstance(e, Estimate) else _about_records(e)
-    validation = None
-    if e.validation is not None:
-        validation = {"fits": validation_rows(e.validation), "checks": _check_cells(checks_of(e.validation))}
+    judged = e.validation
+    validation = None if judged is None else {"fits": validation_rows(judged), "checks": judged["checks"]}
     provenance = [*about.pop("origin"), ("rig", str(e.rig.get("name") or "–"))]
     provenance += [("operating point", ", ".join(f"{role} {x:.6g}" for role, x in e.operating_point.items()) + " (SI)")]
     provenance += [("computing time", f"{sum(e.timing_s.values()):.3g} s")] if e.timing_s else []
@@ -89,13 +86,14 @@ def _content(evidence: Evidence | BearingEvidence, made: str) -> dict[str, Any]:
         **about,
         "status": e.status,
         "warnings": other_warnings(e),
-        "parameters": _parameter_cells(e.parameters, meaning, finished=e.status == "converged"),
+        "parameters": parameter_rows(e.parameters, finished=e.status == "converged"),
+        "meaning": meaning,
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),
         "correlations": list(zip(e.covariance_names, correlations(e.covariance), strict=True)),
         "delays": delay_lines(e),
         "fits": output_rows(e),
-        "checks": _check_cells(e.checks),
+        "checks": e.checks,
         "validation": validation,
         "figures": _embedded(figures(evidence)),
         "provenance": provenance,
@@ -135,24 +133,6 @@ def _about_records(e: Any) -> dict[str, Any]:
 def _steps(record: Mapping[str, object]) -> list[str]:
     history = record.get("history")
     return [str(step) for step in history] if isinstance(history, (list, tuple)) else []
-
-
-def _parameter_cells(
-    parameters: Sequence[EstimatedParameter], meaning: Mapping[str, str], *, finished: bool
-) -> list[dict[str, str]]:
-    rows = []
-    for p in parameters:
-        q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
-        said, style = verdict(p, finished=finished), style_of(p, finished=finished)
-        rows.append(
-            {"name": p.name, "meaning": meaning[p.name], "text": q.text, "interval": interval_words(q), "si": q.si,
-             "verdict": said, "style": style}
-        )  # fmt: skip
-    return rows
-
-
-def _check_cells(checks: Mapping[str, Check]) -> list[dict[str, object]]:
-    return [{"name": name, "passed": c.passed, "detail": c.detail} for name, c in checks.items()]
 
 
 def correlations(covariance: Array) -> list[list[str]]:

@@ -122,15 +122,12 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint 
         for x in comparison.entries
         if x.fit is None or x.failed
     ]
-    notes = [line for r in remarks for line in textwrap.wrap(r, width, subsequent_indent="  ")]
-    meaning = textwrap.wrap(
+    meaning = (
         "d: numbers estimated; BIC: above the least, on the data fitted; one-step, simulation: fit on data not used, "
-        "1 - |e|/|y - mean|; s: seconds with the choice of orders. "
-        f"{comparison.summary}.",
-        width,
+        f"1 - |e|/|y - mean|; s: seconds with the choice of orders. {comparison.summary}."
     )
-    blocks = [textwrap.wrap(header, width) if paint is plain else [header], painted, notes, meaning]
-    return joined(blocks)
+    first = wrapped([header], width) if paint is plain else [header]
+    return joined([first, painted, wrapped(remarks, width, "  "), wrapped([meaning], width)])
 
 
 def _entry(entry: Entry, least: float) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.report.numbers import Quantity, quantity, sized
@@ -72,21 +72,21 @@ def parameter_lines(
 
     Where the terminal is too narrow the column of SI values is left out.
     """
-    shown = [quantity(p.value, p.sd, p.unit, ci95=p.ci95) for p in parameters]
-    rows = [
-        (p.name, q.text, interval_words(q), q.si, verdict(p, finished=finished))
-        for p, q in zip(parameters, shown, strict=True)
-    ]
-    styles = [style_of(p, finished=finished) for p in parameters]
-    return verdict_table(
-        ("", "value ± sd", "95 % interval", "in SI", "verdict"),
-        rows,
-        styles,
-        right=2,
-        spare=3,
-        width=width,
-        paint=paint,
-    )
+    rows = parameter_rows(parameters, finished=finished)
+    head = ("", "value ± sd", "95 % interval", "in SI", "verdict")
+    return verdict_table(head, rows, right=2, spare=3, width=width, paint=paint)
+
+
+def parameter_rows(
+    parameters: Sequence[EstimatedParameter], *, finished: bool = True
+) -> list[tuple[str, str, str, str, str, Style]]:
+    """Return name, value, interval, value in SI and verdict of each parameter, and how the verdict is painted."""
+    rows: list[tuple[str, str, str, str, str, Style]] = []
+    for p in parameters:
+        q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
+        style: Style = "dim" if p.role == "fixed" else "good" if p.identifiable and finished else "bad"
+        rows.append((p.name, q.text, interval_words(q), q.si, verdict(p, finished=finished), style))
+    return rows
 
 
 def interval_words(q: Quantity) -> str:
@@ -97,31 +97,23 @@ def interval_words(q: Quantity) -> str:
 def verdict_table(
     head: tuple[str, ...],
     rows: Sequence[tuple[str, ...]],
-    styles: Sequence[Style],
     *,
     right: int,
     spare: int,
     width: int,
     paint: Paint,
 ) -> list[str]:
-    """Return a table with the column `right` aligned right and the last one painted.
+    """Return a table whose rows end with a verdict and its style, the column `right` aligned right.
 
     The column `spare` is left out where the terminal is too narrow.
     """
-    table = [head, *rows]
+    table = [head, *(row[:-1] for row in rows)]
     lines = columns(table, right=(right,))
     if max(map(len, lines)) > width:
         lines = columns([row[:spare] + row[spare + 1 :] for row in table], right=(right - (spare < right),))
-    painted = [
-        line.removesuffix(row[-1]) + paint(row[-1], style) if row[-1] else line
-        for line, row, style in zip(lines[1:], rows, styles, strict=True)
-    ]
-    return [lines[0], *painted]
-
-
-def style_of(p: EstimatedParameter, *, finished: bool = True) -> Style:
-    """Return how a parameter's verdict is painted."""
-    return "dim" if p.role == "fixed" else "good" if p.identifiable and finished else "bad"
+    ends = [(row[-2], cast("Style", row[-1])) for row in rows]
+    body = zip(lines[1:], ends, strict=True)
+    return [lines[0], *(line.removesuffix(x) + paint(x, style) if x else line for line, (x, style) in body)]
 
 
 def verdict(p: EstimatedParameter, *, finished: bool = True) -> str:
@@ -190,9 +182,7 @@ def check_lines(checks: Mapping[str, Check], *, width: int = WIDTH, paint: Paint
     lines: list[str] = []
     for name, check in checks.items():
         mark = paint("✓", "good") if check.passed else paint("✗", "bad")
-        first, *more = _hanging(check.detail, width, wide + 4)
-        lines.append(f"{mark} {name.ljust(wide)}  {first}")
-        lines += [" " * (wide + 4) + line for line in more]
+        lines += hanging(f"{mark} {name.ljust(wide)}  ", check.detail, width, wide + 4)
     return lines
 
 
@@ -204,17 +194,19 @@ def checks_of(validation: Mapping[str, Any]) -> dict[str, Check]:
     }
 
 
-def _hanging(text: str, width: int, indent: int) -> list[str]:
-    return textwrap.wrap(text, max(width - indent, 30), break_long_words=False, break_on_hyphens=False) or [""]
+def hanging(head: str, text: str, width: int, indent: int, first: int | None = None) -> list[str]:
+    """Return a text behind a head of `first` columns, colour not counted (default `indent`); it goes on `indent` in."""
+    first = indent if first is None else first
+    lines = textwrap.wrap(
+        "x" * first + text, max(width, indent + 30), subsequent_indent=" " * indent, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+    return [head + lines[0][first:], *lines[1:]] if lines else [head]
 
 
 def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write warnings, one after the other."""
-    lines: list[str] = []
-    for warning in warnings:
-        first, *more = _hanging(warning, width, 9)
-        lines += [f"{paint('warning:', 'bad')} {first}", *(" " * 9 + line for line in more)]
-    return lines
+    return [line for x in warnings for line in hanging(f"{paint('warning:', 'bad')} ", x, width, 9)]
 
 
 def other_warnings(result: Judged) -> list[str]:

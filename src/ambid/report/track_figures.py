@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
-from ambid.report.drawing import BAND, MEASURED, NORMAL_95, PREDICTED, grid
+from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
+from ambid.report.drawing import BAND, MEASURED, NORMAL_95, PIXELS, PREDICTED, curve, extremes, grid
 from ambid.report.numbers import prefixed
 
 if TYPE_CHECKING:
@@ -33,20 +32,20 @@ _MARKED: dict[str, Any] = {
     "reverted": ":",
     "disturbed": "--",
 }  # events that get a vertical mark, and its line style
-_BINS = 1200  # a longer track is drawn as the extremes of that many stretches
 _LEAST = 0.004  # part of the width that the shortest state is drawn with, so that none is lost
+_UNKNOWN = (np.nan, np.nan, 0.0)
 _LEVELS = 2  # rows in which names of events stand over each other
 
 
 class TrackHistory:
-    """A track that is added to line by line."""
+    """A track that is added to line by line, kept as numbers."""
 
     def __init__(self, header: TrackHeader) -> None:
         """Begin before the first line."""
         self.header = header
         self.events: list[Event] = []
-        self._t, self._error, self._state = array("d"), array("d"), array("b")
-        self._columns: dict[str, tuple[array[float], array[float], array[int]]] = {}
+        self._lines = array("d")  # t, error, state of each
+        self._columns: dict[str, array[float]] = {}  # value, sd, stale of each line, up to the last that has them
 
     @classmethod
     def of(cls, track: Track) -> Self:
@@ -57,37 +56,19 @@ class TrackHistory:
         return history
 
     def add(self, line: TrackLine) -> None:
-        """Add one line.
-
-        `line`: numbers of `extra` stand behind the parameters; before their first line they are NaN.
-        """
-        self._t.append(line.t)
-        self._error.append(line.error)
-        self._state.append(STATES.index(line.state))
+        """Add one line; numbers of `extra` stand behind the parameters, and are NaN before their first line."""
+        n = self.n_lines
+        self._lines.extend((line.t, line.error, STATES.index(line.state)))
         self.events += line.events
-        for name, value in line.parameters.items():
-            self._put(name, value)
-        for name, value in line.extra.items():
-            self._put(name, value)
-
-    def _put(self, name: str, v: TrackedValue) -> None:
-        column = self._columns.get(name)
-        if column is None:
-            column = self._columns[name] = (array("d"), array("d"), array("b"))
-        value, sd, stale = column
-        missing = len(self._t) - 1 - len(value)
-        if missing:
-            value.extend([np.nan] * missing)
-            sd.extend([np.nan] * missing)
-            stale.extend([0] * missing)
-        value.append(v.value)
-        sd.append(v.sd)
-        stale.append(v.stale)
+        for name, v in {**line.parameters, **line.extra}.items():
+            column = self._columns.setdefault(name, array("d"))
+            column.extend(_UNKNOWN * (n - len(column) // 3))
+            column.extend((v.value, v.sd, v.stale))
 
     @property
     def n_lines(self) -> int:
         """Number of lines."""
-        return len(self._t)
+        return len(self._lines) // 3
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -97,41 +78,24 @@ class TrackHistory:
     @property
     def t(self) -> Array:
         """End of each reporting interval, shape (n_lines,), s of record."""
-        return np.array(self._t)
+        return np.array(self._lines[::3])
 
     @property
     def error(self) -> Array:
         """Model error, shape (n_lines,), 1 where the model predicts as well as when it was identified."""
-        return np.array(self._error)
+        return np.array(self._lines[1::3])
 
     @property
     def state(self) -> NDArray[np.int8]:
         """Place in `STATES`, shape (n_lines,)."""
-        return np.array(self._state)
+        return np.array(self._lines[2::3], dtype=np.int8)
 
     def values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return one track.
-
-        `name`: one of `names`. Returns `value, sd`: (n_lines,), SI, naN where it was not given; `stale`: (n_lines,),
-        whether it was frozen for want of information.
-        """
-        value, sd, stale = self._columns[name]
-        missing = self.n_lines - len(value)
-        rest = np.full(missing, np.nan)
-        frozen = np.concatenate([np.array(stale, dtype=bool), np.zeros(missing, dtype=bool)])
-        return np.concatenate([value, rest]), np.concatenate([sd, rest]), frozen
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Curve:
-    """Value and 95 % band, or their extremes over stretches of lines."""
-
-    t: Array
-    low: Array
-    high: Array
-    band_low: Array
-    band_high: Array
-    thinned: bool
+        """Return value and sd (SI, NaN where not given) and whether it was frozen, (n_lines,) each, of one name."""
+        column = self._columns[name]
+        rest = array("d", _UNKNOWN * (self.n_lines - len(column) // 3))
+        value, sd, stale = np.array(column + rest).reshape(-1, 3).T
+        return value, sd, stale > 0
 
 
 def track_figure(track: Track | TrackHistory, *, truth: Truth | None = None, title: str | None = None) -> Figure:
@@ -186,14 +150,11 @@ def _parameter_panel(axes: Axes, history: TrackHistory, name: str, truth: tuple[
     scale, unit = prefixed(max(abs(low), abs(high)), history.header.units.get(name, ""))
     for first, last in runs(stale):
         axes.axvspan(t[first] - history.header.every_s, t[last], color=_STALE, linewidth=0, zorder=0)
-    c = _thinned(t, value, half)
-    axes.fill_between(c.t, c.band_low / scale, c.band_high / scale, color=BAND, linewidth=0, zorder=1)
-    if c.thinned:
-        axes.fill_between(c.t, c.low / scale, c.high / scale, color=PREDICTED, linewidth=1.0, zorder=3)
-    elif t.size == 1:
+    axes.fill_between(*extremes(t, (value - half) / scale, (value + half) / scale), color=BAND, linewidth=0, zorder=1)
+    if t.size == 1:
         axes.errorbar(t, value / scale, half / scale, color=PREDICTED, marker="o", capsize=4, zorder=3)
     else:
-        axes.plot(c.t, c.low / scale, color=PREDICTED, linewidth=1.4, zorder=3)
+        curve(axes, t, value / scale, PREDICTED, None, linewidth=1.4, alpha=1.0, zorder=3)
     if truth is not None:
         axes.plot(truth[0], truth[1] / scale, color=_TRUTH, linewidth=1.1, linestyle=(0, (4, 2)), zorder=4)
         _say(axes, truth_words(t, value, sd, stale, truth))
@@ -241,21 +202,6 @@ def _relative_axis(axes: Axes, history: TrackHistory, name: str, scale: float) -
     beside = axes.secondary_yaxis("right", functions=(percent, own_unit))
     beside.tick_params(labelsize=8, colors="#555555")
     beside.set_ylabel("% from start", fontsize=8, color="#555555")
-
-
-def _thinned(t: Array, value: Array, half: Array) -> _Curve:
-    low, high = value - half, value + half
-    if t.size <= 2 * _BINS:
-        return _Curve(t=t, low=value, high=value, band_low=low, band_high=high, thinned=False)
-    edges = np.linspace(0, t.size, _BINS + 1).astype(int)[:-1]
-    return _Curve(
-        t=t[edges],
-        low=np.fmin.reduceat(value, edges),
-        high=np.fmax.reduceat(value, edges),
-        band_low=np.fmin.reduceat(low, edges),
-        band_high=np.fmax.reduceat(high, edges),
-        thinned=True,
-    )
 
 
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
@@ -318,12 +264,11 @@ def event_words(event: Event) -> str:
 
 def _error_panel(axes: Axes, history: TrackHistory) -> None:
     t, error, limit = history.t, history.error, history.header.limit
-    c = _thinned(t, error, np.zeros_like(error))
-    if c.thinned:
-        axes.fill_between(c.t, c.low, c.high, color=MEASURED, linewidth=0.8)
-    else:
-        axes.plot(c.t, c.low, color=MEASURED, linewidth=1.0, marker="o" if t.size == 1 else None)
-    axes.fill_between(c.t, limit, c.high, where=list(c.high > limit), color=_OVER, alpha=0.55, linewidth=0, step="mid")
+    if t.size == 1:
+        axes.plot(t, error, "o", color=MEASURED)
+    curve(axes, t, error, MEASURED, None, linewidth=1.0, alpha=1.0)
+    at, _, high = extremes(t, error, error)
+    axes.fill_between(at, limit, high, where=list(high > limit), color=_OVER, alpha=0.55, linewidth=0, step="mid")
     axes.axhline(limit, color=_OVER, linewidth=1.2, linestyle="--")
     known = error[np.isfinite(error)]
     top = max(1.25 * limit, 1.05 * float(known.max(initial=0.0)))
@@ -369,7 +314,7 @@ def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequenc
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    thin = f", extremes of {history.n_lines // _BINS} lines each" if history.n_lines > 2 * _BINS else ""
+    thin = f", extremes of {history.n_lines // PIXELS} lines each" if history.n_lines > 2 * PIXELS else ""
     entries: list[Any] = [
         Line2D([], [], color=PREDICTED, linewidth=1.4, label=f"accepted value{thin}"),
         Patch(color=BAND, label="95 % band"),

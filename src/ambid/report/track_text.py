@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -11,7 +10,17 @@ from typing import TYPE_CHECKING
 
 from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
-from ambid.report.text import WIDTH, Paint, Style, columns, interval_words, joined, plain, verdict_table, warning_lines
+from ambid.report.text import (
+    WIDTH,
+    Paint,
+    columns,
+    hanging,
+    interval_words,
+    joined,
+    plain,
+    verdict_table,
+    warning_lines,
+)
 from ambid.track.lines_file import NORMAL_95
 
 if TYPE_CHECKING:
@@ -77,13 +86,13 @@ def parameter_lines(header: TrackHeader, last: TrackLine, *, width: int = WIDTH,
     `width`: columns of the terminal; where they are too few, the interval is left out; `paint`: adds colour. Returns a
     header and a line for each parameter.
     """
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, v in last.parameters.items():
         value, interval = value_words(v, header.units.get(name, ""))
-        rows.append((name, value, interval, change_words(v, header.start.get(name)), "STALE" if v.stale else "tracked"))
+        change = change_words(v, header.start.get(name))
+        rows.append((name, value, interval, change, *(("STALE", "bad") if v.stale else ("tracked", "good"))))
     head = ("", "value ± sd", "95 % interval", "from start", "verdict")
-    styles: list[Style] = ["bad" if v.stale else "good" for v in last.parameters.values()]
-    return verdict_table(head, rows, styles, right=3, spare=2, width=width, paint=paint)
+    return verdict_table(head, rows, right=3, spare=2, width=width, paint=paint)
 
 
 def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
@@ -156,10 +165,7 @@ def state_lines(
     """
     error = "not known" if math.isnan(last.error) else f"{last.error:.3g}"
     lines = [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"]
-    for trouble in troubles:
-        first, *more = _wrapped(trouble, width, 2, 2)
-        lines += [f"{paint('✗', 'bad')} {first}", *("  " + line for line in more)]
-    return lines
+    return [*lines, *(x for trouble in troubles for x in hanging(f"{paint('✗', 'bad')} ", trouble, width, 2))]
 
 
 def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
@@ -174,9 +180,8 @@ def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = p
         who = f" {e.parameter}" if e.parameter else ""
         head = f"{e.t:10.3f} s  "
         what = f"{e.kind}{who}: "
-        first, *more = _wrapped(e.why, width, len(head) + len(what), len(head))
-        lines.append(head + paint(what, "bad" if e.kind in _BAD else "strong") + first)
-        lines += [" " * len(head) + line for line in more]
+        painted = head + paint(what, "bad" if e.kind in _BAD else "strong")
+        lines += hanging(painted, e.why, width, len(head), len(head) + len(what))
     return lines
 
 
@@ -220,15 +225,6 @@ def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> s
 
 def _counted(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
-
-
-def _wrapped(text: str, width: int, first: int, rest: int) -> list[str]:
-    """Lines of a text whose first line begins `first` columns in and the others `rest`, without those spaces."""
-    lines = textwrap.wrap(
-        "x" * first + text, max(width, first + 20), subsequent_indent=" " * rest, break_long_words=False,
-        break_on_hyphens=False,
-    )  # fmt: skip
-    return [lines[0][first:], *(line[rest:] for line in lines[1:])] if lines else [""]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
