@@ -32,9 +32,9 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.signals.delay import lagged_triangle
 
-Kernel = Literal["tc", "dc"]
+Kernel = Literal["tc", "dc", "ss"]
 
-SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2}  # numbers beside the size
+SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2, "ss": 1}  # numbers beside the size
 
 
 def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Array]]:
@@ -49,17 +49,24 @@ def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Arr
     if kernel == "tc":
         K = np.exp(log[0] * most)
         return K, [most * K]
-    K = np.exp(log[0] * both / 2 + log[1] * apart)
-    return K, [both / 2 * K, apart * K]
+    if kernel == "dc":
+        K = np.exp(log[0] * both / 2 + log[1] * apart)
+        return K, [both / 2 * K, apart * K]
+    first, second = np.exp(log[0] * (both + most)) / 2, np.exp(log[0] * 3 * most) / 6
+    return first - second, [(both + most) * first - 3 * most * second]
 
 
 def kernel_root(kernel: Kernel, n: int, shape: Array) -> Array:
-    """Return L with L L^T = K.
+    """Return L with L L^T = K; exact for TC and DC, to rounding for SS.
 
     `n`: taps. Returns (n, n).
     """
     i = np.arange(n)
     apart = np.abs(np.subtract.outer(i, i))
+    if kernel == "ss":  # smooth, so nearly singular: a trace of roughness on every tap makes it definite
+        alike = 1.5 * shape[0] ** (0.5 * apart) - 0.5 * shape[0] ** (1.5 * apart)
+        size = shape[0] ** (1.5 * (i + 1)) / np.sqrt(3.0)
+        return np.asarray(size[:, None] * np.linalg.cholesky(alike + 1e-10 * np.eye(n)))
     decay, rho = (shape[0], shape[1]) if kernel == "dc" else (shape[0], np.sqrt(shape[0]))
     lower = np.tril(rho**apart)
     lower[:, 1:] *= np.sqrt(max(1.0 - rho**2, 0.0))
@@ -103,7 +110,7 @@ def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int
     return Triangle(R=R[phi, phi], r=R[phi, y], left=R[y, y].T @ R[y, y], head=R[0], rows=rows - first)
 
 
-def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel] = tuple(SHAPES)) -> Posterior:
+def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel]) -> Posterior:
     """Choose sizes, shapes and the kernel by marginal likelihood.
 
     `output`: column of y; `kernels`: to choose from.
@@ -226,7 +233,7 @@ def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
     n_y = data.n_outputs
     whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
     t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
-    found = [posterior(t, o, (lags,) * z.shape[1]) for o in range(n_y)]
+    found = [posterior(t, o, (lags,) * z.shape[1], ("tc", "dc")) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T
     noise = (t.left + error.T @ error) / max(t.rows - 1 - float(np.mean([f.freedom for f in found])), 1.0)
@@ -351,7 +358,7 @@ def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
     """
     check_order_names("rfir", orders, ("nb", "nk"), ("nb",))
     nb = order_per_input("rfir", orders, "nb", 1, data.n_inputs)
-    nk = order_per_input("rfir", {"nk": 1, **orders}, "nk", 0, data.n_inputs)
+    nk = order_per_input("rfir", {"nk": 0, **orders}, "nk", 0, data.n_inputs)
     layout = arx_layout(0, nb, nk)
     check_length("rfir", data, 4 * (data.n_samples - layout.first_row), sum(nb) + 1)
     with one_thread():
@@ -461,7 +468,7 @@ def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array
     lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
     nb, first = layout.nb, layout.first_row
     t = triangle([(u[:, i], k) for i, k in lags], y, first)
-    rough = [posterior(t, o, nb) for o in range(data.n_outputs)]
+    rough = [posterior(t, o, nb, tuple(SHAPES)) for o in range(data.n_outputs)]
     found = [_whiten(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
     return found, (means, u_sd), (y_mean, y_sd)
 

@@ -52,7 +52,7 @@ def in_loop(n, seed, *, noise=0.5, told=False):
     return IOData(u=u[:, None], y=y[:, None], dt=0.1, inputs=("u0",), outputs=("y",), units={}, open_loop=told)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc"])
+@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
 def test_kernels_and_roots_agree(kernel):
     shape = np.array([0.8, 0.95])[: 2 if kernel == "dc" else 1]
     K, slopes = kernel_matrix(kernel, 30, shape)
@@ -65,7 +65,7 @@ def test_kernels_and_roots_agree(kernel):
         np.testing.assert_allclose(kernel_matrix(kernel, 30, complex_shape)[0].imag / 1e-30, slope, rtol=1e-12)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc"])
+@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
 def test_the_gradient_and_the_value_of_the_evidence_are_exact(kernel):
     data = record(400, 1, inputs=2)
     u, y = data.u - data.u.mean(axis=0), data.y[:, 0] - data.y.mean()
