@@ -36,6 +36,8 @@ Kernel = Literal["tc", "dc", "ss"]
 
 SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2, "ss": 1}  # numbers beside the size
 
+_SURE: tuple[Kernel, ...] = ("tc", "dc")  # whose bands hold at the single tap; SS is too smooth for that
+
 
 def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Array]]:
     """Return a kernel and its derivatives by the logarithms of its shape.
@@ -233,7 +235,7 @@ def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
     n_y = data.n_outputs
     whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
     t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
-    found = [posterior(t, o, (lags,) * z.shape[1], ("tc", "dc")) for o in range(n_y)]
+    found = [posterior(t, o, (lags,) * z.shape[1], _SURE) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T
     noise = (t.left + error.T @ error) / max(t.rows - 1 - float(np.mean([f.freedom for f in found])), 1.0)
@@ -350,7 +352,7 @@ class ImpulseResponse:
         return int(np.argmax(out)) if np.any(out) else None
 
 
-def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
+def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = tuple(SHAPES)) -> BlackBoxFit:
     """Estimate a long FIR model with a fading prior; every output by itself.
 
     `data`: without feedback. Returns a PolynomialModel whose covariance is that of the posterior; `n_estimated` is the
@@ -362,7 +364,7 @@ def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
     layout = arx_layout(0, nb, nk)
     check_length("rfir", data, 4 * (data.n_samples - layout.first_row), sum(nb) + 1)
     with one_thread():
-        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout)
+        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout, kernels)
     theta, covariance = list[Array](), list[Array]()
     for f, sd in zip(found, y_sd, strict=True):
         scale = np.concatenate([np.full(b, sd / s) for b, s in zip(nb, u_sd, strict=True)])
@@ -433,7 +435,7 @@ def impulse_response(data: IOData, n_taps: int, *, method: Literal["auto", "rfir
 
 def _direct(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
     """Fill in values and covariance; noise, kernels and warnings."""
-    fit = rfir(data, {"nb": values.shape[0], "nk": 0})
+    fit = rfir(data, {"nb": values.shape[0], "nk": 0}, kernels=_SURE)
     assert isinstance(fit.model, PolynomialModel)
     assert fit.covariance is not None
     for o, letter, i, place in fit.model.blocks():
@@ -460,7 +462,9 @@ def _through_autoregression(
     return np.sqrt(np.diag(taps.noise)) * taps.y_sd, taps.kernels, warnings
 
 
-def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
+def _regress(
+    data: IOData, layout: Layout, kernels: Sequence[Kernel]
+) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
     """Scale, reduce to a triangle, and fit each output."""
     means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
     y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
@@ -468,7 +472,7 @@ def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array
     lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
     nb, first = layout.nb, layout.first_row
     t = triangle([(u[:, i], k) for i, k in lags], y, first)
-    rough = [posterior(t, o, nb, tuple(SHAPES)) for o in range(data.n_outputs)]
+    rough = [posterior(t, o, nb, kernels) for o in range(data.n_outputs)]
     found = [_whiten(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
     return found, (means, u_sd), (y_mean, y_sd)
 
