@@ -171,22 +171,14 @@ def _free(model: StateSpaceModel, feedthrough: bool) -> NDArray[np.bool_]:
     return free
 
 
-def _change_states(model: StateSpaceModel, T: Array) -> StateSpaceModel:
-    """The same model in the state T^-1 x."""
-    back = np.linalg.inv(T)
-    return StateSpaceModel(
-        A=back @ model.A @ T, B=back @ model.B, C=model.C @ T, D=model.D, K=back @ model.K, dt=model.dt
-    )
-
-
 def _balance(model: StateSpaceModel) -> StateSpaceModel:
     """States of which inputs and outputs speak alike: rows of B and columns of C of equal size, A balanced."""
     from scipy.linalg import matrix_balance
 
     _, T = matrix_balance(model.A)
-    model = _change_states(model, np.asarray(T))
+    model = model.in_states(np.asarray(T))
     b, c = np.linalg.norm(model.B), np.linalg.norm(model.C)
-    return _change_states(model, np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
+    return model.in_states(np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
 
 
 _GRID = 9  # values of p that are tried

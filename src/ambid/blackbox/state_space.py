@@ -88,6 +88,22 @@ class StateSpaceModel:
             first += rows * columns
         return StateSpaceModel(dt=self.dt, **parts)
 
+    def in_states(self, T: Array) -> StateSpaceModel:
+        """Return the same model in the state T^-1 x.
+
+        Parameters
+        ----------
+        T : ndarray, shape (n, n)
+
+        Returns
+        -------
+        StateSpaceModel
+        """
+        back = np.linalg.inv(T)
+        return StateSpaceModel(
+            A=back @ self.A @ T, B=back @ self.B, C=self.C @ T, D=self.D, K=back @ self.K, dt=self.dt
+        )
+
     def state_space(self) -> StateSpaceModel:
         """Return the model itself."""
         return self

@@ -10,7 +10,7 @@ every T (McKelvey, Helmersson and Ribarits 2004, Automatica 40, 1629). Efficient
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,14 +19,22 @@ from scipy.linalg.lapack import dtpqrt
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
-from ambid.blackbox.fit import BlackBoxFit, build_fit
+from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.response import Sensitivities
 from ambid.blackbox.state_space import StateSpaceModel
-from ambid.blackbox.subspace import FirstModel, Method, embed_delays, first_model, operating_point, to_units
+from ambid.blackbox.subspace import (
+    Asked,
+    FirstModel,
+    Method,
+    Tick,
+    build_subspace_fit,
+    first_model,
+    operating_point,
+)
 from ambid.blackbox.subspace_projection import Realisation, kalman_gain, radius
 from ambid.errors import EstimationError
 from ambid.estimation.kernels import state_scan
-from ambid.estimation.linear import directions, one_thread
+from ambid.estimation.linear import directions, least_squares, one_thread
 
 _DOUBLINGS = 24  # samples as a power of two
 _FAINT = 1e-10  # Hankel singular value beside the largest below which a state is not scaled further
@@ -78,19 +86,6 @@ def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
     return out
 
 
-def move(model: StateSpaceModel, change: Array) -> StateSpaceModel:
-    """Return the model with its coefficients changed.
-
-    `change`: (n_theta,).
-    """
-    theta, parts, at = model.theta + change, {}, 0
-    for name in "ABCDK":
-        shape = getattr(model, name).shape
-        parts[name] = theta[at : at + shape[0] * shape[1]].reshape(shape)
-        at += shape[0] * shape[1]
-    return StateSpaceModel(**parts, dt=model.dt)
-
-
 def balance(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpaceModel, Array]:
     """Return the model in states that white inputs and outputs drive, and the predictions show, by equal amounts.
 
@@ -111,7 +106,7 @@ def balance(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpace
         return model, x0
     if not (np.all(np.isfinite(T)) and np.linalg.cond(T) < 1e12):
         return model, x0
-    return StateSpaceModel(A=T @ m.A @ back, B=T @ m.B, C=m.C @ back, D=m.D, K=T @ m.K, dt=m.dt), T @ x0
+    return m.in_states(back), T @ x0
 
 
 def _gramian(F: Array, G: Array) -> Array:
@@ -134,8 +129,6 @@ def _factor(gramian: Array) -> Array:
         raise np.linalg.LinAlgError("nothing drives the states")
     return np.asarray(ways * np.sqrt(np.maximum(values, 1e-14 * values[-1])))
 
-
-Tick = Callable[[], None] | None
 
 _BLOCK = 2048  # samples at once
 _PANEL = 32
@@ -228,25 +221,21 @@ def _step(
 ) -> tuple[Point | None, float]:
     """Find a better point: more damping after failure, a shorter step where the predictor gets unstable."""
     n, k = point.model.order, point.model.order + point.model.n_outputs
-    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
-    rows, right = factor[:-1, :-1] / size, factor[:-1, -1]
-    U, s, Vt = np.linalg.svd(rows)
-    s = np.maximum(s, 1e-300)
-    along = U.T @ right
+    rows, right = factor[:-1, :-1], factor[:-1, -1]
+    seen = directions(rows)
     while damping < 1e10:
-        scaled = Vt.T @ (along * s / (s**2 + damping))
-        change, part = scaled / size, 1.0
-        model = move(point.model, ways @ change[k:])
+        change, part = seen.solve(right, damping), 1.0
+        model = point.model.with_theta(point.model.theta + ways @ change[k:])
         while radius(model.A - model.K @ model.C) >= 1.0 and part > _SHORTEST:
             part *= 0.5
-            model = move(point.model, ways @ (part * change[k:]))
+            model = point.model.with_theta(point.model.theta + ways @ (part * change[k:]))
         trial = None
         if part > _SHORTEST:
             near = replace(
                 point, model=model, x0=point.x0 + part * change[:n], constant=point.constant + part * change[n:k]
             )
             trial = _settle(near, linear(model, feedthrough=feedthrough), u, y)
-        left = right - part * rows @ scaled
+        left = right - part * rows @ change
         promised = float(right @ right - left @ left)
         if trial is not None and point.cost - trial.cost > 1e-3 * promised > 0:
             good = point.cost - trial.cost > 0.5 * promised and part == 1.0
@@ -261,10 +250,8 @@ def _settle(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
     factor = _triangle(rough, ways, u, y)
     if not np.all(np.isfinite(factor)):
         return None
-    size = np.maximum(np.linalg.norm(factor[:-1, :-1], axis=0), 1e-150)
-    solved = np.linalg.lstsq(factor[:-1, :-1] / size, factor[:-1, -1], rcond=1e-10)[0]
-    change = np.asarray(solved / size, dtype=np.float64)
-    model = move(rough.model, ways @ change[k:])
+    change = least_squares(factor[:-1, :-1], factor[:-1, -1])
+    model = rough.model.with_theta(rough.model.theta + ways @ change[k:])
     return _evaluate(model, rough.x0 + change[:n], rough.constant + change[n:k], u, y)
 
 
@@ -323,15 +310,7 @@ def _triangle(point: Point, ways: Array, u: Array, y: Array) -> Array:
 _LOOSE = 1e6  # condition of the scaled information's root from which states are told apart by rounding alone
 
 
-def sspem(
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
-    tick: Tick = None,
-) -> BlackBoxFit:
+def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
     """Identify a state-space model by prediction error (local coordinates: McKelvey et al. 2004, Automatica 40, 1629).
 
     Parameters
@@ -340,10 +319,6 @@ def sspem(
     orders : Mapping
         ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
         or one for each, at least 1 (default); larger ones become states of their own.
-    horizon, past : int, optional
-        Samples of future and past of the subspace estimate it starts from.
-    feedthrough : bool, optional
-        Whether to estimate D; as for `n4sid` if missing.
     tick : callable, optional
         Called between steps.
 
@@ -359,8 +334,8 @@ def sspem(
         a stable predictor.
     """
     with one_thread():
-        first = first_model("pbsid", data, orders, horizon, past, feedthrough, tick)
-        n, given = first.full.A.shape[0], first.plan.channels
+        first = first_model("pbsid", data, orders, Asked(tick=tick))
+        n, given = first.full.model.order, first.plan.channels
         u, y = (given.u - given.mean_u) / given.scale_u, (given.y - given.mean_y) / given.scale_y
         numbers = n * (u.shape[1] + 2 * y.shape[1] + 1) + y.shape[1] * (1 + first.plan.feedthrough * u.shape[1])
         if y.size < 2 * numbers:
@@ -368,37 +343,28 @@ def sspem(
                 f"sspem: {y.shape[0]} samples for {numbers} numbers; it wants at least {2 * numbers} values. "
                 "Lower n, or take a longer record"
             )
-        method, start = _start(data, first, orders, u, y, horizon, past, tick)
+        method, start = _start(data, first, orders, u, y, tick)
         found = search(start, u, y, feedthrough=first.plan.feedthrough, tick=tick)
     return _result(data, first, found, method, start)
 
 
-def _start(
-    data: IOData,
-    first: FirstModel,
-    orders: Orders,
-    u: Array,
-    y: Array,
-    horizon: int | None,
-    past: int | None,
-    tick: Tick,
-) -> tuple[Method, Point]:
+def _start(data: IOData, first: FirstModel, orders: Orders, u: Array, y: Array, tick: Tick) -> tuple[Method, Point]:
     """Take the subspace estimate with the smallest determinant: pbsid, and cva where there is no feedback."""
-    n = first.full.A.shape[0]
+    n = first.full.model.order
     tried: list[tuple[Method, Realisation]] = [("pbsid", first.full)]
     if data.open_loop or not data.n_inputs:
         try:
-            both = {**orders, "n": n}
-            other = first_model("cva", data, both, horizon, past, first.plan.feedthrough, tick)
-            tried.append(("cva", other.full))
+            asked = Asked(feedthrough=first.plan.feedthrough, tick=tick)
+            tried.append(("cva", first_model("cva", data, {**orders, "n": n}, asked).full))
         except EstimationError:  # a record too short for cva may still do for pbsid
             pass
     points = list[tuple[Method, Point]]()
     for method, one in tried:
-        point = start_point(_model(one, one.K, data.dt), one.innovation + 1e-12 * np.eye(y.shape[1]), u, y)
+        m = replace(one.model, dt=data.dt)
+        point = start_point(m, one.innovation + 1e-12 * np.eye(y.shape[1]), u, y)
         if point is None:
-            K, noise, _ = kalman_gain(one.A, one.C, np.eye(n), np.zeros_like(one.K), np.eye(y.shape[1]))
-            point = start_point(_model(one, K, data.dt), noise, u, y)
+            K, noise, _ = kalman_gain(m.A, m.C, np.eye(n), np.zeros_like(m.K), np.eye(y.shape[1]))
+            point = start_point(replace(m, K=K), noise, u, y)
         if point is not None:
             points.append((method, point))
     if not points:
@@ -408,10 +374,6 @@ def _start(
     return min(points, key=lambda pair: pair[1].cost)
 
 
-def _model(one: Realisation, K: Array, dt: float) -> StateSpaceModel:
-    return StateSpaceModel(A=one.A, B=one.B, C=one.C, D=one.D, K=K, dt=dt)
-
-
 def _result(data: IOData, first: FirstModel, found: Found, method: Method, start: Point) -> BlackBoxFit:
     """Give the numbers their units and say what has to be said of them."""
     m, plan, given = found.point.model, first.plan, first.plan.channels
@@ -419,14 +381,9 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
     # each output has its share of the numbers
     widened = n_samples / (n_samples - found.n_numbers / n_y)
     noise = found.point.noise * widened
-    scaled = _realisation(m, noise)
-    core, scale = to_units(scaled, given, data.dt)
-    model, places = embed_delays(core, plan.nk)
-    half = found.tangent * scale[:, None]
-    own = half @ directions(found.information).inverse() @ half.T * widened
-    covariance = np.zeros((model.theta.size, model.theta.size))
-    covariance[np.ix_(places, places)] = 0.5 * (own + own.T)
-    condition = _condition(found.information)
+    scaled = Realisation(model=m, innovation=noise, Q=m.K @ noise @ m.K.T, S=m.K @ noise, R=noise)
+    seen = directions(found.information)
+    condition = min(seen.condition, 1e18)
     warnings = []
     if found.point.exact:
         warnings.append(
@@ -438,16 +395,15 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
             f"the record does not tell all {m.order} states apart (condition {condition:.1g}): standard deviations "
             "along what it does not show mean little. Lower n"
         )
-    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
-    return build_fit(
+    return build_subspace_fit(
         "sspem",
         data,
-        orders={"n": m.order, **delays},
-        model=model,
-        covariance=covariance,
+        plan,
+        scaled,
+        found.tangent @ seen.inverse() @ found.tangent.T * widened,
+        criterion=first.criterion,
         n_estimated=found.tangent.shape[1],
         offsets=operating_point(scaled, given, found.point.constant),
-        noise_covariance=noise * np.outer(given.scale_y, given.scale_y),
         status="converged" if found.converged else "stalled",
         warnings=warnings,
         details={
@@ -457,20 +413,5 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
             "left_nats": 0.5 * found.promise,
             "condition_number": condition,
             "covariance": {"kind": "information"},
-            "feedthrough": plan.feedthrough,
-            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
-            "order_criterion": None if first.criterion is None else first.criterion.tolist(),
         },
     )
-
-
-def _realisation(m: StateSpaceModel, noise: Array) -> Realisation:
-    return Realisation(
-        A=m.A, B=m.B, C=m.C, D=m.D, K=m.K, innovation=noise, Q=m.K @ noise @ m.K.T, S=m.K @ noise, R=noise
-    )
-
-
-def _condition(root: Array) -> float:
-    """Condition number of the columns over their sizes, at most 1e18."""
-    s = np.linalg.svd(root / np.maximum(np.linalg.norm(root, axis=0), 1e-150), compute_uv=False)
-    return float(s[0] / max(s[-1], 1e-18 * s[0]))

@@ -8,9 +8,9 @@ group of time for the covariance (delete-a-group jackknife; Shao and Tu 1995, ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,19 @@ _LONGEST = {"n4sid": 20, "moesp": 20, "cva": 20, "pbsid": 60}  # samples of past
 _WIDEST = {"n4sid": 100, "moesp": 100, "cva": 100, "pbsid": 240}  # columns of past
 
 
+Tick = Callable[[], None] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What was asked for beside the order."""
+
+    horizon: int | None = None  # samples of future and past; chosen if missing
+    past: int | None = None
+    feedthrough: bool | None = None  # whether to estimate D
+    tick: Tick = None  # called between steps
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
     """All that an estimate needs."""
@@ -74,22 +87,12 @@ class Plan:
     past_limited: bool  # whether the criterion wanted a longer past than was tried
 
 
-def plan_estimate(
-    method: Method,
-    data: IOData,
-    orders: Orders,
-    *,
-    horizon: int | None,
-    past: int | None,
-    feedthrough: bool | None,
-    n_max: int | None = None,
-    tick: Callable[[], None] | None = None,
-) -> Plan:
+def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_max: int | None = None) -> Plan:
     """Check what was asked for, compress the record and choose what was left open.
 
-    `horizon`, `past`: samples of future and past; chosen if missing; `n_max`: largest order to try; `tick`: called
-    between steps.
+    `n_max`: largest order to try.
     """
+    horizon, past, feedthrough = asked.horizon, asked.past, asked.feedthrough
     n, nk = _read_orders(method, data, orders)
     _check_finite(data)
     given = channels(data, tuple(k - 1 for k in nk))
@@ -97,8 +100,8 @@ def plan_estimate(
     longest = _longest(method, data, given.n_samples, largest, horizon, past)
     length = _window(method, longest, horizon, past)
     factors = compress(given, length, _GROUPS)
-    if tick is not None:
-        tick()
+    if asked.tick is not None:
+        asked.tick()
     total = merge_factors(factors.groups)
     check_inputs_differ(factors, total, data.inputs, 1)
     criterion = autoregression_criterion(factors, total)
@@ -197,22 +200,52 @@ def _feedthrough(data: IOData, factors: Factors, total: Array, past: int) -> boo
     return bool(factors.n_rows * (without - with_it) > n_u * n_y * np.log(factors.n_rows))
 
 
-def to_units(scaled: Realisation, given: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
-    """Return the model in SI, and what its coefficients were multiplied by.
+def build_subspace_fit(
+    name: str,
+    data: IOData,
+    plan: Plan,
+    scaled: Realisation,
+    covariance: Array | None,
+    details: Mapping[str, object],
+    criterion: Array | None,
+    **more: Any,
+) -> BlackBoxFit:
+    """Give the numbers their units and put the result together.
 
-    Returns `scale`: (n_theta,).
+    `covariance`: (n_theta, n_theta), of the scaled coefficients; `criterion`: by which the order was chosen; `more`:
+    as `build_fit` takes it.
     """
+    core, scale = to_units(scaled, plan.channels, data.dt)
+    model, places = embed_delays(core, plan.nk)
+    if covariance is not None:
+        wide = np.zeros((model.theta.size, model.theta.size))
+        wide[np.ix_(places, places)] = covariance * np.outer(scale, scale)
+        covariance = 0.5 * (wide + wide.T)
+    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
+    return build_fit(
+        name,
+        data,
+        orders={"n": core.order, **delays},
+        model=model,
+        covariance=covariance,
+        noise_covariance=scaled.innovation * np.outer(plan.channels.scale_y, plan.channels.scale_y),
+        details={
+            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
+            "order_criterion": None if criterion is None else criterion.tolist(),
+            "feedthrough": plan.feedthrough,
+            **details,
+        },
+        **more,
+    )
+
+
+def to_units(scaled: Realisation, given: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
+    """Return the model in SI, and what its coefficients were multiplied by, (n_theta,)."""
     u, y = given.scale_u, given.scale_y
-    n = scaled.A.shape[0]
-    factors = {
-        "A": np.ones((n, n)),
-        "B": np.ones((n, 1)) / u,
-        "C": y[:, None] * np.ones((1, n)),
-        "D": y[:, None] / u,
-        "K": np.ones((n, 1)) / y,
-    }
-    model = StateSpaceModel(**{m: getattr(scaled, m) * f for m, f in factors.items()}, dt=dt)
-    return model, np.concatenate([f.ravel() for f in factors.values()])
+    n = scaled.model.order
+    factors = (np.ones((n, n)), np.ones((n, 1)) / u, y[:, None] * np.ones(n), y[:, None] / u, np.ones((n, 1)) / y)
+    scale = np.concatenate([f.ravel() for f in factors])
+    return replace(scaled.model.with_theta(scaled.model.theta * scale), dt=dt), scale
 
 
 def embed_delays(core: StateSpaceModel, nk: tuple[int, ...]) -> tuple[StateSpaceModel, NDArray[np.intp]]:
@@ -221,39 +254,25 @@ def embed_delays(core: StateSpaceModel, nk: tuple[int, ...]) -> tuple[StateSpace
     `core`: for inputs that come nk - 1 samples early. Returns `model`: for the inputs as recorded; `places`: (n_theta
     of core,), where each coefficient of the core is among those of the model.
     """
+    numbers = np.arange(2.0, core.theta.size + 2)
+    home = {x: k for k, x in enumerate(_embed(core.with_theta(numbers), nk).theta.tolist())}
+    return _embed(core, nk), np.array([home[x] for x in numbers.tolist()], dtype=np.intp)
+
+
+def _embed(core: StateSpaceModel, nk: tuple[int, ...]) -> StateSpaceModel:
     n, extra = core.order, sum(k - 1 for k in nk)
-    N, n_u, n_y = n + extra, core.n_inputs, core.n_outputs
-    value = {m: np.zeros(s) for m, s in zip("ABCDK", ((N, N), (N, n_u), (n_y, N), (n_y, n_u), (N, n_y)), strict=True)}
-    value["A"][:n, :n], value["C"][:, :n], value["K"][:n] = core.A, core.C, core.K
-    home = {
-        "A": [(i, j) for i in range(n) for j in range(n)],
-        "B": [],
-        "C": [(i, j) for i in range(n_y) for j in range(n)],
-        "D": [],
-        "K": [(i, j) for i in range(n) for j in range(n_y)],
-    }
-    entry: list[tuple[str, int]] = []  # for each input: matrices and column by which it enters the core
+    A, C = (np.pad(x, ((0, more), (0, extra))) for x, more in ((core.A, extra), (core.C, 0)))
+    B, K, D = np.pad(core.B, ((0, extra), (0, 0))), np.pad(core.K, ((0, extra), (0, 0))), core.D.copy()
     first = n
     for j, k in enumerate(nk):
         if k == 1:
-            entry.append(("now", j))
             continue
+        A[:n, first], C[:, first], B[:, j], D[:, j] = core.B[:, j], core.D[:, j], 0.0, 0.0
         for i in range(first, first + k - 2):
-            value["A"][i, i + 1] = 1.0
-        value["B"][first + k - 2, j] = 1.0
-        entry.append(("late", first))
+            A[i, i + 1] = 1.0
         first += k - 1
-    for j, (when, column) in enumerate(entry):
-        value["B" if when == "now" else "A"][:n, column] = core.B[:, j]
-        value["D" if when == "now" else "C"][:, column] = core.D[:, j]
-    model = StateSpaceModel(**value, dt=core.dt)
-    index = {name: i for i, name in enumerate(model.names)}
-    places = [index[f"A[{i},{j}]"] for i, j in home["A"]]
-    places += [index[f"{'B' if w == 'now' else 'A'}[{i},{c}]"] for i in range(n) for w, c in entry]
-    places += [index[f"C[{i},{j}]"] for i, j in home["C"]]
-    places += [index[f"{'D' if w == 'now' else 'C'}[{i},{c}]"] for i in range(n_y) for w, c in entry]
-    places += [index[f"K[{i},{j}]"] for i, j in home["K"]]
-    return model, np.array(places, dtype=np.intp)
+        B[first - 1, j] = 1.0
+    return StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=core.dt)
 
 
 def offsets(scaled: Realisation, plan: Plan) -> Offsets:
@@ -262,7 +281,7 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
     A shift of y by dy and of u by du moves their mean by Py dy - Pu du, the predictor's answers at frequency zero:
     finite and solvable for unstable plants and integrators too. The shortest shift of means is taken.
     """
-    f, s = plan.factors, scaled
+    f, s = plan.factors, scaled.model
     mean = plan.total[0] / plan.total[0, 0]
     now = f.length - 1
     error = mean[f.columns("y", now, now + 1)] - s.D @ mean[f.columns("u", now, now + 1)]
@@ -279,7 +298,7 @@ def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offse
 
     `error`: (n_outputs,), mean of the innovations of the centred, scaled channels.
     """
-    s = scaled
+    s = scaled.model
     n, n_u = s.A.shape[0], s.B.shape[1]
     F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
     at_rest = s.C @ np.linalg.solve(np.eye(n) - F, G)
@@ -288,8 +307,6 @@ def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offse
     n_y = s.C.shape[0]
     return Offsets(u=given.mean_u - shift[n_y:] * given.scale_u, y=given.mean_y - shift[:n_y] * given.scale_y)
 
-
-Tick = Callable[[], None] | None
 
 _HORIZONS = (4, 6, 8, 11, 15, 20)  # samples of future that are tried
 
@@ -305,49 +322,26 @@ class FirstModel:
     criterion: Array | None  # (n_states + 1,), or None, by which the order was chosen; None where it was given
 
 
-def estimate(
-    method: Method,
-    data: IOData,
-    orders: Orders,
-    horizon: int | None,
-    past: int | None,
-    feedthrough: bool | None,
-    tick: Tick,
-) -> BlackBoxFit:
-    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance.
-
-    `horizon`, `past`: samples.
-    """
+def estimate(method: Method, data: IOData, orders: Orders, asked: Asked) -> BlackBoxFit:
+    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance."""
     with one_thread():
-        first = first_model(method, data, orders, horizon, past, feedthrough, tick)
-        plan, given, found, full, criterion = first.plan, first.given, first.found, first.full, first.criterion
-        n, others = full.A.shape[0], []
+        first = first_model(method, data, orders, asked)
+        plan, others = first.plan, []
         for factor in leave_each_out(plan.factors.arranged(_columns(plan))):
-            if tick is not None:
-                tick()
-            others.append(model_of(plan, _decompose(plan, factor, given), n))
-        covariance = jackknife(full, others, plan.future, with_bias=method != "pbsid")
-    return _result(method, data, plan, found, given, full, covariance, criterion)
+            if asked.tick is not None:
+                asked.tick()
+            others.append(model_of(plan, _decompose(plan, factor, first.given), first.full.model.order))
+        covariance = jackknife(first.full, others, plan.future, with_bias=method != "pbsid")
+    return _result(method, data, first, covariance)
 
 
-def first_model(
-    method: Method,
-    data: IOData,
-    orders: Orders,
-    horizon: int | None,
-    past: int | None,
-    feedthrough: bool | None,
-    tick: Tick,
-) -> FirstModel:
-    """Compress, decompose, choose the order, regress.
-
-    `horizon`, `past`: samples.
-    """
-    plan = plan_estimate(method, data, orders, horizon=horizon, past=past, feedthrough=feedthrough, tick=tick)
+def first_model(method: Method, data: IOData, orders: Orders, asked: Asked) -> FirstModel:
+    """Compress, decompose, choose the order, regress."""
+    plan = plan_estimate(method, data, orders, asked)
     criterion = None if plan.n else order_criterion(plan)
     n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
-    if method != "pbsid" and horizon is None:
-        plan = _choose_horizons(plan, n, keep_past=past is not None)
+    if method != "pbsid" and asked.horizon is None:
+        plan = _choose_horizons(plan, n, keep_past=asked.past is not None)
     check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
     given, found = decomposition(plan)
     return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
@@ -436,24 +430,10 @@ def order_criterion(plan: Plan) -> Array:
     return state_criterion(states.state[:most], states.y, plan.factors.n_inputs, plan.factors.n_rows)
 
 
-def _result(
-    method: Method,
-    data: IOData,
-    plan: Plan,
-    found: Projection | Prediction,
-    given: Prior | None,
-    full: Realisation,
-    covariance: Array | None,
-    criterion: Array | None,
-) -> BlackBoxFit:
-    """Give the numbers their units and say what has to be said of them."""
-    core, scale = to_units(full, plan.channels, data.dt)
-    model, places = embed_delays(core, plan.nk)
-    if covariance is not None:
-        wide = np.zeros((model.theta.size, model.theta.size))
-        wide[np.ix_(places, places)] = covariance * np.outer(scale, scale)
-        covariance = 0.5 * (wide + wide.T)
-    n, n_y, n_u = full.A.shape[0], data.n_outputs, data.n_inputs
+def _result(method: Method, data: IOData, first: FirstModel, covariance: Array | None) -> BlackBoxFit:
+    """Say what has to be said of the numbers."""
+    plan, given, full = first.plan, first.given, first.full
+    n, n_y, n_u = full.model.order, data.n_outputs, data.n_inputs
     y = plan.channels.scale_y
     warnings = []
     if covariance is None:
@@ -463,22 +443,18 @@ def _result(
     related = input_relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
     if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
         warnings.append(f"{related}: pbsid may share their effects out wrongly. Use cva or n4sid, or leave one out")
-    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
-    return build_fit(
+    return build_subspace_fit(
         method,
         data,
-        orders={"n": n, **delays},
-        model=model,
-        covariance=covariance,
+        plan,
+        full,
+        covariance,
+        criterion=first.criterion,
         n_estimated=n * (2 * n_y + n_u) + (n_u * n_y if plan.feedthrough else 0),
         offsets=offsets(full, plan),
-        noise_covariance=full.innovation * np.outer(y, y),
         warnings=warnings,
         details={
-            "singular_values": found.values.tolist(),
-            "horizons": {"past": plan.past, "future": plan.future, "past_limited": plan.past_limited},
-            "order_criterion": None if criterion is None else criterion.tolist(),
-            "feedthrough": plan.feedthrough,
+            "singular_values": first.found.values.tolist(),
             "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
             "condition_number": _condition(plan),
             "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
@@ -514,9 +490,6 @@ def subspace_models(
     n_max: int,
     *,
     nk: int | tuple[int, ...] = 1,
-    horizon: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = None,
     tick: Tick = None,
 ) -> tuple[OrderModel, ...]:
     """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram wants them.
@@ -529,10 +502,6 @@ def subspace_models(
         Largest order.
     nk : int or tuple of int, optional
         Known delay of the inputs in samples.
-    horizon, past : int, optional
-        Samples of future and past.
-    feedthrough : bool, optional
-        As for `n4sid`.
     tick : callable, optional
         Called between steps.
 
@@ -550,9 +519,7 @@ def subspace_models(
     if n_max < 1:
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
     with one_thread():
-        plan = plan_estimate(
-            method, data, {"nk": nk}, horizon=horizon, past=past, feedthrough=feedthrough, n_max=n_max, tick=tick
-        )
+        plan = plan_estimate(method, data, {"nk": nk}, Asked(tick=tick), n_max)
         _, found = decomposition(plan)
         criterion = order_criterion(plan)
         out = []
@@ -614,7 +581,7 @@ def _estimator(method: Method, summary: str, bound: str = "") -> Callable[..., B
         feedthrough: bool | None = None,
         tick: Tick = None,
     ) -> BlackBoxFit:
-        return estimate(method, data, orders, horizon, past, feedthrough, tick)
+        return estimate(method, data, orders, Asked(horizon=horizon, past=past, feedthrough=feedthrough, tick=tick))
 
     fit.__name__ = fit.__qualname__ = method
     fit.__doc__ = _CONTRACT.format(summary=summary, bound=bound)

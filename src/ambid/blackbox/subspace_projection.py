@@ -26,6 +26,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
+from ambid.blackbox.state_space import StateSpaceModel
 from ambid.errors import EstimationError
 
 _BLOCK_ROWS = 2048  # rows of the window matrix at once: some hundred columns of it stay in the cache
@@ -271,11 +272,7 @@ class Realisation:
     channels.
     """
 
-    A: Array  # (n, n)
-    B: Array  # (n, n_inputs)
-    C: Array  # (n_outputs, n)
-    D: Array  # (n_outputs, n_inputs)
-    K: Array  # (n, n_outputs)
+    model: StateSpaceModel  # without a sampling interval
     innovation: Array  # (n_outputs, n_outputs), covariance of the innovations
     Q: Array
     S: Array
@@ -432,7 +429,8 @@ def realise(projection: Projection, n: int, *, feedthrough: bool) -> Realisation
     Q, S, R = covariance[:n, :n], covariance[:n, n:], covariance[n:, n:]
     K, innovation, stable = kalman_gain(A, C, Q, S, R)
     B, D = BD[n_y:], BD[:n_y]
-    return Realisation(A=A, B=B, C=C, D=D, K=K, innovation=innovation, Q=Q, S=S, R=R, stable_predictor=stable)
+    model = StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=None)
+    return Realisation(model=model, innovation=innovation, Q=Q, S=S, R=R, stable_predictor=stable)
 
 
 def _input_part(
@@ -591,7 +589,8 @@ def regress_states(prediction: Prediction, n: int, *, feedthrough: bool) -> Real
     innovation, stable = R, True
     if radius(A - K @ C) >= 1.0:
         K, innovation, stable = kalman_gain(A, C, Q, S, R)
-    return Realisation(A=A, B=B, C=C, D=D, K=K, innovation=innovation, Q=Q, S=S, R=R, stable_predictor=stable)
+    model = StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=None)
+    return Realisation(model=model, innovation=innovation, Q=Q, S=S, R=R, stable_predictor=stable)
 
 
 def _regression(factor: Array, past: int, feedthrough: bool, like: Factors) -> tuple[Array, Array, Array]:
@@ -617,27 +616,6 @@ def _with_prior(rows: Array, right: Array, lags: Array, given: Prior) -> Array:
     return out
 
 
-def align_states(one: Realisation, like: Realisation, length: int) -> Realisation:
-    """Return a realisation in the state basis of another.
-
-    `one`, `like`: of equal order; `length`: block rows of the observability matrices that are compared.
-    """
-    T = least_squares(observability(one.A, one.C, length), observability(like.A, like.C, length))
-    back = np.linalg.inv(T)
-    return Realisation(
-        A=back @ one.A @ T,
-        B=back @ one.B,
-        C=one.C @ T,
-        D=one.D,
-        K=back @ one.K,
-        innovation=one.innovation,
-        Q=back @ one.Q @ back.T,
-        S=back @ one.S,
-        R=one.R,
-        stable_predictor=one.stable_predictor,
-    )
-
-
 def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, with_bias: bool) -> Array | None:
     """Return the covariance of vec(A, B, C, D, K), each row by row.
 
@@ -645,13 +623,13 @@ def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, 
     are compared; `with_bias`: whether to add the square of the bias that leaving out data shows. Returns (n_theta,
     n_theta), or None, none where a basis cannot be matched.
     """
-    rows = []
+    wanted, rows = observability(full.model.A, full.model.C, length), []
     for one in others:
         try:
-            same = align_states(one, full, length)
+            T = least_squares(observability(one.model.A, one.model.C, length), wanted)
+            rows.append(one.model.in_states(T).theta)
         except np.linalg.LinAlgError:
             return None
-        rows.append(theta(same))
     values = np.array(rows)
     if not np.all(np.isfinite(values)):
         return None
@@ -659,14 +637,6 @@ def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, 
     groups = values.shape[0]
     covariance = (groups - 1) / groups * deviations.T @ deviations
     if with_bias:
-        bias = (groups - 1) * (values.mean(0) - theta(full))
+        bias = (groups - 1) * (values.mean(0) - full.model.theta)
         covariance = covariance + np.outer(bias, bias)
     return np.asarray(covariance)
-
-
-def theta(one: Realisation) -> Array:
-    """Return the coefficients in the order of `StateSpaceModel.theta`.
-
-    Returns (n_theta,).
-    """
-    return np.concatenate([getattr(one, m).ravel() for m in "ABCDK"])

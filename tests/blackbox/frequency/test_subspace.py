@@ -151,7 +151,7 @@ def test_the_gauge_carries_no_information():
     frf = noisy(F, plant("unstable-bearing", F), 0.02, 5)
     fit, ln = frf_subspace(frf, {"n": 3}, p=300.0), check_lines(frf, 9)
     T = np.random.default_rng(0).normal(size=(3, 3)) + 2 * np.eye(3)
-    turned = frequency_subspace._change_states(fit.model, T)
+    turned = fit.model.in_states(T)
     other, _ = frequency_subspace.information(ln, turned, False)
     one, two = pole_covariance(fit.model, fit.covariance), pole_covariance(turned, other)
     np.testing.assert_allclose(two, one, rtol=1e-5, atol=1e-9)
