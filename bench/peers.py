@@ -23,9 +23,9 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ambid.blackbox.data import IOData
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.structures import structure as registered
 from ambid.errors import EstimationError
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from peers import Answer, Array, Bench, Way, bench, ways
 from table import Table
 from timing import quantity

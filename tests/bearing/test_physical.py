@@ -14,9 +14,9 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.blackbox import structures
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.physics.discretise import discretise

@@ -7,8 +7,8 @@ import pytest
 import scipy.signal
 
 from ambid.blackbox.convert import to_control, to_scipy
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import ModelError
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets, one_step, simulation
 from ambid.blackbox.roots import root_derivative, roots_at
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 
 DT = 1e-3

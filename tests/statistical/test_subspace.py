@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.model import pole_covariance, response_covariance
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import StateSpaceModel, pole_covariance, response_covariance
 from ambid.blackbox.subspace import n4sid, pbsid
 from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, record
 

@@ -19,7 +19,7 @@ from ambid.bearing.frequency import Channels, FrequencyEstimate, response
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_to_json
 from ambid.blackbox.frequency_lines import check_lines
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import StateSpaceModel
 from ambid.estimation.documents import covariance_together, fields_json, plain_json
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import StateSpace

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ambid.blackbox.instrumental import two_stage as two_stage
     from ambid.blackbox.instrumental_continuous import clsrivc as clsrivc
     from ambid.blackbox.instrumental_continuous import srivc as srivc
+    from ambid.blackbox.model import StateSpaceModel as StateSpaceModel
     from ambid.blackbox.polynomial import ararmax as ararmax
     from ambid.blackbox.polynomial import ararx as ararx
     from ambid.blackbox.polynomial import arma as arma
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from ambid.blackbox.polynomial import oe as oe
     from ambid.blackbox.polynomial_model import PolynomialModel as PolynomialModel
     from ambid.blackbox.polynomial_model import Polynomials as Polynomials
-    from ambid.blackbox.state_space import StateSpaceModel as StateSpaceModel
     from ambid.blackbox.state_space_search import sspem as sspem
     from ambid.blackbox.subspace import cva as cva
     from ambid.blackbox.subspace import moesp as moesp

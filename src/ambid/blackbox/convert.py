@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambid.blackbox.model import BlackBoxModel
+from ambid.blackbox.model import BlackBoxModel, StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import ModelError
 

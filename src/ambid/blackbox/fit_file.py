@@ -9,10 +9,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import BlackBoxModel, pole_covariance
+from ambid.blackbox.model import BlackBoxModel, StateSpaceModel, pole_covariance
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.structures import RESPONSE_STRUCTURES, any_structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import ModelError

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.roots import roots_at, roots_of, used_part
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import BlackBoxModel, StateSpaceModel
+from ambid.blackbox.roots import roots_at
 from ambid.errors import ModelError
 
 Complex = NDArray[np.complex128]
@@ -65,7 +65,7 @@ class Polynomials:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PolynomialModel:
+class PolynomialModel(BlackBoxModel):
     """One set of polynomials for each output; discrete time.
 
     Attributes
@@ -151,7 +151,7 @@ class PolynomialModel:
         -------
         ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
         """
-        z = self._delay(omega)
+        z = 1.0 / self.points(omega)
         g = [[_at(b, z) / (_at(p.A, z) * _at(f, z)) for b, f in zip(p.B, p.F, strict=True)] for p in self.outputs]
         return np.moveaxis(np.array(g, dtype=np.complex128).reshape(self.n_outputs, self.n_inputs, z.size), 2, 0)
 
@@ -166,7 +166,7 @@ class PolynomialModel:
         -------
         ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
         """
-        z = self._delay(omega)
+        z = 1.0 / self.points(omega)
         h = np.zeros((z.size, self.n_outputs, self.n_outputs), dtype=np.complex128)
         for o, p in enumerate(self.outputs):
             h[:, o, o] = _at(p.C, z) / (_at(p.A, z) * _at(p.D, z))
@@ -183,7 +183,7 @@ class PolynomialModel:
         -------
         ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
         """
-        z, g = self._delay(omega), self.frequency_response(omega)
+        z, g = 1.0 / self.points(omega), self.frequency_response(omega)
         out = np.zeros((*g.shape, self.theta.size), dtype=np.complex128)
         for o, letter, i, place in self.blocks():
             p = self.outputs[o]
@@ -196,41 +196,14 @@ class PolynomialModel:
                 out[:, o, i, place] = -g[:, o, i, None] * powers / _at(p.F[i], z)[:, None]
         return out
 
-    def poles(self) -> Complex:
-        """Return the roots of every A and F (of A and D for a time series) in z.
+    def _poles(self) -> tuple[Complex, Complex]:
+        return self._roots("AF" if self.n_inputs else "AD")
 
-        Returns
-        -------
-        ndarray, shape (n_poles,), complex
-        """
-        return self._roots(self._pole_letters())
-
-    def pole_derivative(self) -> Complex:
-        """Return the derivative of `poles` by `theta`.
-
-        Returns
-        -------
-        ndarray, shape (n_poles, n_theta), complex
-        """
-        return self._derivative(self._pole_letters())
-
-    def zeros(self) -> Complex:
-        """Return the roots of every B (of C for a time series) in z.
-
-        Returns
-        -------
-        ndarray, shape (n_zeros,), complex
-        """
+    def _zeros(self) -> tuple[Complex, Complex]:
         return self._roots("B" if self.n_inputs else "C")
 
-    def zero_derivative(self) -> Complex:
-        """Return the derivative of `zeros` by `theta`.
-
-        Returns
-        -------
-        ndarray, shape (n_zeros, n_theta), complex
-        """
-        return self._derivative("B" if self.n_inputs else "C")
+    def _roots(self, letters: str) -> tuple[Complex, Complex]:
+        return roots_at(self.theta, *[place for _, letter, _, place in self.blocks() if letter in letters])
 
     def state_space(self) -> StateSpaceModel:
         """Return the innovations form: the outputs side by side, each in observer form."""
@@ -254,22 +227,6 @@ class PolynomialModel:
             dt=self.dt,
         ).state_space()
         return silent.plant()
-
-    def _pole_letters(self) -> str:
-        return "AF" if self.n_inputs else "AD"
-
-    def _delay(self, omega: Array) -> Complex:
-        return np.asarray(np.exp(-1j * np.asarray(omega, dtype=np.float64) * self.dt), dtype=np.complex128)
-
-    def _roots(self, letters: str) -> Complex:
-        theta = self.theta
-        found = [roots_of(theta[used_part(theta, place)]) for _, letter, _, place in self.blocks() if letter in letters]
-        return np.concatenate(found or [np.empty(0, dtype=np.complex128)])
-
-    def _derivative(self, letters: str) -> Complex:
-        theta = self.theta
-        rows = [roots_at(theta, place)[1] for _, letter, _, place in self.blocks() if letter in letters]
-        return np.vstack(rows or [np.zeros((0, theta.size), dtype=np.complex128)])
 
 
 def _at(p: Array, z: Complex) -> Complex:

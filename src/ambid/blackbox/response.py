@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import StateSpaceModel
 
 Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
 

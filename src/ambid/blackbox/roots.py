@@ -91,15 +91,17 @@ def used_part(theta: Array, place: slice) -> slice:
     return slice(place.start + int(used[0]) if used.size else place.stop, place.stop)
 
 
-def roots_at(theta: Array, place: slice) -> tuple[Complex, Complex]:
-    """Return the roots of one of a model's polynomials, and their derivatives by all its coefficients.
+def roots_at(theta: Array, *places: slice) -> tuple[Complex, Complex]:
+    """Return the roots of some of a model's polynomials, and their derivatives by all its coefficients.
 
-    `theta`: (n_theta,); `place`: of the polynomial; leading zeros are a delay. Returns `roots`: (n_roots,), complex;
+    `theta`: (n_theta,); `places`: of the polynomials; leading zeros are a delay. Returns `roots`: (n_roots,), complex;
     `derivatives`: (n_roots, n_theta), complex.
     """
-    used = used_part(theta, place)
-    roots = roots_of(theta[used])
-    rows = np.zeros((roots.size, theta.size), dtype=np.complex128)
-    if roots.size:
-        rows[:, used] = root_derivative(theta[used], roots)
-    return roots, rows
+    found, rows = [np.empty(0, dtype=np.complex128)], [np.zeros((0, theta.size), dtype=np.complex128)]
+    for place in places:
+        used = used_part(theta, place)
+        found.append(roots_of(theta[used]))
+        rows.append(np.zeros((found[-1].size, theta.size), dtype=np.complex128))
+        if found[-1].size:
+            rows[-1][:, used] = root_derivative(theta[used], found[-1])
+    return np.concatenate(found), np.vstack(rows)

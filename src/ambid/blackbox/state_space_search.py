@@ -20,8 +20,8 @@ from scipy.linalg.lapack import dtpqrt
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.response import Sensitivities
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.subspace import (
     Asked,
     FirstModel,

@@ -26,7 +26,7 @@ from scipy.linalg.lapack import dtpqrt
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError
 
 _BLOCK_ROWS = 2048  # rows of the window matrix at once: some hundred columns of it stay in the cache

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.blackbox.model import BlackBoxModel, StateSpaceModel
 from ambid.blackbox.roots import roots_at
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.errors import ModelError
 
 Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TransferModel:
+class TransferModel(BlackBoxModel):
     """G[o][i] = num[o][i] / den[o][i] * exp(-s delay[i]), output noise white (H = I).
 
     Attributes
@@ -89,7 +89,7 @@ class TransferModel:
         -------
         ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
         """
-        s, lag = self._points(omega)
+        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
         g = np.empty((omega.size, self.n_outputs, self.n_inputs), dtype=np.complex128)
         for o, i in np.ndindex(self.n_outputs, self.n_inputs):
             g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
@@ -119,7 +119,7 @@ class TransferModel:
         -------
         ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
         """
-        s, lag = self._points(omega)
+        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
         out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
         for o, i, which, p, place in self.parts():
             powers = s[:, None] ** np.arange(p.size - 1, -1, -1)
@@ -132,56 +132,11 @@ class TransferModel:
                 out[:, :, i, first + i] = -1j * omega[:, None] * g[:, :, i]
         return out
 
-    def poles(self) -> Complex:
-        """Return the roots of every denominator.
+    def _poles(self) -> tuple[Complex, Complex]:
+        return self._roots("den")
 
-        Returns
-        -------
-        ndarray, shape (n_poles,), complex
-        """
-        return self._roots("den")[0]
-
-    def pole_derivative(self) -> Complex:
-        """Return the derivative of `poles` by `theta`.
-
-        Returns
-        -------
-        ndarray, shape (n_poles, n_theta), complex
-        """
-        return self._roots("den")[1]
-
-    def zeros(self) -> Complex:
-        """Return the roots of every numerator.
-
-        Returns
-        -------
-        ndarray, shape (n_zeros,), complex
-        """
-        return self._roots("num")[0]
-
-    def zero_derivative(self) -> Complex:
-        """Return the derivative of `zeros` by `theta`.
-
-        Returns
-        -------
-        ndarray, shape (n_zeros, n_theta), complex
-        """
-        return self._roots("num")[1]
-
-    def plant(self) -> StateSpaceModel:
-        """Return G as a state space.
-
-        Returns
-        -------
-        StateSpaceModel
-            With K = 0.
-
-        Raises
-        ------
-        ModelError
-            As `state_space`.
-        """
-        return self.state_space()
+    def _zeros(self) -> tuple[Complex, Complex]:
+        return self._roots("num")
 
     def state_space(self) -> StateSpaceModel:
         """Return an innovations form with K = 0; delays of a discrete model become states.
@@ -227,16 +182,8 @@ class TransferModel:
                 yield o, i, which, p, slice(first, first + p.size)
                 first += p.size
 
-    def _points(self, omega: Array) -> tuple[Complex, Complex]:
-        s = 1j * omega if self.dt is None else np.exp(1j * omega * self.dt)
-        return np.asarray(s, dtype=np.complex128), np.asarray(np.exp(-1j * np.outer(omega, self.delay)))
-
     def _roots(self, wanted: str) -> tuple[Complex, Complex]:
-        theta = self.theta
-        found = [roots_at(theta, place) for _, _, which, _, place in self.parts() if which == wanted]
-        if not found:
-            return np.empty(0, dtype=np.complex128), np.zeros((0, theta.size), dtype=np.complex128)
-        return np.concatenate([r for r, _ in found]), np.vstack([d for _, d in found])
+        return roots_at(self.theta, *[place for _, _, which, _, place in self.parts() if which == wanted])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel
 from ambid.blackbox.roots import roots_at
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.structures import structure
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.estimation.criteria import criteria, skipped

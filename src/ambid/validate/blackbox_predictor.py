@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Sensitivities, one_step, run_states, simulation, stable
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.errors import EstimationError
 from ambid.physics.discretise import zero_order_hold

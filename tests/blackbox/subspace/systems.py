@@ -7,7 +7,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.state_space import StateSpaceModel
+from ambid.blackbox.model import StateSpaceModel
 
 DT = 0.01
 

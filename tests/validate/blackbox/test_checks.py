@@ -8,9 +8,9 @@ from scipy.signal import cont2discrete, lfilter
 
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instrumental import two_stage
+from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.state_space import StateSpaceModel
 from ambid.blackbox.subspace import n4sid, pbsid
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.validate.blackbox import judge
