@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambid.nonlinear.narmax.selection import Selection, candidates, select_terms
-from ambid.nonlinear.narmax.terms import Term, lagged, products
+from ambid.nonlinear.polynomial import Term, lagged, products
+from ambid.nonlinear.selection import Selection, candidates, select_terms
 from peers import Array, Bench, bench
 from table import Table
 from timing import quantity
@@ -33,7 +33,7 @@ def record(n: int, seed: int = 0) -> tuple[Array, Array]:
 def chosen(u: Array, y: Array) -> tuple[tuple[Term, ...], Selection]:
     """All of ambid's work: candidates made, terms chosen."""
     terms = products(lagged(1, 1, ny=LAGS, nu=LAGS, nk=1, ne=0), DEGREE)
-    found = candidates(terms, [y[:, None]], [u[:, None]], None, LAGS)
+    found = candidates(terms, [(y[:, None], u[:, None])], LAGS)
     picked = select_terms(found, y[LAGS:], most=VALUES, criterion=CRITERION)
     return tuple(terms[k] for k in picked.order), picked
 

@@ -79,7 +79,7 @@ def test_words(seconds, words) -> None:
 
 SLOWLY = """
 import sys, time
-from ambid.nonlinear.narmax.model import Problem
+from ambid.nonlinear.lagged_problem import LaggedProblem as Problem
 quick = Problem.cost
 def cost(*words):
     time.sleep(0.2)

@@ -15,8 +15,9 @@ from ambid.nonlinear.hybrid_choice import choose_noise
 from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem
 from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.lagged_problem import laplace
-from ambid.nonlinear.narmax import Factor, narmax
+from ambid.nonlinear.narmax import narmax
 from ambid.nonlinear.narx import narx
+from ambid.nonlinear.polynomial import Factor
 from tests.nonlinear.narmax.systems import coefficients, polynomial, record
 
 TRUTH = {"y(t-1)": 0.5, "y(t-2)": -0.2, "u(t-1)*y(t-1)": 0.3, "u(t-2)": 0.4, "e(t-1)": 0.7}

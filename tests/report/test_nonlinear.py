@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit
-from ambid.nonlinear.narmax.estimate import narmax
+from ambid.nonlinear.narmax import narmax
 from ambid.report.fit_text import (
     curve_line,
     curve_lines,

@@ -148,14 +148,34 @@ class Terms:
             first = last
         return tuple(out)
 
+    @cached_property
+    def _rational(self) -> bool:
+        return bool(np.any(self.place[:, 1]))
+
+    @cached_property
+    def _holds(self) -> dict[int, list[tuple[int, int, list[int]]]]:
+        """Terms that hold a regressor: number, power, and the factors that its slope has."""
+        out: dict[int, list[tuple[int, int, list[int]]]] = {}
+        for k, term in enumerate(self.terms):
+            factors = [int(v) for v in term if v >= 0]
+            for v in dict.fromkeys(factors):
+                rest = list(factors)
+                rest.remove(v)
+                out.setdefault(v, []).append((k, factors.count(v), rest))
+        return out
+
     def uses(self, at: Table) -> bool:
         """As `Block.uses`."""
-        return bool(np.any(np.isin(self.terms, at)))
+        return any(int(v) in self._holds for v in at)
 
     def bends(self, at: Table) -> bool:
         """As `Block.bends`."""
         inside = np.isin(self.terms, at)
         return bool(np.any(inside.sum(axis=1) > 1) or np.any(inside[self.place[:, 1] == 1]))
+
+    def _varies(self, at: Table) -> bool:
+        """Whether slopes by regressors at some places are not the same everywhere."""
+        return self._rational or any(rest for v in at for _, _, rest in self._holds.get(int(v), ()))
 
     def prepare(self, x: Array) -> tuple[Array, ...]:
         """As `Block.prepare`."""
@@ -166,38 +186,45 @@ class Terms:
                 row *= columns[v]
         return np.ascontiguousarray(out.T), x
 
-    def _sums(self, theta: Array, T: Array) -> tuple[Array, Array]:
-        num, den = np.zeros((T.shape[0], self.n_outputs)), np.ones((T.shape[0], self.n_outputs))
-        for o, (up, down) in enumerate(self._slices):
-            num[:, o] = T[:, up] @ theta[up]
-            if down.stop > down.start:
-                den[:, o] += T[:, down] @ theta[down]
-        return num, den
+    def _numerators(self, theta: Array, T: Array) -> Array:
+        out = np.empty((T.shape[0], self.n_outputs))
+        for o, (up, _) in enumerate(self._slices):
+            out[:, o] = T[:, up] @ theta[up]
+        return out
+
+    def denominators(self, theta: Array, rows: tuple[Array, ...]) -> Array:
+        """Return the denominators' values, ones without, shape (n, n_outputs)."""
+        T, out = rows[0], np.ones((rows[0].shape[0], self.n_outputs))
+        for o, (_, down) in enumerate(self._slices):
+            out[:, o] += T[:, down] @ theta[down]
+        return out
 
     def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
         """As `Block.values`."""
-        num, den = self._sums(theta, rows[0])
-        return num / den
+        found = self._numerators(theta, rows[0])
+        return found / self.denominators(theta, rows) if self._rational else found
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
         """As `Block.derivatives`."""
         T, x = rows
-        num, den = self._sums(theta, T)
-        out = np.zeros((T.shape[0], self.n_outputs, self.n_theta))
-        by_value = np.stack([1.0 / den, -num / den**2], axis=2)  # by numerator and denominator
-        for o, both in enumerate(self._slices):
+        n, p = T.shape[0], self.n_outputs
+        by_value = np.ones((1, p, 2))  # slopes by numerator and denominator
+        if self._rational:
+            num, den = self._numerators(theta, T), self.denominators(theta, rows)
+            by_value = np.stack([1.0 / den, -num / den**2], axis=2)
+        out = np.zeros((n, p, self.n_theta if np.any(live) else 0))
+        for o, both in enumerate(self._slices if np.any(live) else ()):
             for below, own in enumerate(both):
                 out[:, o, own] = T[:, own] * by_value[:, o, below, None]
-        by_x = np.zeros((T.shape[0], self.n_outputs, at.size))
-        where = {int(v): k for k, v in enumerate(at)}
-        for k, (term, (o, below)) in enumerate(zip(self.terms, self.place, strict=True)):
-            factors = [int(v) for v in term if v >= 0]
-            for v in sorted(set(factors) & where.keys()):
-                rest = list(factors)
-                rest.remove(v)
-                slope = theta[k] * factors.count(v) * np.prod(x[:, rest], axis=1)
-                by_x[:, o, where[v]] += slope * by_value[:, o, below]
-        return out if np.all(live) else out[:, :, live], by_x
+        by_x = np.zeros((n if self._varies(at) else 1, p, at.size))
+        for j, v in enumerate(at):
+            for k, times, rest in self._holds.get(int(v), ()):
+                o, below = self.place[k]
+                slope = theta[k] * times * by_value[:, o, below]
+                for w in rest:
+                    slope = slope * x[:, w]
+                by_x[:, o, j] += slope
+        return out if np.all(live) else out[:, :, live[: out.shape[2]]], by_x
 
     def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
         """As `Block.fill`."""

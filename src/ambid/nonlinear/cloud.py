@@ -41,13 +41,12 @@ class Cloud:
     faces: Array
 
     def novelty(self, x: Array) -> Array:
-        """Return how far regressors are from the training: 0 in the middle, 1 at the edge, above 1 outside.
-
-        `x`: (n, n_regressors). Returns (n,).
-        """
+        """Return how far regressors (n, n_regressors) are from the training: 0 in the middle, 1 at the edge."""
         from scipy.spatial import KDTree
 
         out: Array = np.linalg.norm((x - self.mean) @ self.whitening.T, axis=1)
+        if not self.marks.size:
+            return out
         out = np.maximum(out, np.max((x - self.mean) @ self.faces.T, axis=1, initial=0.0))
         sound = np.all(np.isfinite(x), axis=1)
         near = np.full(x.shape[0], np.nan)
@@ -57,39 +56,28 @@ class Cloud:
 
     def as_json(self) -> dict[str, Any]:
         """Return all that `from_json` needs."""
-        return {
-            "mean": self.mean.tolist(),
-            "whitening": self.whitening.tolist(),
-            "scale": self.scale.tolist(),
-            "marks": self.marks.tolist(),
-            "reach": self.reach,
-            "faces": self.faces.tolist(),
-        }
+        ellipsoid = {"mean": self.mean.tolist(), "whitening": self.whitening.tolist()}
+        if not self.marks.size:
+            return ellipsoid
+        more = {k: getattr(self, k).tolist() for k in ("scale", "marks", "faces")}
+        return {**ellipsoid, **more, "reach": self.reach}
 
     @classmethod
     def from_json(cls, found: Mapping[str, Any], n: int) -> Self:
-        """Read it back.
-
-        `n`: regressors.
-        """
-        marks = np.array(found["marks"], dtype=np.float64).reshape(-1, n)
-        if not np.all(np.isfinite(marks)):
-            raise ValueError("a mark of the cloud is no finite number")
-        return cls(
-            mean=np.array(found["mean"], dtype=np.float64).reshape(n),
-            whitening=np.array(found["whitening"], dtype=np.float64).reshape(n, n),
-            scale=np.array(found["scale"], dtype=np.float64).reshape(n),
-            marks=marks,
-            reach=float(found["reach"]),
-            faces=np.array(found["faces"], dtype=np.float64).reshape(-1, n),
-        )
+        """Read the cloud of `n` regressors back."""
+        whole = found if "marks" in found else {**found, "scale": [1.0] * n, "marks": [], "faces": [], "reach": 1.0}
+        shapes = {"mean": (n,), "whitening": (n, n), "scale": (n,), "marks": (-1, n), "faces": (-1, n)}
+        arrays = {
+            k: np.array(whole[k], dtype=np.float64).reshape(shape if n else (0,) * len(shape))
+            for k, shape in shapes.items()
+        }
+        if not all(np.all(np.isfinite(x)) for x in arrays.values()):
+            raise ValueError("a number of the cloud is not finite")
+        return cls(**arrays, reach=float(whole["reach"]))
 
 
-def cloud_of(x: Array) -> Cloud:
-    """Return where training regressors lie.
-
-    `x`: (n, n_regressors).
-    """
+def cloud_of(x: Array, *, ellipsoid: bool = False) -> Cloud:
+    """Return where training regressors (n, n_regressors) lie, with hull and neighbours or by their ellipsoid alone."""
     from scipy.spatial import KDTree
 
     mean, scale = x.mean(axis=0), x.std(axis=0)
@@ -97,14 +85,18 @@ def cloud_of(x: Array) -> Cloud:
     _, s, Vt = np.linalg.svd(np.linalg.qr(x - mean, mode="r"))
     wide = np.zeros(x.shape[1])
     wide[: s.size] = s
-    narrow = np.maximum(wide, _NARROW * max(s[0], 1e-300))
+    narrow = np.maximum(wide, _NARROW * max(s.max(initial=0.0), 1e-300))
     W = Vt / (narrow / np.sqrt(x.shape[0]))[:, None]
     far = float(np.max(np.linalg.norm((x - mean) @ W.T, axis=1)))
+    W_far = W / far if far > 0 else W
+    if ellipsoid:
+        none = np.zeros((0, x.shape[1]))
+        return Cloud(mean=mean, whitening=W_far, scale=np.ones(x.shape[1]), marks=none, reach=1.0, faces=none)
     marks = _spread(x[:: max(1, x.shape[0] // _LOOKED_AT)], mean, scale)
     reach = float(np.max(KDTree(marks / scale).query(x / scale)[0]))
     return Cloud(
         mean=mean,
-        whitening=W / far if far > 0 else W,
+        whitening=W_far,
         scale=scale,
         marks=marks,
         reach=reach if reach > 0 else 1.0,

@@ -87,13 +87,13 @@ def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
 
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
-        "narmax": "ambid.nonlinear.narmax.model:PolynomialNarmax.from_json",
-        "hybrid": "ambid.nonlinear.hybrid_function:read_model",
+        "narmax": "ambid.nonlinear.polynomial:PolynomialFunction.read_model",
+        "hybrid": "ambid.nonlinear.hybrid_function:HybridFunction.read_model",
         "rbf": "ambid.nonlinear.rbf_network:read_model",
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
-        "narx": "ambid.nonlinear.narx:read_model",
-        "hammerstein": "ambid.nonlinear.hammerstein:read_model",
+        "narx": "ambid.nonlinear.narx:NarxFunction.read_model",
+        "hammerstein": "ambid.nonlinear.hammerstein:HammersteinFunction.read_model",
         "lpv": "ambid.nonlinear.lpv_model:LpvModel.from_json",
     }
 )

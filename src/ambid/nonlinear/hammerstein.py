@@ -22,7 +22,7 @@ from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.blocks import Block, Mask, Table, Terms
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, lags
+from ambid.nonlinear.lagged import LaggedFunction, Regressors, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     bias_caution,
@@ -106,6 +106,7 @@ class HammersteinFunction(LaggedFunction):
     """Sizes of a Hammerstein model of one output."""
 
     kind: ClassVar[str] = "hammerstein"
+    title: ClassVar[str] = "Hammerstein"
     m: int  # inputs
     ny: int
     nu: int
@@ -153,14 +154,6 @@ class HammersteinFunction(LaggedFunction):
             b.append(s[0] * first * U[:, 0])
             g.append(Vt[0, 1:] / first)
         return np.concatenate([k[: self.ny], *b, k[self.ny, None], *g])
-
-
-def read_model(found: dict[str, Any]) -> LaggedModel:
-    """Read a Hammerstein model back."""
-    try:
-        return HammersteinFunction.from_json(found).model_from_json(found)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise EstimationError(f"no Hammerstein model ({type(error).__name__}: {error}). Write it again") from error
 
 
 def hammerstein(

@@ -34,9 +34,10 @@ from ambid.nonlinear.hybrid_choice import (
     train_network,
 )
 from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem, make_invertible, transfer
+from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, cautions, finish, guarded, laplace
-from ambid.nonlinear.narmax import PolynomialNarmax, narmax
-from ambid.nonlinear.narmax.terms import Term, lagged, products, term_name
+from ambid.nonlinear.narmax import narmax
+from ambid.nonlinear.polynomial import PolynomialFunction, Term, is_noisy, lagged, products, term_name
 from ambid.nonlinear.records import Scaled, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, whole
 
@@ -73,10 +74,6 @@ class HybridSettings:
         "none", "prediction", default="prediction",
     )  # fmt: skip
     selection: str = choice("frols, all (every candidate); frols", "frols", "all")
-    levels: str = choice(
-        "what signals are deviations from: zero, mean, auto (mean where it is over two deviations); auto",
-        "auto", "zero", "mean",
-    )  # fmt: skip
     innovations: str = choice(
         "linear (through C alone), network (they are its regressors too); linear", "linear", "network"
     )
@@ -90,7 +87,7 @@ class HybridSettings:
     @property
     def polynomial(self) -> dict[str, int | float | str | tuple[int, ...]]:
         """Settings of the polynomial's estimator."""
-        same = ("ny", "nu", "nk", "degree", "terms", "constant", "criterion", "pruning", "selection", "levels")
+        same = ("ny", "nu", "nk", "degree", "terms", "constant", "criterion", "pruning", "selection")
         return {k: getattr(self, k) for k in same} | {"ne": 2 if self.ne is None else self.ne}
 
 
@@ -142,12 +139,12 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     if not records:
         raise EstimationError("hybrid: no record is given. Pass one at least")
     s = hybrid_settings(settings, n_inputs=records[0].n_inputs)
-    data = scaled_records("hybrid", records, lag=s.lag, levels=s.levels, fewest=10)
+    data = scaled_records("hybrid", records, lag=s.lag, levels="auto", fewest=10)
     ticks = portions(tick, _costs(s))
     began = perf_counter()
     first = narmax(records, s.polynomial, seed=seed, tick=ticks[0])
     timing = {"polynomial": perf_counter() - began}
-    if not isinstance(first.model, PolynomialNarmax):
+    if not isinstance(first.model, LaggedModel):
         return failed_fit("hybrid", records, asdict(s), seed, first.reason, timing)
     work = _polynomial(s, first, first.model)
     work.timing_s.update(timing)
@@ -170,15 +167,16 @@ def _costs(s: HybridSettings) -> tuple[float, ...]:
     return 3.0, 1.0, 100.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
 
 
-def _polynomial(s: HybridSettings, first: NonlinearFit, model: PolynomialNarmax) -> _Work:
+def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _Work:
     """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
-    terms = tuple(tuple(x for x in one if all(f.kind != "e" for f in x)) for one in model.numerators)
-    ne = max((f.lag for one in model.numerators for x in one for f in x if f.kind == "e"), default=0)
+    assert isinstance(model.function, PolynomialFunction)
+    terms = tuple(tuple(x for x in one if not is_noisy(x)) for one in model.function.numerators)
+    ne = max((f.lag for _, _, x in model.function.owned for f in x if f.kind == "e"), default=0)
     function = HybridFunction(
         terms=terms, ne=ne if s.ne is None else s.ne, p=model.n_outputs, m=model.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk,
         neurons=0, deep=s.innovations == "network",
     )  # fmt: skip
-    known = dict(zip(model.names, model.theta / model.unit, strict=True))
+    known = dict(zip(model.names, model.scaled_theta, strict=True))
     start = np.array([known.get(name, 0.0) for name in function.names], dtype=np.float64)
     theta, factor = make_invertible(function, start)
     found = first.details.get("candidates", 0)
@@ -374,8 +372,5 @@ def _details(records: Sequence[IOData], data: Scaled, work: _Work, problem: Lagg
             "start_drawn_in_by": work.drawn_in,
         },
         "tried": [{"neurons": x.neurons, "held_out_rms": x.held_out} for x in work.tried],
-        "levels": {
-            **dict(zip(records[0].inputs, data.u_level.tolist(), strict=True)),
-            **dict(zip(records[0].outputs, data.y_level.tolist(), strict=True)),
-        },
+        "levels": data.levels(records[0]),
     }

@@ -29,7 +29,7 @@ from ambid.nonlinear.hybrid_function import (
     transfer,
 )
 from ambid.nonlinear.lagged_problem import LaggedProblem
-from ambid.nonlinear.narmax.terms import Term
+from ambid.nonlinear.polynomial import Term
 from ambid.nonlinear.records import Parts
 
 Counted = tuple[Mask, ...]

@@ -19,11 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
-from ambid.nonlinear.blocks import Block, Linear, Mask, Table, Tanh, Terms
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
+from ambid.nonlinear.blocks import Block, Linear, Mask, Table, Tanh
+from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
-from ambid.nonlinear.narmax.terms import Factor, Term, term_from_json, term_name, term_to_json
+from ambid.nonlinear.polynomial import (
+    Factor,
+    Term,
+    block_of,
+    column_of,
+    term_name,
+    terms_from_json,
+    terms_to_json,
+    unit_of,
+)
 from ambid.nonlinear.records import Parts
 
 _DRAWS = 40  # of a random hidden layer
@@ -35,6 +43,7 @@ class HybridFunction(LaggedFunction):
     """Terms and sizes of a hybrid model."""
 
     kind: ClassVar[str] = "hybrid"
+    title: ClassVar[str] = "hybrid"
     terms: tuple[tuple[Term, ...], ...]  # of the polynomial, by output, without innovations
     ne: int  # order of C
     p: int  # outputs
@@ -55,26 +64,23 @@ class HybridFunction(LaggedFunction):
         """What the network sees, innovations, then whatever else the terms look at."""
         x = lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk, ne=self.ne)
         known = set(zip(x.column.tolist(), x.back.tolist(), strict=True))
-        factors = {self._at(f) for one in self.terms for term in one for f in term}
+        factors = {(column_of(f, self.p, self.m), f.lag) for _, _, term in self.owned for f in term}
         more = np.array(sorted(factors - known), dtype=np.int64).reshape(-1, 2)
         column, back = np.append(x.column, more[:, 0]), np.append(x.back, more[:, 1])
         return Regressors(n_outputs=self.p, n_inputs=self.m, column=column, back=back)
 
-    def _at(self, f: Factor) -> tuple[int, int]:
-        return f.channel + (self.p if f.kind == "u" else 0), f.lag
+    @property
+    def owned(self) -> tuple[tuple[int, int, Term], ...]:
+        """Output, 0, and term of each coefficient of the polynomial."""
+        return tuple((o, 0, term) for o, one in enumerate(self.terms) for term in one)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
         """Polynomial, C, hidden layer."""
-        x, d = self.regressors, self.seen.column.size
-        where = {at: k for k, at in enumerate(zip(x.column.tolist(), x.back.tolist(), strict=True))}
-        rows = [(o, [where[self._at(f)] for f in term]) for o, one in enumerate(self.terms) for term in one]
-        width = max((len(v) for _, v in rows), default=0)
-        table = np.array([v + [-1] * (width - len(v)) for _, v in rows], dtype=np.int64).reshape(len(rows), width)
-        place = np.array([(o, 0) for o, _ in rows], dtype=np.int64).reshape(-1, 2)
+        d = self.seen.column.size
         last = d + self.p * self.ne
         return (
-            Terms(n_outputs=self.p, terms=table, place=place),
+            block_of(self.regressors, self.owned),
             Linear(n_outputs=self.p, at=slice(d, last), constant=False),
             Tanh(n_outputs=self.p, width=last if self.deep else d, neurons=self.neurons),
         )
@@ -113,14 +119,8 @@ class HybridFunction(LaggedFunction):
 
     def unit(self, y_scale: Array, u_scale: Array) -> Array:
         """Coefficients of the polynomial and of C are in SI; weights of the network stay scaled."""
-        size = {"y": y_scale, "u": u_scale, "e": y_scale}
-        found = [
-            y_scale[o] / np.prod([size[f.kind][f.channel] for f in x])
-            for terms in (self.terms, (self.noise_terms,) * self.p)
-            for o, one in enumerate(terms)
-            for x in one
-        ]
-        return np.concatenate([found, np.ones(self.n_theta - self.n_linear)])
+        owned = (*self.owned, *((o, 0, x) for o in range(self.p) for x in self.noise_terms))
+        return np.concatenate([unit_of(owned, y_scale, u_scale), np.ones(self.n_theta - self.n_linear)])
 
     def noise_radius(self, theta: Array) -> float:
         """Return the largest magnitude of a root of C: below 1 the predictor forgets how it began."""
@@ -144,7 +144,7 @@ class HybridFunction(LaggedFunction):
         """As `LaggedFunction.as_json`."""
         sizes = {"n_outputs": self.p, "n_inputs": self.m, "ny": self.ny, "nu": self.nu, "nk": self.nk}
         return {
-            "terms": [[term_to_json(x) for x in one] for one in self.terms],
+            "terms": terms_to_json(self.terms),
             "ne": self.ne,
             "sizes": {**sizes, "neurons": self.neurons},
             "innovations": "network" if self.deep else "linear",
@@ -155,23 +155,11 @@ class HybridFunction(LaggedFunction):
         """Read it back."""
         sizes = {k: int(v) for k, v in found["sizes"].items()}
         p, m = sizes.pop("n_outputs"), sizes.pop("n_inputs")
-        terms = tuple(tuple(term_from_json(x) for x in one) for one in found["terms"])
+        terms = terms_from_json(found["terms"], p, m)
         innovations, ne = found["innovations"], found["ne"]
         if innovations not in ("linear", "network") or not isinstance(ne, int) or ne < 0:
             raise ValueError("innovations or ne are none")
-        if len(terms) != p or any(
-            f.channel >= {"y": p, "u": m}.get(f.kind, 0) for one in terms for x in one for f in x
-        ):
-            raise ValueError("terms name channels that the model does not have")
         return cls(terms=terms, ne=ne, p=p, m=m, deep=innovations == "network", **sizes)
-
-
-def read_model(found: dict[str, Any]) -> LaggedModel:
-    """Read a hybrid model back."""
-    try:
-        return HybridFunction.from_json(found).model_from_json(found)
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise EstimationError(f"no hybrid model ({type(error).__name__}: {error}). Write it again") from error
 
 
 def hybrid_problem(

@@ -20,6 +20,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.errors import EstimationError
 from ambid.nonlinear.blocks import Block, Linear, Mask, Table
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.signals import finite, scaled, with_head
@@ -108,6 +109,8 @@ class LaggedFunction(ABC):
     """The function of a family, in scaled signals."""
 
     kind: ClassVar[str]
+    title: ClassVar[str]  # for messages
+    ellipsoid: ClassVar[bool] = False  # whether the ellipsoid alone says where it was trained
     folded: int = 0  # 1 or 2 where the sign of the output is not measured, see `lagged_kernels.run`
 
     @property
@@ -134,6 +137,16 @@ class LaggedFunction(ABC):
     def from_json(cls, found: dict[str, Any]) -> Self:
         """Read it back."""
 
+    @classmethod
+    def read_model(cls, found: dict[str, Any]) -> LaggedModel:
+        """Read a model of the family back."""
+        try:
+            return cls.from_json(found).model_from_json(found)
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+            raise EstimationError(
+                f"no {cls.title} model ({type(error).__name__}: {error}). Write the file again"
+            ) from error
+
     @property
     def n_outputs(self) -> int:
         """Number of outputs."""
@@ -154,6 +167,10 @@ class LaggedFunction(ABC):
         """Regressors whose cloud says where the model was trained: all but innovations."""
         x = self.regressors
         return np.flatnonzero(x.column < x.n_outputs + x.n_inputs) if x.noisy.size else slice(None)
+
+    def training_rows(self, theta: Array, rows: Rows) -> Array:
+        """Return the regressors of rows that its cloud is made of, outputs with the signs of their predictions."""
+        return (self.predict(theta, rows)[1] if self.folded else rows).x[:, self.in_cloud]
 
     def unit(self, y_scale: Array, u_scale: Array) -> Array | float:
         """Return what a scaled parameter of 1 is in the model's `theta`."""
@@ -267,13 +284,10 @@ class LaggedFunction(ABC):
         out[: self.lag] = y[: self.lag]
         return out, z
 
-    def _first_sign(self, theta: Array, z: Array) -> float:
-        """Sign of first outputs of which only the magnitude is known: where the linear part is driven to at first."""
-        none, x = np.zeros((self.lag + 1, z.shape[1])), self.regressors
-        slopes = self.derivatives(theta, self.rows_of(none, none[:, : self.n_outputs]), np.arange(x.column.size))[1][0]
-        own = x.column < self.n_outputs
-        driven = slopes[:, ~own] @ np.mean(z[: self.lag], axis=0)[x.column[~own]]
-        return -1.0 if np.sum(driven) * (1.0 - np.sum(slopes[:, own])) < 0 else 1.0
+    def first_sign(self, theta: Array, z: Array) -> float:
+        """Return the sign of first outputs of which only the magnitude is known."""
+        del theta, z
+        return 1.0
 
     def _run(self, theta: Array, z: Array, *, free: bool) -> Array:
         from ambid.nonlinear.lagged_kernels import run
@@ -288,7 +302,7 @@ class LaggedFunction(ABC):
             block.fill(own, numbers)
         out, x = np.empty((z.shape[0], p)), self.regressors
         if self.folded:
-            z[: self.lag, :p] *= self._first_sign(theta, z)
+            z[: self.lag, :p] *= self.first_sign(theta, z)
         shape = np.array([self.lag, p, p + x.n_inputs, int(free), self.folded], dtype=np.int64)
         run(z, x.column, x.back, shape, out, *numbers.values())
         return out
@@ -431,8 +445,7 @@ class LaggedModel:
         ys, us = scaled(self, u, y)
         of, out = self.function, np.full(ys.shape[0], np.nan)
         if ys.shape[0] > self.lag:
-            x = of.regressors.rows(of.regressors.signals(ys, us), of.lag)
-            out[self.lag :] = self.cloud.novelty(x[:, of.in_cloud])
+            out[self.lag :] = self.cloud.novelty(of.training_rows(self.scaled_theta, of.rows(ys, us)))
         return out
 
     def as_json(self) -> dict[str, Any]:

@@ -96,8 +96,9 @@ class LaggedProblem:
         """Return the triangle of [J | r], the prior's rows included."""
         with np.errstate(over="ignore", invalid="ignore"):
             found = [triangle_of([b.reshape(-1, b.shape[2])]) for _, b in self.blocks(theta) if b.size]
-        found.append(self.prior_rows(theta))
-        return triangle_of([np.concatenate(found)])
+        if np.any(self.precision):
+            found.append(self.prior_rows(theta))
+        return found[0] if len(found) == 1 else triangle_of([np.concatenate(found)])
 
     def blocks(self, v: Array) -> Iterator[tuple[int, Array]]:
         """Yield record number and weighted slopes and errors of some of its rows, (n, n_outputs, n_live + 1)."""
@@ -187,16 +188,26 @@ def problem_at(
     counted: tuple[Mask, ...] | None = None,
 ) -> LaggedProblem:
     """Return the problem whose errors have unit variance at given parameters, of which the live ones are searched."""
-    one = _unweighted(function, parts, theta, precision, free=free)
+    one = plain_problem(function, parts, theta, precision, free=free)
     mean = one.mean if mean is None else mean
     return replace(one, mean=mean, joint=joint, counted=counted).at(theta, live)
 
 
-def _unweighted(function: LaggedFunction, parts: Parts, theta: Array, precision: Array, *, free: bool) -> LaggedProblem:
-    n = function.n_theta
+def plain_problem(
+    function: LaggedFunction,
+    parts: Parts,
+    theta: Array,
+    precision: Array | None = None,
+    *,
+    free: bool = False,
+    weight: Array | None = None,
+) -> LaggedProblem:
+    """Return the problem in which errors count alike, or by a `weight`."""
+    none = np.zeros(function.n_theta)
     return LaggedProblem(
-        function=function, parts=parts, weight=np.eye(function.n_outputs), base=theta,
-        live=np.ones(n, dtype=np.bool_), mean=np.zeros(n), precision=precision, free=free,
+        function=function, parts=parts, weight=np.eye(function.n_outputs) if weight is None else weight, base=theta,
+        live=np.ones(none.size, dtype=np.bool_), mean=none, precision=none if precision is None else precision,
+        free=free,
     )  # fmt: skip
 
 
@@ -221,7 +232,7 @@ def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
 
 def rms_error(function: LaggedFunction, theta: Array, parts: Parts, *, free: bool = False) -> float:
     """Return the root mean square error in deviations of the outputs; infinite where the model diverges."""
-    problem = _unweighted(function, parts, theta, np.zeros(theta.size), free=free)
+    problem = plain_problem(function, parts, theta, free=free)
     with np.errstate(over="ignore", invalid="ignore"):
         found = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
     return found if np.isfinite(found) else np.inf
@@ -298,9 +309,9 @@ class Draft:
         self.curves.append(curve)
 
     def timed(self, stage: str, began: float) -> float:
-        """Note what a stage took since `began`, and return when the next one begins."""
+        """Add what a stage took since `began`, and return when the next one begins."""
         now = perf_counter()
-        self.timing_s[stage] = now - began
+        self.timing_s[stage] = self.timing_s.get(stage, 0.0) + now - began
         return now
 
 
@@ -364,10 +375,10 @@ def finish(
         whole = np.zeros((draft.theta.size, draft.theta.size))
         whole[np.ix_(problem.live, problem.live)] = covariance
         whole *= unit[:, None] * unit
-    x = np.concatenate([r.x for r in problem.rows()])
+    x = np.concatenate([of.training_rows(draft.theta, r) for r in problem.rows()])
     model = LaggedModel(
         dt=records[0].dt, function=of, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
-        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x[:, of.in_cloud]),
+        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=of.ellipsoid),
     )  # fmt: skip
     draft.timed("result", began)
     draft.timing_s["all"] = sum(draft.timing_s.values())
@@ -384,7 +395,7 @@ def finish(
         curves=tuple(draft.curves),
         warnings=tuple(draft.warnings),
         timing_s=dict(draft.timing_s),
-        details={"effective_parameters": found.effective, **draft.details},
+        details={**({"effective_parameters": found.effective} if np.any(problem.precision) else {}), **draft.details},
         **provenance(records),
     )
 

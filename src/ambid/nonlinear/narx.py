@@ -26,7 +26,7 @@ from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.blocks import Block, Linear, Tanh
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
+from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
@@ -84,6 +84,7 @@ class NarxFunction(LaggedFunction):
     """yhat(t) = L z + c + W2 tanh(W1 z + b1), z = [y(t-1), .., y(t-ny), u(t-nk), .., u(t-nk-nu+1)]."""
 
     kind: ClassVar[str] = "narx"
+    title: ClassVar[str] = "neural NARX"
     p: int  # outputs
     m: int  # inputs
     ny: int
@@ -133,14 +134,6 @@ class NarxFunction(LaggedFunction):
         """Read it back."""
         sizes = {k: int(v) for k, v in found["sizes"].items()}
         return cls(p=sizes.pop("n_outputs"), m=sizes.pop("n_inputs"), **sizes)
-
-
-def read_model(found: dict[str, Any]) -> LaggedModel:
-    """Read a neural NARX model back."""
-    try:
-        return NarxFunction.from_json(found).model_from_json(found)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise EstimationError(f"no neural NARX model ({type(error).__name__}: {error}). Write it again") from error
 
 
 def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:

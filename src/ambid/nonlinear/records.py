@@ -33,6 +33,11 @@ class Scaled:
         """Number of outputs."""
         return int(self.y_level.size)
 
+    def levels(self, record: IOData) -> dict[str, float]:
+        """Return the level of each channel, SI."""
+        values = (*self.u_level.tolist(), *self.y_level.tolist())
+        return dict(zip((*record.inputs, *record.outputs), values, strict=True))
+
 
 def scaled_records(
     structure: str, records: Sequence[IOData], *, lag: int, levels: str = "mean", fewest: int = _FEWEST

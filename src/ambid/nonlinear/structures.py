@@ -57,8 +57,8 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="narmax",
         summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
-        options="ambid.nonlinear.narmax.settings:NarmaxSettings",
-        home="ambid.nonlinear.narmax.estimate:narmax",
+        options="ambid.nonlinear.narmax_choice:NarmaxSettings",
+        home="ambid.nonlinear.narmax:narmax",
         feedback="with noise model",
     ),
     NonlinearStructure(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.narmax import PolynomialNarmax, narmax
+from ambid.nonlinear.lagged import LaggedModel
+from ambid.nonlinear.narmax import narmax
 from tests.measured import ABSENT, BENCHMARKS
 from tests.nonlinear.narmax.systems import record
 
@@ -20,7 +21,7 @@ def read(name: str) -> IOData:
     return record(found[:, 1], found[:, 2])
 
 
-def free_run(model: PolynomialNarmax, data: IOData, first: int) -> float:
+def free_run(model: LaggedModel, data: IOData, first: int) -> float:
     """Root mean square error of the free run from sample `first` on."""
     return float(np.sqrt(np.mean((model.simulate(data.u, data.y) - data.y)[first:] ** 2)))
 
@@ -32,7 +33,7 @@ def test_silverbox_by_a_polynomial_narx_model() -> None:
     training, test = multisine.part(0, 65062), multisine.part(65062, multisine.n_samples)
     settings = {"ny": 2, "nu": 3, "nk": 0, "ne": 0, "degree": 3, "criterion": "bic", "terms": 20}
     found = narmax([training], {**settings, "focus": "simulation", "pruning": "simulation"})
-    assert isinstance(found.model, PolynomialNarmax)
+    assert isinstance(found.model, LaggedModel)
     assert free_run(found.model, test, 50) < 0.27e-3
     assert free_run(found.model, test, 50) / np.std(test.y[50:]) < 0.005
     arrow = whole.part(100, 40575)
@@ -51,8 +52,8 @@ def test_coupled_drives_whose_speed_is_measured_without_sign() -> None:
         for degree, limit in ((1, linear), (3, cubic)):
             settings = {"ny": 3, "nu": 3, "degree": degree, "output": "magnitude", "criterion": "bic"}
             found = narmax([whole.part(0, 250)], {**settings, "symmetry": "odd"}).model
-            assert isinstance(found, PolynomialNarmax)
+            assert isinstance(found, LaggedModel)
             assert free_run(found, whole, 250) < limit
         signed = narmax([whole.part(0, 250)], {"ny": 3, "nu": 3, "degree": 2, "ne": 0, "focus": "simulation"}).model
-        assert isinstance(signed, PolynomialNarmax)
+        assert isinstance(signed, LaggedModel)
         assert free_run(signed, whole, 250) > 2 * linear  # without the magnitude nothing comes of it

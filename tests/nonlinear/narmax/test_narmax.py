@@ -9,8 +9,9 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.narmax import Factor, PolynomialNarmax, narmax
-from ambid.nonlinear.narmax.model import Cloud, derive, predict
+from ambid.nonlinear.lagged import LaggedModel
+from ambid.nonlinear.narmax import narmax
+from ambid.nonlinear.polynomial import PolynomialFunction
 from tests.nonlinear.narmax.systems import TRUTH, coefficients, polynomial, rational, record
 
 
@@ -54,8 +55,9 @@ def test_jacobian_with_innovations_and_denominators_is_exact() -> None:
     data = rational(300, 2, colour=0.7)
     found = narmax([data], {"kind": "rational", "ne": 1, "criterion": "bic", "pruning": "none", "ny": 1, "nu": 1})
     model = found.model
-    assert isinstance(model, PolynomialNarmax)
-    assert any(model.denominators)
+    assert isinstance(model, LaggedModel)
+    assert isinstance(model.function, PolynomialFunction)
+    assert model.function.is_rational
     assert any("e(" in name for name in model.names)
     J = model.jacobian(data.u, data.y)
     for k in range(model.theta.size):
@@ -178,35 +180,12 @@ def test_a_sign_that_the_sensor_does_not_see_is_found() -> None:
         narmax([data], {"output": "magnitude", "focus": "prediction"})
 
 
-def test_slopes_of_magnitudes_are_exact() -> None:
-    rng = np.random.default_rng(7)
-    u = np.repeat(rng.choice([-1.0, 1.0], 30), 8)[:, None]
-    y = np.abs(rng.standard_normal((240, 1)))
-    zero = np.zeros(2)
-    for output in ("magnitude", "mean magnitude"):
-        model = PolynomialNarmax(
-            dt=1.0, n_inputs=1, numerators=(((Factor("y", 0, 1),), (Factor("y", 0, 2),) * 3, (Factor("u", 0, 1),)),),
-            denominators=((),), theta=np.array([0.7, -0.02, 0.4]), u_level=zero[:1], u_scale=np.ones(1),
-            y_level=zero[:1], y_scale=np.ones(1), cloud=Cloud(mean=np.zeros(3), whitening=np.eye(3)), output=output,
-        )  # fmt: skip
-        t, theta = model.tables, model.theta
-        for free in (False, True):
-            out, z = predict(t, theta, y, u, free=free)
-            assert np.nanmin(out) >= 0
-            S = derive(t, theta, z, free=free)
-            for k in range(3):
-                h = np.zeros(3)
-                h[k] = 1e-7
-                slope = predict(t, theta + h, y, u, free=free)[0] - predict(t, theta - h, y, u, free=free)[0]
-                np.testing.assert_allclose(S[t.lag :, :, k], slope[t.lag :] / 2e-7, atol=1e-6)
-
-
 def test_levels_are_taken_off_only_where_signals_stand_far_from_zero() -> None:
     data = polynomial(800, 5)
     near = narmax([data], {}).model
     far = narmax([replace(data, y=data.y + 50.0)], {}).model
-    assert isinstance(near, PolynomialNarmax)
-    assert isinstance(far, PolynomialNarmax)
+    assert isinstance(near, LaggedModel)
+    assert isinstance(far, LaggedModel)
     assert near.y_level[0] == 0.0
     assert far.y_level[0] == pytest.approx(50.0, abs=0.5)
     one, other = near.predict(data.u, data.y), far.predict(data.u, data.y + 50.0) - 50.0
@@ -216,7 +195,7 @@ def test_levels_are_taken_off_only_where_signals_stand_far_from_zero() -> None:
 
 def test_a_run_that_diverges_is_not_a_number_from_there_on() -> None:
     found = narmax([polynomial(500, 0)], {"ne": 0}).model
-    assert isinstance(found, PolynomialNarmax)
+    assert isinstance(found, LaggedModel)
     names = list(found.names)
     theta = found.theta.copy()
     theta[names.index("y(t-1)")] = 1.5

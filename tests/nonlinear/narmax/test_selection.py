@@ -7,8 +7,8 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import CRITERIA, information, penalty
-from ambid.nonlinear.narmax.selection import MatrixCandidates, candidates, select_terms
-from ambid.nonlinear.narmax.terms import lagged, products, term_name
+from ambid.nonlinear.polynomial import lagged, products, term_name
+from ambid.nonlinear.selection import MatrixCandidates, candidates, select_terms
 from tests.nonlinear.narmax.systems import polynomial
 
 
@@ -36,7 +36,7 @@ def plain(P: np.ndarray, y: np.ndarray, most: int) -> tuple[list[int], list[floa
 def regression(n: int = 700, degree: int = 3) -> tuple[np.ndarray, np.ndarray, tuple]:
     data = polynomial(n, 1, c=0.0)
     terms = products(lagged(1, 1, ny=3, nu=3, nk=1, ne=0), degree)
-    found = candidates(terms, [data.y], [data.u], None, 3)
+    found = candidates(terms, [(data.y, data.u)], 3)
     return found.columns(range(len(terms))), data.y[3:, 0], terms
 
 
@@ -95,7 +95,7 @@ def test_candidates_given_first_stay_in() -> None:
 def test_the_matrix_is_not_changed_and_blocks_do_not_matter() -> None:
     data = polynomial(9000, 2)
     terms = products(lagged(1, 1, ny=2, nu=2, nk=1, ne=0), 2)
-    rows = candidates(terms, [data.y[:5000], data.y[5000:]], [data.u[:5000], data.u[5000:]], None, 2)
+    rows = candidates(terms, [(data.y[:5000], data.u[:5000]), (data.y[5000:], data.u[5000:])], 2)
     P = np.asfortranarray(rows.columns(range(len(terms))))
     before, y = P.copy(), np.concatenate([data.y[2:5000, 0], data.y[5002:, 0]])
     whole, blocks = select_terms(MatrixCandidates(matrix=P), y, most=8), select_terms(rows, y, most=8)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.nonlinear.narmax.estimate import narmax
+from ambid.nonlinear.narmax import narmax
 from ambid.validate.nonlinear import judge, residuals_of, run
 from ambid.validate.residuals import correlations
 from tests.validate.nonlinear.plants import io, levitated, output_error, squared

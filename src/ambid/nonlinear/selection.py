@@ -16,7 +16,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.criteria import EXACT, information, penalty
-from ambid.nonlinear.narmax.terms import Factor, Term
+from ambid.nonlinear.polynomial import Factor, Term
 
 _BLOCK = 4096  # rows at a time: a block of some hundred candidates stays in the cache of the second level
 _SHORT = 1e-6  # squared length left of a candidate below which its Gram matrix has too few digits to choose it
@@ -42,10 +42,9 @@ class Candidates:
         return sum(self.rows)
 
     def blocks(self, which: Sequence[int] | None = None) -> Iterator[tuple[slice, Array]]:
-        """Yield rows in order, a block at a time.
+        """Yield rows in order, a block at a time, and values of some candidates, or of all, there.
 
-        `which`: candidates; all of them without. Returns `values`: (n_which, n_rows of the block), one candidate a row,
-        contiguous.
+        Values are of shape (n_which, n_rows of the block), contiguous.
         """
         terms = self.terms if which is None else [self.terms[k] for k in which]
         size, start = max(_BLOCK, 1), 0
@@ -61,10 +60,7 @@ class Candidates:
             start += n
 
     def columns(self, which: Sequence[int]) -> Array:
-        """Return some candidates whole.
-
-        Returns (n_rows, n_which).
-        """
+        """Return some candidates whole, shape (n_rows, n_which)."""
         out = np.empty((len(which), self.n_rows))
         for rows, values in self.blocks(which):
             out[:, rows] = values
@@ -82,25 +78,21 @@ def _product(term: Term, signals: dict[Factor, Array], first: int, last: int, ou
 
 def candidates(
     terms: Sequence[Term],
-    y: Sequence[Array],
-    u: Sequence[Array],
-    e: Sequence[Array] | None,
+    records: Sequence[tuple[Array, Array]],
     lag: int,
+    innovations: Sequence[Array] | None = None,
     weight: tuple[Array, ...] | None = None,
 ) -> Candidates:
-    """Return the candidates over several records, rows from sample `lag` of each on.
-
-    Innovations `e` may be left out where no term holds one; `weight` multiplies the values of each row.
-    """
+    """Return the candidates over several records, rows from sample `lag` of each on; `weight` multiplies each row."""
     factors = sorted({f for t in terms for f in t})
     parts = []
-    for r in range(len(y)):
-        of = {"y": y[r], "u": u[r]} if e is None else {"y": y[r], "u": u[r], "e": e[r]}
-        n = y[r].shape[0]
+    for r, (y, u) in enumerate(records):
+        of, n = {"y": y, "u": u}, y.shape[0]
+        if innovations is not None:
+            of["e"] = innovations[r]
         parts.append({f: np.ascontiguousarray(of[f.kind][lag - f.lag : max(n - f.lag, 0), f.channel]) for f in factors})
-    return Candidates(
-        terms=tuple(terms), parts=tuple(parts), rows=tuple(max(x.shape[0] - lag, 0) for x in y), weight=weight
-    )
+    rows = tuple(max(y.shape[0] - lag, 0) for y, _ in records)
+    return Candidates(terms=tuple(terms), parts=tuple(parts), rows=rows, weight=weight)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,20 +112,14 @@ class MatrixCandidates:
         return range(self.matrix.shape[1])
 
     def blocks(self, which: Sequence[int] | None = None) -> Iterator[tuple[slice, Array]]:
-        """Yield rows in order, as `Candidates.blocks` does.
-
-        Returns `values`: (n_which, n_rows of the block).
-        """
+        """As `Candidates.blocks`."""
         chosen = self.matrix if which is None else self.matrix[:, list(which)]
         for first in range(0, self.n_rows, _BLOCK):
             last = min(first + _BLOCK, self.n_rows)
             yield slice(first, last), np.array(chosen[first:last].T, order="C")
 
     def columns(self, which: Sequence[int]) -> Array:
-        """Return some candidates whole.
-
-        Returns (n_rows, n_which).
-        """
+        """Return some candidates whole, shape (n_rows, n_which)."""
         return self.matrix[:, list(which)]
 
 

@@ -1,0 +1,299 @@
+"""NARMAX from records: terms by orthogonal least squares, coefficients by prediction (or simulation) errors.
+
+Linear start -> process terms -> denominators -> noise terms -> pruning -> Levenberg-Marquardt with exact derivatives.
+Standard deviations are those of the coefficients of the terms chosen; that the terms were chosen from the same data
+makes them too small where a term was a close call (Leeb and Poetscher 2005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.progress import Tick, part_of, portions
+from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
+from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, finish, guarded, laplace, sandwiched
+from ambid.nonlinear.narmax_choice import (
+    Choice,
+    NarmaxSettings,
+    add_all_noise,
+    add_noise_terms,
+    choose_by_simulation,
+    is_sampled_fast,
+    narmax_settings,
+    process_terms,
+    prune_by_prediction,
+    prune_by_simulation,
+    rational_terms,
+    samples,
+)
+from ambid.nonlinear.polynomial import term_name
+from ambid.nonlinear.records import Parts, Scaled, scaled_records
+
+_CLEAR = 10.0  # of the information criterion, which all candidates have to gain over those of the ratios
+_MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more take minutes
+_PRUNINGS = 6
+_ITERATIONS, _ROUGHLY = 60, 12  # of a search at most; of one between, with terms too many, which creeps
+_NEAR_ZERO = 0.05  # part of a denominator's largest value
+DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+
+
+@dataclass(slots=True, kw_only=True)
+class _Fitting(Draft):
+    """The best model so far that runs, and how its terms were chosen."""
+
+    choice: Choice
+
+    def take(self, choice: Choice, *, free: bool) -> None:
+        """Take over another model; `free`: whether its coefficients are fitted to the free run."""
+        self.choice, self.function, self.theta, self.free = choice, choice.function, choice.theta, free
+
+
+def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+    """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4).
+
+    Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``; not random.
+    """
+    if not records:
+        raise EstimationError("narmax: no record is given. Pass one at least")
+    s = narmax_settings(settings, n_inputs=records[0].n_inputs)
+    data = scaled_records("narmax", records, lag=s.lag, levels="auto" if s.output == "signed" else "zero", fewest=10)
+    _check_magnitude(s, records)
+    # a linear model: something to hand over when the very next thing is an interruption
+    linear = process_terms(replace(s, degree=1, ne=0, selection="frols"), data.parts, None)
+    fitting = _Fitting(choice=linear, function=linear.function, theta=linear.theta)
+
+    def identify() -> None:
+        _fit_terms(s, data.parts, fitting, tick)
+        if fitting.status == "stalled":
+            fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+
+    def fail(why: str) -> NonlinearFit:
+        return failed_fit("narmax", records, asdict(s), seed, why, fitting.timing_s)
+
+    failed = guarded(identify, fitting, fail)
+    if failed or not np.isfinite(fitting.choice.cost(data.parts)):
+        return failed or fail(DIVERGED)
+    return _finish(records, s, data, fitting, seed)
+
+
+def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
+    if s.output == "signed":
+        return
+    if (records[0].n_inputs, records[0].n_outputs) != (1, 1):
+        raise EstimationError(f"narmax: output = {s.output} is for one input and one output. Choose one of each")
+    for r, x in enumerate(records):
+        if np.min(x.y) < 0:
+            raise EstimationError(
+                f"narmax: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
+                "magnitude is not. Use output = signed"
+            )
+
+
+def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | None) -> None:
+    if tick is not None:
+        tick("start", 0.0)
+    if s.selection != "auto":
+        _run_stages(s, parts, fitting, tick)
+        return
+    by_ratio, every = replace(s, selection="frols"), replace(s, selection="all")
+    first = process_terms(by_ratio, parts, None)
+    few = first.n_candidates <= min(_MOST_AT_ONCE, samples(parts, s.lag) // 20)  # all can be in a model at once
+    if not (few and s.kind == "polynomial" and is_sampled_fast(first)):
+        _run_stages(by_ratio, parts, fitting, tick)
+        return
+    _run_stages(by_ratio, parts, fitting, part_of(tick, 0.0, 0.2))
+    one, status, curves, free = fitting.choice, fitting.status, len(fitting.curves), fitting.free
+    weight = _weight(one, parts)
+    _run_stages(every, parts, fitting, part_of(tick, 0.2, 1.0))
+    gained = _value(s, parts, one, weight) - _value(s, parts, fitting.choice, weight)
+    if gained > _CLEAR and fitting.free == free:
+        fitting.warnings.append(
+            "sampled so fast that the last output takes nearly all of an error reduction ratio and hides what drives "
+            "the plant: terms are what is left of all candidates (selection = all), which predict better than those "
+            "chosen by the ratios"
+        )
+        return
+    fitting.take(one, free=free)
+    fitting.status = status
+    del fitting.curves[curves:]
+
+
+def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | None) -> None:
+    """All stages, one after the other; their shares of the time are a guess, right within a factor of some."""
+    by_run, free = s.selection == "simulation", s.focus == "simulation"
+    costs = (20.0 if by_run else 0.2, 1.5 * (s.kind == "rational"), 1.0 * bool(s.ne), 1.5, 1.0 * free)
+    choosing, below, noise, pruning, last = portions(tick, costs)
+    began = perf_counter()
+    if by_run:
+        found = choose_by_simulation(s, parts, choosing, lambda x: fitting.take(x, free=True))
+    else:
+        found = process_terms(s, parts, choosing)
+    if s.kind == "rational":
+        found = rational_terms(s, found, parts, part_of(below, 0.0, 0.5))
+        found = _search(parts, found, fitting, part_of(below, 0.5, 1.0))
+    if not (by_run and free):
+        if by_run:  # coefficients by one-step errors for terms that were chosen, and fitted, by the free run
+            found = found.with_theta(found.search(parts, free=False).theta)
+        _keep(fitting, parts, found)
+        began = fitting.timed("terms", began)
+        if s.ne:
+            found = add_noise_terms(s, found, parts, part_of(noise, 0.0, 0.4))
+            found = _search(parts, found, fitting, part_of(noise, 0.4, 1.0))
+        began = fitting.timed("noise terms", began)
+        found = _prune(s, parts, found, fitting, pruning)
+        began = fitting.timed("pruning", began)
+    else:
+        began = fitting.timed("terms", began)
+    if free:
+        found = found.without_noise()
+        if np.isfinite(found.cost(parts, free=True)):
+            _search(parts, found, fitting, last, free=True)
+        else:
+            fitting.status = "stalled"
+            fitting.warnings.append(
+                "the free run of the chosen terms diverges, so that their coefficients are those of the one-step "
+                "errors: choose terms by simulation (selection or pruning), or lower degree"
+            )
+        fitting.timed("simulation errors", began)
+
+
+def _weight(found: Choice, parts: Parts, *, free: bool = False) -> Array:
+    """What gives the errors of a choice unit variance."""
+    problem = found.problem(parts, free=free)
+    return problem.weight_for(np.concatenate(problem.errors(found.theta)))
+
+
+def _keep(fitting: _Fitting, parts: Parts, found: Choice) -> None:
+    """Keep a choice if it runs."""
+    if np.isfinite(found.cost(parts)):
+        fitting.take(found, free=False)
+
+
+def _search(
+    parts: Parts, found: Choice, fitting: _Fitting, tick: Tick | None, *, free: bool = False, most: int = _ITERATIONS
+) -> Choice:
+    """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
+    if not free and not np.any(found.function.noisy) and not found.function.is_rational:
+        _keep(fitting, parts, found)
+        return found
+    weight = _weight(found, parts, free=free)
+
+    def keep(theta: Array) -> None:
+        fitting.take(found.with_theta(theta), free=free)
+
+    ended = found.search(parts, weight=weight, free=free, most=most, tick=tick, keep=keep)
+    if not np.isfinite(ended.cost):
+        return found
+    fitting.status = "converged" if ended.converged else "stalled"
+    problem = found.problem(parts, free=free, weight=weight)
+    fitting.note(ended, problem, f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors")
+    keep(ended.theta)
+    return found.with_theta(ended.theta)
+
+
+def _prune(s: NarmaxSettings, parts: Parts, found: Choice, fitting: _Fitting, tick: Tick | None) -> Choice:
+    if s.pruning == "none":
+        return found
+    if s.pruning == "simulation":
+        n = samples(parts, found.function.lag)
+        fewer = prune_by_simulation(
+            found, parts, lambda x: x.value(s.criterion, parts, n, free=True), part_of(tick, 0.0, 0.6)
+        )
+        return found if fewer is found else _search(parts, fewer, fitting, part_of(tick, 0.6, 1.0))
+    weight = _weight(found, parts)
+
+    def prune(x: Choice, share: float, *, noise: bool = True, most: int = _ITERATIONS) -> Choice:
+        for k in range(_PRUNINGS):  # a search between, for what may go is judged where the rest is at its best
+            fewer = prune_by_prediction(x, parts, weight, s.criterion, noise=noise)
+            same, begin = fewer.theta.size == x.theta.size, share + 0.25 * k / _PRUNINGS
+            x = _search(parts, fewer, fitting, part_of(tick, begin, begin + 0.25 / _PRUNINGS), most=most)
+            if same:
+                break
+        return x
+
+    best = prune(found, 0.0)
+    ended = fitting.status
+    richer = add_all_noise(s, found)
+    if richer is not found and np.any(found.function.noisy):
+        # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
+        # these are there can the surplus process terms go one by one.
+        other = _search(parts, richer, fitting, part_of(tick, 0.25, 0.5), most=_ROUGHLY)
+        other = prune(prune(other, 0.5, noise=False, most=_ROUGHLY), 0.75)
+        if _value(s, parts, other, weight) < _value(s, parts, best, weight):
+            best, ended = other, fitting.status
+    fitting.status = ended
+    _keep(fitting, parts, best)
+    return best
+
+
+def _value(s: NarmaxSettings, parts: Parts, found: Choice, weight: Array) -> float:
+    """Information criterion of the one-step errors of all outputs."""
+    n = samples(parts, found.function.lag) * found.function.n_outputs
+    return found.value(s.criterion, parts, n, weight=weight)
+
+
+def _finish(records: Sequence[IOData], s: NarmaxSettings, data: Scaled, fitting: _Fitting, seed: int) -> NonlinearFit:
+    """Return the fit of a model that runs."""
+    of, theta = fitting.choice.function, fitting.theta
+    problem = fitting.choice.problem(data.parts, free=fitting.free).at(theta)
+    found = laplace(problem, theta)
+    covariance = found.covariance
+    if covariance is None:
+        fitting.warnings.append(
+            f"the data do not tell the chosen terms apart (condition number {found.condition:.1e}). Lower terms or "
+            "degree, or excite more"
+        )
+    elif fitting.free:
+        covariance = sandwiched(problem, theta)
+    fitting.warnings += _cautions(records, s, problem, fitting)
+    if covariance is None:
+        fitting.warnings.append(
+            "no covariance, and so no standard deviations: the data do not determine the coefficients"
+        )
+    terms = {
+        records[0].outputs[o]: [
+            {"term": term_name(x, of.n_outputs, of.m), "err": fitting.choice.err.get((o, x))} for x in own
+        ]
+        for o, own in enumerate(of.numerators)
+    }
+    fitting.details = {
+        "terms": terms, "candidates": fitting.choice.n_candidates, "passes": fitting.choice.passes,
+        "levels": data.levels(records[0]),
+    }  # fmt: skip
+    used = {**asdict(s), "focus": "simulation" if fitting.free else "prediction"}
+    return finish(
+        "narmax", records, used, data, fitting, problem, found, covariance=covariance,
+        origin="sandwich" if fitting.free else "information", seed=seed,
+    )  # fmt: skip
+
+
+def _cautions(records: Sequence[IOData], s: NarmaxSettings, problem: LaggedProblem, fitting: _Fitting) -> list[str]:
+    out, of = [], fitting.choice.function
+    may_be_closed = of.m > 0 and not all(x.open_loop for x in records)
+    if fitting.free and may_be_closed:
+        out.append(
+            "fitted to the free run, narmax is biased where a controller was at work, and nothing says that these "
+            "records are open loop: use focus = prediction, or say --open-loop if there was no feedback"
+        )
+    elif not s.ne and may_be_closed:
+        out.append(
+            "without a noise model (ne = 0) narmax is biased under feedback unless the equation error is white: "
+            "raise ne, or say --open-loop if there was no feedback"
+        )
+    if not fitting.free and not np.isfinite(fitting.choice.cost(problem.parts, free=True)):
+        out.append(
+            "the free run diverges on the records that the model was fitted to: it predicts, but does not simulate. "
+            "Choose terms by simulation (selection or pruning), or lower degree"
+        )
+    block = of.terms_block
+    below = [block.denominators(fitting.theta, of.predict(fitting.theta, r)[1].prepared[0]) for r in problem.rows()]
+    if of.is_rational and any(np.any(np.min(a, axis=0) < _NEAR_ZERO * np.max(np.abs(a), axis=0)) for a in below):
+        out.append("a denominator comes near zero on the training data: predictions there are not to be trusted")
+    return out

@@ -1,0 +1,529 @@
+"""Which terms a NARMAX model has: process terms, denominators, noise terms, and which of them can go again.
+
+Process terms are chosen from measured signals alone, by orthogonal least squares. Denominators are chosen together with
+numerators from the equation multiplied out (thesis eq. 3.3); there y(t) stands on the right side too, and its noise
+would bias the result (Billings and Zhu 1991): a prediction takes its place, which makes the equation error the
+innovation itself. Terms with innovations follow by extended least squares: those of the model before stand for the
+unknown ones, process terms stay as they are (Billings 2013, sec. 3.5).
+
+By simulation, from a linear model on, each candidate not in the model is looked at as a coefficient that is still zero:
+the slope of the free run by it, an exact sensitivity, is its column, and the simulation error what the columns have to
+explain. The one with the largest error reduction ratio enters, all coefficients are searched anew, terms that have
+become useless go. The aim is that of Piroddi and Spinelli (2003), who try every candidate in a run of its own. Where
+only the magnitude of the output is measured, such as the speed of a pulse counter, the sign is not in the data, and a
+search from a wrong one ends in a wrong minimum. So linear models of order three (a real pole, a pair, a delay) are laid
+on a grid, the gain of each fitted to the magnitude, and the best of them refined.
+
+A term is taken out with the others readjusted along the linearised least-squares problem, exact for NARX: by
+predictions if an information criterion gains by it, by simulation if the free run does not pay for it, for terms that
+predict well for one step may spoil a run of many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.criteria import CRITERIA, information, penalty
+from ambid.estimation.linear import least_squares
+from ambid.estimation.progress import Tick, guessed, part_of
+from ambid.estimation.search import Found, search
+from ambid.nonlinear.lagged_problem import LaggedProblem, plain_problem
+from ambid.nonlinear.nn_magnitude import pole_grid
+from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term, lagged, products
+from ambid.nonlinear.records import Parts
+from ambid.nonlinear.selection import Candidates, MatrixCandidates, Selection, candidates, select_terms
+from ambid.nonlinear.settings import choice, read_settings, whole
+
+_ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations
+_NEARLY_ALL = 0.99  # of the output's energy
+_RATIONAL_ROUNDS = 4
+_LONG = 20  # lags of the model whose errors begin
+_LESS = 0.95  # part of the errors' variance that it must leave
+_ROUNDS = 12  # of extended least squares
+_USUAL_ROUNDS = 3.0  # about half of those that it takes
+_CHOOSING = 3  # rounds in which the choice of noise terms may still change
+_USUAL_PRUNED, _USUAL_TRIALS = 4.0, 8.0  # about half of the terms that are left out, of the trials by simulation
+_PRUNED = 10  # coefficients that are tried before it is said that none can go
+_ADDED = 4  # candidates that are tried by simulation before it is said that none pays
+_WORSE = 1.2  # times the errors' squares: beyond, leaving one out is far from what the linearised problem says
+_REFINED = 25  # models of the grid that are searched from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NarmaxSettings:
+    """Settings of a NARMAX fit."""
+
+    ny: int = whole("largest lag of the outputs; 2", 0, 100, 2)
+    nu: int = whole("number of lags of each input; 2", 0, 100, 2)
+    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
+    ne: int = whole("largest lag of the innovations, 0 for NARX; 2", 0, 100, 2)
+    degree: int = whole("of the polynomial; 2", 1, 9, 2)
+    terms: int = whole(
+        "process terms that are looked at for each output, at most; 30, fewer on a short record", 1, 2000, 30
+    )
+    constant: int = whole("1 to let a constant be chosen, 0 for none; 1", 0, 1, 1)
+    criterion: str = choice("what ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic", *CRITERIA)
+    pruning: str = choice(
+        "what decides on terms to leave out again: prediction, simulation, none; prediction",
+        *("prediction", "simulation", "none"),
+    )
+    kind: str = choice("polynomial or rational; polynomial", "polynomial", "rational")
+    selection: str = choice(
+        "frols (by ratios), simulation (by the free run), all (every candidate), auto (frols; all if a"
+        " plant is sampled so fast that the ratios say little, and all predict better); auto",
+        *("auto", "frols", "simulation", "all"),
+    )
+    focus: str = choice(
+        "prediction or simulation: which errors the coefficients make small at last; prediction",
+        *("prediction", "simulation"),
+    )
+    output: str = choice(
+        "magnitude, or mean magnitude (over a sample), where the sensor sees no sign; signed", *OUTPUTS
+    )
+    symmetry: str = choice(
+        "odd where the plant is the same the other way round: terms of odd degree alone; none", "none", "odd"
+    )
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a candidate may look at."""
+        return max(self.ny, self.nk + self.nu - 1 if self.nu else 0, self.ne)
+
+
+_WITH_MAGNITUDE: Mapping[str, object] = {
+    "selection": "simulation",
+    "focus": "simulation",
+    "kind": "polynomial",
+    "pruning": "simulation",
+    "ne": 0,
+}
+
+
+def narmax_settings(given: Mapping[str, object], *, n_inputs: int) -> NarmaxSettings:
+    """Check settings and complete them; without inputs there are no lags of them."""
+    s = read_settings(NarmaxSettings, "narmax", given)
+    if s.output != "signed":  # a sign that is not measured is found by simulation
+        for name, value in _WITH_MAGNITUDE.items():
+            if given.get(name, value) != value:
+                raise EstimationError(f"narmax: output = {s.output} needs {name} = {value}; it is {given[name]!r}")
+        s = replace(s, **_WITH_MAGNITUDE)  # type: ignore[arg-type]
+    if not n_inputs:
+        s = replace(s, nu=0, nk=1)
+    if not s.ny and not s.nu:
+        raise EstimationError("narmax: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+    return s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Choice:
+    """Terms with their coefficients, in scaled signals, and how they were chosen."""
+
+    function: PolynomialFunction
+    theta: Array
+    err: Mapping[tuple[int, Term], float] = field(default_factory=dict)  # error reduction ratio, where there is one
+    n_candidates: int = 0  # of one output, at most
+    passes: int = 0  # over the data, in the choice of process terms
+
+    def with_theta(self, theta: Array) -> Choice:
+        """Return the same terms with other coefficients."""
+        return replace(self, theta=theta)
+
+    def with_numerators(self, numerators: list[tuple[Term, ...]], coefficients: list[Array]) -> Choice:
+        """Return other numerators over the same denominators, coefficients by output."""
+        both = [x for o, c in enumerate(coefficients) for x in (c, self.coefficients(o, 1))]
+        return replace(self, function=replace(self.function, numerators=tuple(numerators)), theta=np.concatenate(both))
+
+    def coefficients(self, output: int, below: int = 0) -> Array:
+        """Return the coefficients of an output's numerator, or of its denominator."""
+        return self.theta[[(o, b) == (output, below) for o, b, _ in self.function.owned]]
+
+    def without(self, k: int, theta: Array) -> Choice:
+        """Return a choice without term k; `theta` is of those that stay."""
+        owned = self.function.owned
+        return replace(self, function=self.function.with_terms((*owned[:k], *owned[k + 1 :])), theta=theta)
+
+    def without_noise(self) -> Choice:
+        """Return the process part."""
+        stays = ~self.function.noisy
+        owned = [x for x, stay in zip(self.function.owned, stays, strict=True) if stay]
+        return replace(self, function=self.function.with_terms(owned), theta=self.theta[stays])
+
+    def problem(self, parts: Parts, *, free: bool = False, weight: Array | None = None) -> LaggedProblem:
+        """Return the problem of its coefficients; errors count alike without a `weight`."""
+        return plain_problem(self.function, parts, self.theta, free=free, weight=weight)
+
+    def cost(self, parts: Parts, *, free: bool = False, weight: Array | None = None) -> float:
+        """Return the sum of squared weighted errors; infinite where it diverges."""
+        return self.problem(parts, free=free, weight=weight).cost(self.theta)
+
+    def value(self, criterion: str, parts: Parts, n: int, *, free: bool = False, weight: Array | None = None) -> float:
+        """Return an information criterion of its errors, `n` in number."""
+        cost, m = self.cost(parts, free=free, weight=weight), max(self.n_candidates, self.theta.size)
+        return information(criterion, cost / n, self.theta.size, n, m) if np.isfinite(cost) else np.inf
+
+    def search(
+        self,
+        parts: Parts,
+        *,
+        free: bool,
+        weight: Array | None = None,
+        most: int = 40,
+        tick: Tick | None = None,
+        keep: Callable[[Array], None] | None = None,
+    ) -> Found:
+        """Search for the coefficients of the least sum of squared errors."""
+        problem = self.problem(parts, free=free, weight=weight)
+        return search(
+            problem, self.theta, stage="simulation-error search" if free else "prediction-error search", most=most,
+            tolerance=max(1e-10, _ENOUGH / max(problem.n_errors, 1)), damping=1e-4, tick=tick, keep=keep,
+        )  # fmt: skip
+
+
+def samples(parts: Parts, lag: int) -> int:
+    """Return how many samples of one output can be predicted."""
+    return max(sum(max(int(y.shape[0]) - lag, 0) for y, _ in parts), 2)
+
+
+# --- process terms ---------------------------------------------------------------------------------------------------
+
+
+def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
+    """Choose the terms without innovations by orthogonal least squares, and their coefficients by least squares."""
+    p, m = parts[0][0].shape[1], parts[0][1].shape[1]
+    terms = process_candidates(s, p, m)
+    found = candidates(terms, parts, s.lag)
+    num, theta, err, passes = [], [], {}, 0
+    for o in range(p):
+        target = np.concatenate([y[s.lag :, o] for y, _ in parts])
+        chosen = _choose(s, found, target, part_of(tick, o / p, (o + 1) / p))
+        n_best = len(chosen.order) if s.selection == "all" else max(chosen.n_best, 1)  # no model without a term
+        picks = chosen.order[:n_best] or (0,)
+        err.update({(o, terms[k]): float(x) for k, x in zip(picks, chosen.err, strict=False)})
+        num.append(tuple(terms[k] for k in picks))
+        theta.append(least_squares(found.columns(picks), target))
+        passes = max(passes, chosen.passes)
+    function = PolynomialFunction(numerators=tuple(num), denominators=((),) * p, m=m)
+    return Choice(function=function, theta=np.concatenate(theta), err=err, n_candidates=len(terms), passes=passes)
+
+
+def process_candidates(s: NarmaxSettings, n_outputs: int, n_inputs: int) -> tuple[Term, ...]:
+    """Return all products of lagged outputs and inputs that the settings allow."""
+    factors = lagged(n_outputs, n_inputs, ny=s.ny, nu=s.nu, nk=s.nk)
+    return products(factors, s.degree, constant=bool(s.constant), odd=s.symmetry == "odd")
+
+
+def is_sampled_fast(found: Choice) -> bool:
+    """Return whether an output's last value takes so much of an error reduction ratio that the ratios say little."""
+    return any(x == (Factor("y", o, 1),) and ratio > _NEARLY_ALL for (o, x), ratio in found.err.items())
+
+
+def _choose(s: NarmaxSettings, found: Candidates | MatrixCandidates, y: Array, tick: Tick | None) -> Selection:
+    """Choose as the settings say."""
+    most = len(found.terms) if s.selection == "all" else min(s.terms, max(y.size // 5, 1))
+    tell = None if tick is None else lambda done: tick("choice of terms", done)
+    return select_terms(found, y, most=most, criterion=s.criterion, tick=tell)
+
+
+def rational_terms(s: NarmaxSettings, polynomial: Choice, parts: Parts, tick: Tick | None) -> Choice:
+    """Choose numerators and denominators together; the predictions of a `polynomial` model begin the iteration."""
+    p, m = parts[0][0].shape[1], parts[0][1].shape[1]
+    up = process_candidates(s, p, m)
+    down = process_candidates(replace(s, constant=0, symmetry="none"), p, m)
+    both = (*up, *down)
+    P, D = (candidates(x, parts, s.lag).columns(range(len(x))) for x in (up, down))
+    owned: list[tuple[int, int, Term]] = []
+    theta, err, passes = [], {}, 1
+    for o, own in enumerate(polynomial.function.numerators):
+        target = np.concatenate([y[s.lag :, o] for y, _ in parts])
+        best, c = [(o, 0, x) for x in own], polynomial.coefficients(o)
+        yhat = candidates(own, parts, s.lag).columns(range(len(own))) @ c
+        for k in range(_RATIONAL_ROUNDS):
+            begin, each = (o * _RATIONAL_ROUNDS + k) / (p * _RATIONAL_ROUNDS), 1.0 / (p * _RATIONAL_ROUNDS)
+            matrix = np.hstack([P, -yhat[:, None] * D])
+            found = _choose(s, MatrixCandidates(matrix=matrix), target, part_of(tick, begin, begin + each))
+            picks = np.array(sorted(found.chosen, key=lambda k: k >= len(up)), dtype=np.int64)
+            trial, below = least_squares(matrix[:, picks], target), picks >= len(up)
+            divided = 1.0 + D[:, picks[below] - len(up)] @ trial[below]
+            if not (picks.size and np.all(divided > 1e-3)):
+                break
+            best, c = [(o, int(k >= len(up)), both[k]) for k in picks], trial
+            yhat = (P[:, picks[~below]] @ trial[~below]) / divided
+            err.update({(o, up[k]): float(x) for k, x in zip(found.chosen, found.err, strict=False) if k < len(up)})
+            passes = max(passes, found.passes)
+        owned += best
+        theta.append(c)
+    function = polynomial.function.with_terms(owned)
+    return Choice(function=function, theta=np.concatenate(theta), err=err, n_candidates=len(both), passes=passes)
+
+
+# --- noise terms ------------------------------------------------------------------------------------------------------
+
+
+def add_noise_terms(s: NarmaxSettings, process: Choice, parts: Parts, tick: Tick | None) -> Choice:
+    """Add innovations to process terms by extended least squares, until coefficients stand still."""
+    p, m = parts[0][0].shape[1], parts[0][1].shape[1]
+    extra = tuple((f,) for f in lagged(p, m, ny=0, nu=0, nk=1, ne=s.ne))
+    errors = innovations(process, parts)
+    if not extra or errors is None:
+        return process
+    errors = _innovations_of_long_model(process, parts, errors)
+    own, last, best = process.function.numerators, process.theta, process
+    chosen: list[tuple[Term, ...]] = [()] * p
+    targets = [np.concatenate([y[s.lag :, o] for y, _ in parts]) for o in range(p)]
+    over = [_over_denominator(s, process, parts, o) for o in range(p)]
+    for rounds in range(_ROUNDS):
+        if tick is not None:
+            tick("extended least squares", guessed(rounds, _USUAL_ROUNDS))
+        num, theta = [], []
+        for o in range(p):
+            if rounds < _CHOOSING:  # process terms are in the regression, not in the choice
+                rows, first = candidates((*own[o], *extra), parts, s.lag, errors, over[o]), range(len(own[o]))
+                most = len(first) + s.terms
+                found = select_terms(rows, targets[o], most=most, criterion=s.criterion, first=first)
+                chosen[o] = tuple(rows.terms[k] for k in found.chosen if k >= len(first))
+            num.append((*own[o], *chosen[o]))
+            rows = candidates(num[o], parts, s.lag, errors, over[o])
+            theta.append(least_squares(rows.columns(range(len(num[o]))), targets[o]))
+        trial = process.with_numerators(num, theta)
+        fresh = innovations(trial, parts)
+        if fresh is None:
+            return best
+        errors, best = fresh, trial
+        still = trial.theta.shape == last.shape and np.allclose(trial.theta, last, rtol=1e-4, atol=1e-6)
+        last = trial.theta
+        if still and rounds >= _CHOOSING - 1:
+            break
+    return best
+
+
+def _innovations_of_long_model(process: Choice, parts: Parts, errors: list[Array]) -> list[Array]:
+    """First innovations from many linear lags beside the process terms (Hannan and Rissanen 1982), if they are less.
+
+    Where noise on the output is sampled fast, least squares without noise terms is so biased that its errors are nearly
+    white, and no noise term pays beside them.
+    """
+    n, of = min(int(y.shape[0]) for y, _ in parts), process.function
+    most = min(_LONG, n // (10 * (of.n_outputs + of.m)))
+    if of.is_rational or most <= of.lag:
+        return errors
+    linear = [(f,) for f in lagged(of.n_outputs, of.m, ny=most, nu=most, nk=1)]
+    num, theta = [], []
+    for o, terms in enumerate(of.numerators):
+        num.append((*terms, *(x for x in linear if x not in terms)))
+        rows = candidates(num[o], parts, most)
+        theta.append(least_squares(rows.columns(range(len(num[o]))), np.concatenate([y[most:, o] for y, _ in parts])))
+    found = innovations(process.with_numerators(num, theta), parts)
+    if found is None:
+        return errors
+    size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, found)]
+    return found if np.any(size[1] < _LESS * size[0]) else errors
+
+
+def _over_denominator(s: NarmaxSettings, process: Choice, parts: Parts, output: int) -> tuple[Array, ...] | None:
+    """One over the values of an output's denominator in each record; None where it has none."""
+    below = process.function.denominators[output]
+    if not below:
+        return None
+    rows = candidates(below, parts, s.lag)
+    values = 1.0 + rows.columns(range(len(below))) @ process.coefficients(output, 1)
+    return tuple(np.split(1.0 / values, np.cumsum(rows.rows)[:-1]))
+
+
+def add_all_noise(s: NarmaxSettings, found: Choice) -> Choice:
+    """Return the choice with every innovation that it may have, those that are new at zero; the same if none is."""
+    of = found.function
+    extra = [(f,) for f in lagged(of.n_outputs, of.m, ny=0, nu=0, nk=1, ne=s.ne)]
+    more = [[x for x in extra if x not in terms] for terms in of.numerators]
+    if not any(more):
+        return found
+    num = [(*terms, *new) for terms, new in zip(of.numerators, more, strict=True)]
+    return found.with_numerators(num, [np.append(found.coefficients(o), np.zeros(len(x))) for o, x in enumerate(more)])
+
+
+def innovations(found: Choice, parts: Parts) -> list[Array] | None:
+    """Return the one-step errors of each record, zero before the first prediction; None where they diverge."""
+    errors, lag = found.problem(parts).errors(found.theta), found.function.lag
+    if not all(np.all(np.isfinite(e)) for e in errors):
+        return None
+    return [np.concatenate([np.zeros((lag, e.shape[1])), e]) for e in errors]
+
+
+# --- pruning ----------------------------------------------------------------------------------------------------------
+
+
+def prune_by_prediction(found: Choice, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Choice:
+    """Leave out terms as long as the information criterion of the one-step errors falls; `noise`: innovations too."""
+    n = samples(parts, found.function.lag)
+    m = max(found.n_candidates, found.theta.size)
+    while found.theta.size > found.function.n_outputs:
+        R, cost = found.problem(parts, weight=weight).triangle(found.theta), found.cost(parts, weight=weight)
+        if not np.all(np.isfinite(R)):
+            break
+        loss, inverse = _find_losses(R, found.theta)
+        saved = penalty(criterion, found.theta.size, n, m) - penalty(criterion, found.theta.size - 1, n, m)
+        may = _may_go(found, noise=noise)
+        order = np.argsort(np.where(may, loss, np.inf), kind="stable")[:_PRUNED]
+        trials = (_readjust(found, inverse, int(k)) for k in order if may[k] and loss[k] < saved)
+        fewer = next((x for x in trials if x.cost(parts, weight=weight) < _WORSE * cost), None)
+        if fewer is None:
+            break
+        found = fewer
+    return found
+
+
+def prune_by_simulation(
+    found: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None, *, anew: bool = False
+) -> Choice:
+    """Leave out process terms as long as `value` falls, an information criterion of the simulation errors.
+
+    With `anew` only the least significant term is tried at a time, and coefficients are searched anew without it.
+    """
+    now, before = value(found), found.theta.size
+    while found.theta.size > max(found.function.n_outputs, 2 * anew) and np.isfinite(now):
+        if tick is not None:
+            tick("simulation-error pruning", guessed(before - found.theta.size, _USUAL_PRUNED))
+        R = found.problem(parts, free=anew).triangle(found.theta)
+        if not np.all(np.isfinite(R)):
+            break
+        loss, inverse = _find_losses(R, found.theta)
+        may = np.flatnonzero(_may_go(found, noise=False))
+        if anew:
+            may = may[np.argmin(loss[may], keepdims=True)]
+        trials = [_readjust(found, inverse, int(k)) for k in may]
+        if anew:
+            trials = [_simulated(x, parts) for x in trials]
+        values = [value(x) for x in trials]
+        if not values or not min(values) < now:
+            break
+        best = int(np.argmin(values))
+        found, now = trials[best], values[best]
+    return found
+
+
+def _find_losses(R: Array, theta: Array) -> tuple[Array, Array]:
+    """How much the sum of squares grows without each coefficient, and the inverse triangle."""
+    scale = np.maximum(np.linalg.norm(R[:, :-1], axis=0), 1e-150)
+    inverse = np.linalg.pinv(R[: theta.size, :-1] / scale, rcond=1e-13) / scale[:, None]
+    variance = np.sum(inverse**2, axis=1)
+    return theta**2 / np.maximum(variance, 1e-300), inverse
+
+
+def _readjust(found: Choice, inverse: Array, k: int) -> Choice:
+    """The choice without term k, the other coefficients adjusted."""
+    covariance = inverse @ inverse[k]
+    return found.without(k, np.delete(found.theta - covariance * (found.theta[k] / max(covariance[k], 1e-300)), k))
+
+
+def _may_go(found: Choice, *, noise: bool) -> np.ndarray:
+    """Whether a term may be left out: an output keeps one term at least, innovations go only with `noise`."""
+    of = found.function
+    alone = np.array([not below and len(of.numerators[o]) == 1 for o, below, _ in of.owned])
+    return np.asarray(~alone & (noise | ~of.noisy))
+
+
+# --- by simulation ----------------------------------------------------------------------------------------------------
+
+
+def choose_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep: Callable[[Choice], None]) -> Choice:
+    """Choose process terms by the error of the free run; `keep` is given each better model.
+
+    Coefficients are those of a one-step fit where no free run stays finite.
+    """
+    if parts[0][0].shape[1] > 1:
+        raise EstimationError("narmax: selection = simulation is for one output. Use frols, and pruning = simulation")
+    terms, n = process_candidates(s, 1, parts[0][1].shape[1]), samples(parts, s.lag)
+    most = min(s.terms, max(n // 5, 1), len(terms))
+    first, trials, tried = part_of(tick, 0.0, 0.3), part_of(tick, 0.3, 1.0), 0
+    if s.output == "signed":
+        linear = replace(s, degree=1, selection="all", ne=0)
+        found = _simulated(process_terms(linear, parts, None), parts)
+    else:
+        found = _start_of_magnitude(s, parts, first)
+    found = replace(found, n_candidates=len(terms))
+
+    def value(x: Choice) -> float:
+        return x.value(s.criterion, parts, n, free=True)
+
+    now = value(found)
+    if not np.isfinite(now):
+        return found
+    keep(found)
+    while found.theta.size < most:
+        better = None
+        for term in _promising(found, terms, parts)[:_ADDED]:
+            if trials is not None:
+                trials("choice of terms by simulation", guessed(tried, _USUAL_TRIALS))
+            tried += 1
+            wider = found.with_numerators([(*found.function.numerators[0], term)], [np.append(found.theta, 0.0)])
+            trial = prune_by_simulation(_simulated(wider, parts), parts, value, anew=True)
+            if value(trial) < now:
+                better = trial
+                break
+        if better is None:
+            break
+        found, now = better, value(better)
+        keep(found)
+    return found
+
+
+def _simulated(found: Choice, parts: Parts) -> Choice:
+    return found.with_theta(found.search(parts, free=True, most=25).theta)
+
+
+def _promising(found: Choice, terms: tuple[Term, ...], parts: Parts) -> list[Term]:
+    """Candidates outside the model, the largest error reduction ratio beside its terms first."""
+    inside = found.function.numerators[0]
+    outside = [x for x in terms if x not in set(inside)]
+    wide = found.with_numerators([(*inside, *outside)], [np.append(found.theta, np.zeros(len(outside)))])
+    R, k = wide.problem(parts, free=True).triangle(wide.theta), len(inside)
+    if not outside or not np.all(np.isfinite(R)):
+        return []
+    Q = np.linalg.qr(R[:, :k])[0]
+    rest, left = R[:, -1] - Q @ (Q.T @ R[:, -1]), R[:, k:-1] - Q @ (Q.T @ R[:, k:-1])
+    squared = np.sum(left**2, axis=0)
+    live = squared > 1e-12 * np.sum(R[:, k:-1] ** 2, axis=0)
+    ratio = np.where(live, (left.T @ rest) ** 2 / np.where(live, squared, 1.0), -1.0)
+    return [outside[int(i)] for i in np.argsort(-ratio, kind="stable") if ratio[i] > 0]
+
+
+def _start_of_magnitude(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
+    """The best linear model of the magnitude, fitted to the free run."""
+    order, delays = min(s.ny, 3), range(max(s.nk, 1), s.nk + s.nu)
+    terms = tuple((f,) for f in lagged(1, 1, ny=order, nu=len(delays), nk=delays.start))
+    function = PolynomialFunction(numerators=(terms,), denominators=((),), m=1, folded=OUTPUTS.index(s.output))
+    best, least = None, np.inf
+    starts = _starts(order, delays, parts)
+    for k, start in enumerate(starts):
+        if tick is not None:
+            tick("sign of the output", k / len(starts))
+        trial = Choice(function=function, theta=start)
+        found = trial.search(parts, free=True, most=30)
+        if best is None or found.cost < least:
+            best, least = trial.with_theta(found.theta), found.cost
+    assert best is not None
+    return best
+
+
+def _starts(order: int, delays: range, parts: Parts) -> list[Array]:
+    """The best of the grid, coefficients in the order of the terms."""
+    scored: list[tuple[float, int, Array]] = []
+    y = np.concatenate([p[0][:, 0] for p in parts])
+    for A in pole_grid(order):
+        runs = [lfilter([1.0], A, p[1][:, 0]) for p in parts]
+        for d in delays:
+            x = np.abs(np.concatenate([np.concatenate([np.zeros(d), r[: r.size - d]]) for r in runs]))
+            size = float(x @ x)
+            if not (np.isfinite(size) and size > 0):
+                continue
+            gain = float(x @ y) / size
+            b = np.zeros(len(delays))
+            b[d - delays.start] = gain
+            scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), np.concatenate([-A[1:], b])))
+    scored.sort(key=lambda found: found[:2])
+    return [theta for _, _, theta in scored[:_REFINED]]
