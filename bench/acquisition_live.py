@@ -13,10 +13,10 @@ import numpy as np
 
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
+from ambid.acquire.recording import acquire
 from ambid.acquire.session import Course
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
-from ambid.job.acquisition import acquire
 from ambid.job.track_live import track_live
 from ambid.recursive.lines import TrackLine
 from ambid.rig import load_rig

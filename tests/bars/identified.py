@@ -7,9 +7,9 @@ from pathlib import Path
 from ambid.acquire.devices.benches import bench_of
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
+from ambid.acquire.recording import acquire
 from ambid.acquire.session import Course
 from ambid.job import identify
-from ambid.job.acquisition import acquire
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.rig import load_rig
 from tests.bars.host import DATA

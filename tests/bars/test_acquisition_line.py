@@ -7,9 +7,9 @@ import pytest
 
 from ambid.acquire.devices.emulated import EmulatedDevice
 from ambid.acquire.program import program
+from ambid.acquire.recording import acquire
 from ambid.acquire.scales import SHORTEST_PERIOD
 from ambid.acquire.session import Course
-from ambid.job.acquisition import acquire
 from ambid.record import read_record
 from tests.bars.rates import COUNTED, run, stream_of
 

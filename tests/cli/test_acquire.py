@@ -296,7 +296,7 @@ def test_a_full_disk_is_told_at_once_and_ends_with_2(acquire, monkeypatch):
                 self._writer._fail(DeviceError("the disk is full. Make room"))
             return super().append(block)
 
-    monkeypatch.setattr("ambid.job.acquisition.Recorder", Full)
+    monkeypatch.setattr("ambid.acquire.recording.Recorder", Full)
     done = acquire("--seconds", "30")
     assert done.code == 2
     told = [line for line in done.err.splitlines() if "the disk is full" in line]
@@ -332,15 +332,15 @@ def test_a_second_signal_says_where_what_came_is(acquire, monkeypatch, place):
 
 
 def test_a_signal_while_an_amplitude_is_looked_for_records_nothing(acquire, monkeypatch, place):
-    from ambid.job import look
+    from ambid.acquire.amplitude import Kept
 
-    take = look.Kept.take
+    take = Kept.take
 
     def interrupted(self, frame):
         os.kill(os.getpid(), signal.SIGINT)
-        monkeypatch.setattr(look.Kept, "take", take)
+        monkeypatch.setattr(Kept, "take", take)
 
-    monkeypatch.setattr(look.Kept, "take", interrupted)
+    monkeypatch.setattr(Kept, "take", interrupted)
     done = acquire("--seconds", "4", "--excitation", "prbs")
     assert done.code == 130
     assert done.err.splitlines()[-1] == "ambid: interrupted; nothing was recorded"
@@ -351,9 +351,9 @@ def test_a_signal_while_an_amplitude_is_looked_for_records_nothing(acquire, monk
 @pytest.fixture(scope="module")
 def estimate(tmp_path_factory):
     from ambid.acquire.program import program
+    from ambid.acquire.recording import acquire
     from ambid.acquire.session import Course
     from ambid.job import identify
-    from ambid.job.acquisition import acquire
 
     folder, rig = tmp_path_factory.mktemp("start"), prototype()
     wave = program("multisine", amplitude_v=1.4, band=(2.0, 66.0), rate_hz=2000.0, seconds=4.0)

@@ -124,13 +124,13 @@ def test_a_failed_fit_says_why_and_ends_with_three(at, ambid, monkeypatch) -> No
 
     from ambid import job
 
-    real = job.fit_nonlinear
+    real = job.fit
 
     def failing(*args, **options):
         fit = real(*args, **options)
         return replace(fit, model=None, covariance=None, status="failed", reason="it broke", checks={}, fit={})
 
-    monkeypatch.setattr(job, "fit_nonlinear", failing)
+    monkeypatch.setattr(job, "fit", failing)
     out = at / "fit.json"
     found = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--json", out, "--plot", at / "none.png")
     assert found.code == 3

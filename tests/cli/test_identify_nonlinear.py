@@ -173,15 +173,16 @@ def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
 
 
 def test_a_second_ctrl_c_writes_nothing_even_if_the_search_took_it_for_the_first(at, ambid, monkeypatch) -> None:
-    def takes_all(taken, *, tick):
+    def takes_all(*_, tick, **__):
         for _ in range(2):
             try:
                 os.kill(os.getpid(), signal.SIGINT)
                 tick("search")
             except KeyboardInterrupt:
                 pass  # as a search does, which then goes on with its best
+        return None, ()
 
-    monkeypatch.setattr("ambid.job.identification.identify_taken", takes_all)
+    monkeypatch.setattr("ambid.job.identification.identify_nonlinear_used", takes_all)
     found = ambid("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--json", at / "ball.json")
     assert found.code == 130, found.out + found.err
     assert found.err == "ambid: interrupted; nothing was written\n"

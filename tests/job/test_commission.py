@@ -18,8 +18,8 @@ from ambid.job.commissioning_steps import STEPS, Wishes, tracking
 from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
 from ambid.rig import load_rig
+from tests.acquire.test_look import WHOLE
 from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
-from tests.job.test_look import WHOLE
 
 SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
 TRUTH = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 0.0803}
@@ -405,8 +405,8 @@ def test_an_interruption_while_numbers_are_worked_out(tmp_path):
 
 def test_a_disk_that_failed_is_the_reason(finished):
     from ambid.acquire.quality import Quality
+    from ambid.acquire.recording import Acquired
     from ambid.errors import DeviceError
-    from ambid.job.acquisition import Acquired
 
     info = SimulatedDevice(prototype()).info
     done = Acquired(

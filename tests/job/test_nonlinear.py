@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError, EstimationError
-from ambid.job import fit_nonlinear
+from ambid.job import fit
 from ambid.job.results import read_estimate
 from ambid.nonlinear.fit_file import nonlinear_fit_text
 from ambid.record import read_record
@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
     stages: list[str] = []
-    fit = fit_nonlinear(
+    found = fit(
         [folder / "r0.csv", read_record(folder / "r1.csv")],
         **CHANNELS,
         structure_name="narmax",
@@ -41,14 +41,14 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
         validate_to_s=3.0,
         tick=lambda stage, done=None: stages.append(stage),
     )
-    assert fit.passed
-    assert [x["samples"] for x in fit.records] == [450, 450]
-    assert fit.model is not None
-    found = dict(zip(fit.model.names, fit.model.theta, strict=True))
-    assert found == pytest.approx({"y(t-1)": 0.6, "u(t-2)": 0.9, "u(t-1)^2": 0.3}, abs=0.02)
-    assert fit.validation is not None
-    assert set(fit.validation["y"]) == {"one_step", "simulation", "extrapolated"}  # type: ignore[call-overload]
-    assert set(fit.timing_s) == {"read", "fit", "checks"}
+    assert found.passed
+    assert [x["samples"] for x in found.records] == [450, 450]
+    assert found.model is not None
+    values = dict(zip(found.model.names, found.model.theta, strict=True))
+    assert values == pytest.approx({"y(t-1)": 0.6, "u(t-2)": 0.9, "u(t-1)^2": 0.3}, abs=0.02)
+    assert found.validation is not None
+    assert set(found.validation["y"]) == {"one_step", "simulation", "extrapolated"}  # type: ignore[call-overload]
+    assert set(found.timing_s) == {"read", "fit", "checks"}
     assert (stages[0], stages[-1]) == ("read", "check")
 
 
@@ -61,19 +61,17 @@ def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> No
             calls.append("stopped")
             raise KeyboardInterrupt
 
-    fit = fit_nonlinear([folder / "r0.csv"], **CHANNELS, structure_name="narx", open_loop=True, tick=tick)
-    assert fit.status == "stalled"
-    assert any("interrupted" in x for x in fit.warnings)
-    assert fit.fit["y"].one_step > 0.1
-    assert "residuals_white" in fit.checks
+    found = fit([folder / "r0.csv"], **CHANNELS, structure_name="narx", open_loop=True, tick=tick)
+    assert found.status == "stalled"
+    assert any("interrupted" in x for x in found.warnings)
+    assert found.fit["y"].one_step > 0.1
+    assert "residuals_white" in found.checks
 
 
 def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -> None:
     settings = {"ny": 1, "nu": 2, "neurons": 3, "starts": 2, "iterations": 8}
     fits = [
-        fit_nonlinear(
-            [folder / "r0.csv"], **CHANNELS, structure_name="narx", settings=settings, open_loop=True, seed=seed
-        )
+        fit([folder / "r0.csv"], **CHANNELS, structure_name="narx", settings=settings, open_loop=True, seed=seed)
         for seed in (4, 4, 5)
     ]
     thetas = [f.model.theta for f in fits if f.model is not None]
@@ -98,13 +96,13 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
 )
 def test_what_makes_no_sense_is_refused(folder, changes, said) -> None:
     with pytest.raises(AmbidError, match=said):
-        fit_nonlinear([folder / "r0.csv"], **{**CHANNELS, "structure_name": "narmax", **changes})
+        fit([folder / "r0.csv"], **{**CHANNELS, "structure_name": "narmax", **changes})
 
 
 def test_records_of_another_rate_are_refused(folder) -> None:
     for words in ({"records": [folder / "r0.csv", folder / "r3.csv"]},
                   {"records": [folder / "r0.csv"], "validate": folder / "r3.csv"}):  # fmt: skip
         with pytest.raises(EstimationError, match="50 Hz"):
-            fit_nonlinear(**words, **CHANNELS, structure_name="narmax")
+            fit(**words, **CHANNELS, structure_name="narmax")
     with pytest.raises(EstimationError, match="no record"):
-        fit_nonlinear([], **CHANNELS, structure_name="narmax")
+        fit([], **CHANNELS, structure_name="narmax")

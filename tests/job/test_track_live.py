@@ -7,10 +7,10 @@ from functools import cache
 import pytest
 
 from ambid.acquire.program import program
+from ambid.acquire.recording import acquire
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError, DeviceError
 from ambid.job import identify
-from ambid.job.acquisition import acquire
 from ambid.job.track_live import track_live
 from ambid.record import read_record
 from ambid.rig import rig_from_text
@@ -228,7 +228,7 @@ def test_a_line_that_is_lost_is_raised(start, tmp_path):
 
 
 def test_a_record_made_meanwhile_is_whole(start, tmp_path):
-    from ambid.job.acquisition import recording
+    from ambid.acquire.recording import recording
 
     with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
         track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from ambid.bearing.magnet.likelihood import search, uncertainty
-from ambid.job.bearing_estimate import judged
+from ambid.job.bearing_estimate import judge_bearing
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
@@ -45,7 +45,7 @@ def outcomes() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         sds = np.sqrt(np.diag(known.information))
         numbers.append([(values[n] - truth[n]) / sd for n, sd in zip(known.names, sds, strict=True)])
         taken = [TakenRecord(record=record, remembered={}, warnings=(), start_s=0.0)]
-        found = judged(fit, known, taken, delay_given=True).curves(x, i)
+        found = judge_bearing(fit, known, taken, delay_given=True).curves(x, i)
         curves.append(
             [(c.value - exact[:, j]) / c.sd for j, c in enumerate((found.force, found.k_x, found.k_i, found.L))]
         )

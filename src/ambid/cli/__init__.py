@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import NoReturn, TextIO
 
-from ambid.cli.interrupts import INTERRUPTED
+from ambid.cli.interrupts import INTERRUPTED, interrupts
 
 BROKEN_PIPE = 141
 
@@ -93,7 +93,6 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        # A second Ctrl-C while the first one is answered would end in a traceback after all.
         return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
     except BrokenPipeError:
         # The interpreter flushes standard output once more when it ends: give it somewhere to go.
@@ -104,8 +103,7 @@ def run(arguments: Sequence[str]) -> int:
         from ambid.cli.app import refusal
         from ambid.errors import AmbidError
 
-        # compiled code turns Ctrl-C into an error of its own
-        if any(isinstance(e, KeyboardInterrupt) for e in (error.__cause__, error.__context__)):
+        if interrupts(error):
             return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
         said = str(error) if isinstance(error, AmbidError) else refusal(error)
         if said is not None:

@@ -9,21 +9,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli.device_options import BandHz, BenchName, Pace, Port, RigOfDevice, Seed, opened
+from ambid.cli import options as opt
+from ambid.cli.devices import opened
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
-from ambid.cli.options import FAILED_CHECK, band_of, check_positive, option, switch
+from ambid.cli.options import option, switch
+from ambid.cli.output import end
 from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.acquire.device import Device
-    from ambid.job.acquisition import Progress
+    from ambid.acquire.recording import Progress
     from ambid.job.commissioning_steps import Step, StepName
 
 
 def command(
-    port: Port,
-    rig: RigOfDevice,
+    port: opt.Port,
+    rig: opt.RigOfDevice,
     folder: Annotated[Path, option("--output -o", "FOLDER", "Where records, estimate and report go.")],
     seconds: Annotated[float, option("--seconds", "S", "Length of the record in s.", True)] = 20.0,
     track_seconds: Annotated[
@@ -32,13 +34,13 @@ def command(
     amplitude: Annotated[
         float | None, option("--amplitude", "V", "Peak of the excitation in V.", "found by trials, small first")
     ] = None,
-    band: BandHz = None,
+    band: opt.BandHz = None,
     widest: Annotated[
         float, option("--widest", "X", "Largest half width of a 95 % interval that is good enough.", True)
     ] = 0.10,
-    bench: BenchName = None,
-    pace: Pace = "fastest",
-    seed: Seed = 0,
+    bench: opt.BenchName = None,
+    pace: opt.Pace = "fastest",
+    seed: opt.Seed = 0,
     yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
     """Commission a bench: self-test, rest, levitate, excite, record, identify, validate, report, then track.
@@ -52,7 +54,7 @@ def command(
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
-    check_positive(
+    opt.check_positive(
         {"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest}
     )
     wishes = Wishes(
@@ -60,7 +62,7 @@ def command(
         second_s=_second_s(seconds),
         track_s=track_seconds,
         amplitude_v=amplitude,
-        band_hz=band_of(band),
+        band_hz=opt.band_of(band),
         widest=widest,
         seed=seed,
     )
@@ -113,8 +115,7 @@ def command(
         raise typer.Exit(stop.code)
     name = last[-1].name
     typer.echo(next_text(passed, name, STEPS.index(name) + 1, len(STEPS), str(folder)))
-    if not passed:
-        raise typer.Exit(FAILED_CHECK)
+    end(failed=not passed)
 
 
 def _second_s(seconds: float) -> float:

@@ -4,54 +4,34 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
-
-from ambid.cli.options import (
-    FAILED_CHECK,
-    From,
-    Gaps,
-    Inputs,
-    JsonFile,
-    OpenLoop,
-    OutputColumns,
-    Rate,
-    RecordFile,
-    References,
-    SecondRecord,
-    Strict,
-    To,
-    argument,
-    json_path,
-    orders_of,
-    switch,
-)
-from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter, progress
+from ambid.cli import options as opt
+from ambid.cli.output import Outputs, end
+from ambid.cli.terminal import progress
 
 
 def command(
-    record: RecordFile,
+    record: opt.RecordFile,
     candidates: Annotated[
         list[str],
-        argument(
+        opt.argument(
             "STRUCTURE:ORDERS...",
             "What to compare: arx:na=2,nb=2,nk=1 or bj:auto; 'ambid models' lists the structures.",
         ),
     ],
-    output: OutputColumns = None,
-    inputs: Inputs = None,
-    reference: References = None,
-    open_loop: OpenLoop = False,
-    from_s: From = None,
-    to_s: To = None,
-    rate: Rate = None,
-    gaps: Gaps = None,
-    second: SecondRecord = None,
+    output: opt.OutputColumns = None,
+    inputs: opt.Inputs = None,
+    reference: opt.References = None,
+    open_loop: opt.OpenLoop = False,
+    from_s: opt.From = None,
+    to_s: opt.To = None,
+    rate: opt.Rate = None,
+    gaps: opt.Gaps = None,
+    second: opt.SecondRecord = None,
     holdout: Annotated[
-        float, switch("--holdout", "Part of the record held back to judge on, where there is no second.")
+        float, opt.switch("--holdout", "Part of the record held back to judge on, where there is no second.")
     ] = 0.3,
-    json: JsonFile = None,
-    strict: Strict = False,
+    json: opt.JsonFile = None,
+    strict: opt.Strict = False,
 ) -> None:
     """Fit several structures to a record and compare them on data that none of them has seen.
 
@@ -61,10 +41,9 @@ def command(
     from ambid.job import compare
     from ambid.report.tables import comparison_text
 
-    with Outputs(record, second) as outputs:
-        outputs.claim(json_path(json), "--json")
+    with Outputs(record, second, json=json) as outputs:
         named = (c.partition(":") for c in candidates)
-        wanted = [(name.strip(), orders_of(orders or "auto")) for name, _, orders in named]
+        wanted = [(name.strip(), opt.orders_of(orders or "auto")) for name, _, orders in named]
         with progress("compare") as tick:
             found = compare(
                 record, wanted, inputs=inputs or (), outputs=output or (), references=reference or (),
@@ -72,8 +51,6 @@ def command(
                 holdout=holdout, tick=tick,
             )  # fmt: skip
         document = {"schema": "ambid.comparison/1", "record": record.name, **plain_json(found.as_dict())}
-        written = json_text(document)
-        outputs.stage_json(json, written)
-    typer.echo(written if json == "-" else comparison_text(found, paint=painter()), nl=json != "-")
-    if strict and any(e.fit is None or not e.fit.passed for e in found.entries):
-        raise typer.Exit(FAILED_CHECK)
+        outputs.keep(json_text(document))
+    outputs.show(lambda paint: comparison_text(found, paint=paint))
+    end(failed=strict and any(e.fit is None or not e.fit.passed for e in found.entries))

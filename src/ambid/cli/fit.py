@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from math import inf
 from pathlib import Path
@@ -10,35 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ambid.cli import options as opt
 from ambid.cli.interrupts import Stop, interruptible, signals
-from ambid.cli.options import (
-    FAILED_CHECK,
-    FIGURE_ENDINGS,
-    From,
-    Gaps,
-    Inputs,
-    JsonFile,
-    OpenLoop,
-    OutputColumns,
-    Rate,
-    References,
-    RigFile,
-    SecondRecord,
-    Strict,
-    To,
-    argument,
-    fixed_of,
-    json_path,
-    option,
-    orders_of,
-    refuse_given,
-    refuse_twice,
-    settings_of,
-    switch,
-)
-from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter, progress
-from ambid.errors import EstimationError, nearest
+from ambid.cli.options import option, switch
+from ambid.cli.output import FIGURE_ENDINGS, Outputs, end
+from ambid.cli.terminal import progress
+from ambid.errors import EstimationError
 
 if TYPE_CHECKING:
     from ambid.blackbox.fit import BlackBoxFit
@@ -50,11 +27,13 @@ Part = tuple[float | None, float | None]
 def command(
     records: Annotated[
         list[Path],
-        argument("RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; nonlinear structures take several of one bench."),
+        opt.argument(
+            "RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; nonlinear structures take several of one bench."
+        ),
     ],
     structure: Annotated[str, option("--structure", "NAME", "Structure; 'ambid models' lists them.")],
-    inputs: Inputs = None,
-    output: OutputColumns = None,
+    inputs: opt.Inputs = None,
+    output: opt.OutputColumns = None,
     orders: Annotated[
         str,
         option(
@@ -77,9 +56,9 @@ def command(
         str, switch("--criterion", "What chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")
     ] = "bic",
     fix: Annotated[list[str] | None, option("--fix", "NAME=NUMBER", "A coefficient that is known; repeat.")] = None,
-    rig: RigFile = None,
-    reference: References = None,
-    open_loop: OpenLoop = False,
+    rig: opt.RigFile = None,
+    reference: opt.References = None,
+    open_loop: opt.OpenLoop = False,
     at_rest: Annotated[
         bool,
         switch(
@@ -87,18 +66,18 @@ def command(
             "Say that all was zero before the first sample: estimate no offsets and initial states (polynomial).",
         ),
     ] = False,
-    from_s: From = None,
-    to_s: To = None,
-    rate: Rate = None,
-    gaps: Gaps = None,
-    second: SecondRecord = None,
+    from_s: opt.From = None,
+    to_s: opt.To = None,
+    rate: opt.Rate = None,
+    gaps: opt.Gaps = None,
+    second: opt.SecondRecord = None,
     validate_from: Annotated[
         float | None, option("--validate-from", "S", "Use the second record from here on, in s.")
     ] = None,
     validate_to: Annotated[
         float | None, option("--validate-to", "S", "Use the second record up to here, in s.")
     ] = None,
-    json: JsonFile = None,
+    json: opt.JsonFile = None,
     plot: Annotated[
         Path | None,
         option(
@@ -119,7 +98,7 @@ def command(
     sensitivity: Annotated[
         bool, switch("--sensitivity", "Show how much each coefficient matters, and which belong together.")
     ] = False,
-    strict: Strict = False,
+    strict: opt.Strict = False,
 ) -> None:
     """Fit a black-box model to a record: polynomial, subspace, continuous-time or nonlinear structures.
 
@@ -127,102 +106,66 @@ def command(
     With --rig, inputs and outputs are the rig's, and a linear fit is carried on to its physical parameters.
     Ctrl-C during a nonlinear fit keeps the best model so far (exit code 130).
     """
-    from ambid.job import fit, fit_nonlinear, physics, read_data
+    from ambid.job import fit, physics, read_data
     from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.report.fit_text import fit_text
     from ambid.rig import load_rig
 
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)
-    linear_only = {
-        "--criterion": criterion != "bic",
-        "--fix": bool(fix),
-        "--reference": bool(reference),
-        "--at-rest": at_rest,
-        "--stabilisation": stabilisation is not None,
-        "--sensitivity": sensitivity,
-    }
+    said: dict[str, Any] = {"settings": None if settings is None else opt.settings_of(settings)}
     if nonlinear:
-        refuse_given(linear_only, f"{{}} is for linear structures; {structure} has no use for it. Leave it out")
+        opt.refuse_given(
+            {"--stabilisation": stabilisation is not None, "--sensitivity": sensitivity},
+            f"{{}} is for linear structures; {structure} has no use for it. Leave it out",
+        )
         if settings is not None and orders != "auto":
             raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
+        said["settings"] = opt.settings_of(orders if settings is None else settings)
     else:
-        _check_linear(records, structure, {"--settings": settings is not None, "--seed": seed is not None})
+        said["orders"] = opt.orders_of(orders)
     stop, extras = Stop(), list[tuple[str, Any, Callable[..., str]]]()
-    with Outputs(*records, second, rig) as outputs:
-        outputs.claim(json_path(json), "--json")
-        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+    with Outputs(*records, second, rig, json=json, plot=plot) as outputs:
         outputs.claim(stabilisation, "--stabilisation", FIGURE_ENDINGS)
-        refuse_twice(records)
+        opt.refuse_twice(records)
         if nonlinear:
             _check_second(records, part, second, second_part)
         bench = None if rig is None else load_rig(rig)
-        channels: dict[str, Any] = {"inputs": inputs or (), "outputs": output or (), "rate_hz": rate, "gaps": gaps}
-        channels["rig"] = bench
-        words = {
-            **channels, "structure_name": structure, "open_loop": open_loop, "from_s": from_s, "to_s": to_s,
-            "validate": second, "validate_from_s": validate_from, "validate_to_s": validate_to,
-        }  # fmt: skip
-        found: BlackBoxFit | NonlinearFit
+        columns: dict[str, Any] = {"inputs": inputs or (), "outputs": output or (), "rig": bench}
+        columns |= {"rate_hz": rate, "gaps": gaps}
         with signals(stop.take) if nonlinear else nullcontext(), progress("fit") as show:
-            if nonlinear:
-                wished = settings_of(orders if settings is None else settings)
-                tick = interruptible(show, stop)
-                found = fit_nonlinear(records, settings=wished, seed=seed or 0, tick=tick, **words)
-                stop.torn()
-            else:
-                found = linear = fit(
-                    records[0], orders=orders_of(orders), criterion=criterion, fixed=fixed_of(fix) or None,
-                    at_rest=at_rest, references=reference or (), tick=show, **words,
-                )  # fmt: skip
-                if bench is not None:
-                    from ambid.report.estimate_text import physics_text
+            found: Any = fit(
+                records, structure_name=structure, criterion=criterion, fixed=opt.fixed_of(fix) or None,
+                at_rest=at_rest, seed=seed, open_loop=open_loop, references=reference or (), from_s=from_s, to_s=to_s,
+                validate=second, validate_from_s=validate_from, validate_to_s=validate_to,
+                tick=interruptible(show, stop) if nonlinear else show, **columns, **said,
+            )  # fmt: skip
+            stop.torn()
+            if bench is not None and not nonlinear:
+                from ambid.report.estimate_text import physics_text
 
-                    extras.append(("physical", physics(linear, bench), physics_text))
-            if (plot is not None and found.status != "failed") or stabilisation is not None or sensitivity:
-                data = [read_data(x, part=part, **channels) for x in records]
-                other = None if second is None or not nonlinear else read_data(second, part=second_part, **channels)
+                extras.append(("physical", physics(found, bench), physics_text))
+            drawn = plot if found.status != "failed" else None
+            if drawn is not None or stabilisation is not None or sensitivity:
+                data = [read_data(x, part=part, **columns) for x in records]
+                other = None if second is None or not nonlinear else read_data(second, part=second_part, **columns)
                 if sensitivity:
                     from ambid.report.tables import sensitivity_text
                     from ambid.validate.sensitivity import sensitivity_analysis
 
-                    extras.append(("sensitivity", sensitivity_analysis(linear, data[0]), sensitivity_text))
-                show("draw")
-                _draw(found, data, other, outputs, plot, stabilisation, show)
-        written = _json_text(found, extras)
-        outputs.stage_json(json, written)
-    if json == "-":
-        typer.echo(written, nl=False)
-    else:
-        from ambid.report.fit_text import fit_text
-
-        texts = [fit_text(found, paint=painter()), *(text(x, paint=painter()) for _, x, text in extras)]
-        typer.echo("\n\n".join(texts))
+                    extras.append(("sensitivity", sensitivity_analysis(found, data[0]), sensitivity_text))
+                outputs.draw(drawn, lambda: _overview(found, data, other), show)
+                outputs.draw(stabilisation, lambda: _poles_by_order(found, data[0], show), show)
+        outputs.keep(_json_text(found, extras))
+    outputs.show(
+        lambda paint: "\n\n".join([fit_text(found, paint=paint), *(text(x, paint=paint) for _, x, text in extras)])
+    )
     if stop.wished():
         raise typer.Exit(stop.code)
     against = against_second(found)
     if json != "-" and against:
         typer.echo("\n".join(against))
     sound = found.passed and all(x.passed for name, x, _ in extras if name == "physical")
-    if found.status == "failed" or (strict and (against or not sound)):
-        raise typer.Exit(FAILED_CHECK)
-
-
-def _check_linear(records: Sequence[Path], structure: str, given: Mapping[str, bool]) -> None:
-    """Refuse what a linear structure has no use for, and a structure that is none."""
-    from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
-    from ambid.blackbox.structures import structure as linear
-    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
-
-    if structure in RESPONSE_STRUCTURES:
-        linear(structure)  # says where those are fitted
-    if structure not in STRUCTURES:
-        every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
-        raise EstimationError(
-            f"structure {structure!r} is not known; known: {', '.join(every)}.{nearest(structure, every)}"
-        )
-    if len(records) > 1:
-        several = ", ".join(NONLINEAR_STRUCTURES)
-        raise EstimationError(f"structure {structure} takes one record; {several} take several. Leave {records[1]} out")
-    refuse_given(given, f"{{}} is for nonlinear structures; {structure} has --orders. Leave it out")
+    end(failed=found.status == "failed" or (strict and (bool(against) or not sound)))
 
 
 def _check_second(records: Sequence[Path], part: Part, second: Path | None, second_part: Part) -> None:
@@ -230,8 +173,8 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
     if second is None or second.resolve() not in {x.resolve() for x in records}:
         return
     (a, b), (c, d) = part, second_part
-    begin, end = max(a or -inf, c or -inf), min(inf if b is None else b, inf if d is None else d)
-    if not begin >= end:
+    begin, last = max(a or -inf, c or -inf), min(inf if b is None else b, inf if d is None else d)
+    if not begin >= last:
         raise EstimationError(
             f"--validate {second} is fitted to as well: errors there say nothing about other records. Give another, or "
             "parts that do not overlap (--from, --to, --validate-from, --validate-to)"
@@ -242,38 +185,30 @@ def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
     """Say why a fit does not hold on the second record, a line for each reason; empty where it was not judged there."""
     from ambid.validate.second_record import objections
 
-    judged: Any = found.validation
-    return [] if judged is None else [f"it does not hold on the second record: {x}" for x in objections(found, judged)]
+    validation: Any = found.validation
+    against = () if validation is None else objections(found, validation)
+    return [f"it does not hold on the second record: {x}" for x in against]
 
 
-def _draw(
-    found: Any,
-    data: Sequence[Any],
-    second: Any,
-    outputs: Outputs,
-    plot: Path | None,
-    stabilisation: Path | None,
-    tick: Callable[[str], None],
-) -> None:
-    """Draw the figures that are asked for."""
+def _overview(found: Any, data: Sequence[Any], second: Any) -> Any:
+    """Draw a fit on its records, and a nonlinear one on the second record."""
     from ambid.blackbox.fit import BlackBoxFit
-    from ambid.report.drawing import save
-    from ambid.report.fit_figures import fit_overview, stabilisation_figure
 
-    if plot is not None and isinstance(found, BlackBoxFit):
-        page = fit_overview(found, data[0])
-        outputs.stage(plot, lambda path: save(page, path))
-    elif plot is not None:
-        from ambid.report.nonlinear_figures import nonlinear_overview
+    if isinstance(found, BlackBoxFit):
+        from ambid.report.fit_figures import fit_overview
 
-        pages = nonlinear_overview(found, data, second)
-        outputs.stage(plot, lambda path: save(pages, path))
-    if stabilisation is not None:
-        from ambid.validate.stabilisation import stabilisation as poles_by_order
+        return fit_overview(found, data[0])
+    from ambid.report.nonlinear_figures import nonlinear_overview
 
-        method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
-        diagram = stabilisation_figure(poles_by_order(data[0], method, tick=lambda: tick("stabilisation")))
-        outputs.stage(stabilisation, lambda path: save(diagram, path))
+    return nonlinear_overview(found, data, second)
+
+
+def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
+    from ambid.report.fit_figures import stabilisation_figure
+    from ambid.validate.stabilisation import stabilisation
+
+    method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
+    return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))
 
 
 def _json_text(found: Any, extras: Sequence[tuple[str, Any, object]]) -> str:

@@ -5,31 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
-from ambid.cli.options import (
-    FAILED_CHECK,
-    FIGURE_ENDINGS,
-    From,
-    Gaps,
-    Inputs,
-    JsonFile,
-    OpenLoop,
-    OutputColumns,
-    Rate,
-    RecordFile,
-    References,
-    RigFile,
-    Strict,
-    To,
-    band_of,
-    json_path,
-    option,
-    orders_of,
-    switch,
-)
-from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter, progress
+from ambid.cli import options as opt
+from ambid.cli.options import option, switch
+from ambid.cli.output import Outputs, end
+from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
@@ -37,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def command(
-    record: RecordFile,
-    inputs: Inputs = None,
-    output: OutputColumns = None,
-    reference: References = None,
-    open_loop: OpenLoop = False,
+    record: opt.RecordFile,
+    inputs: opt.Inputs = None,
+    output: opt.OutputColumns = None,
+    reference: opt.References = None,
+    open_loop: opt.OpenLoop = False,
     method: Annotated[
         Literal["auto", "periodic", "random", "local"],
         switch("--method", "How to measure: averages over periods, averaged spectra, local polynomials, or what fits."),
@@ -75,14 +54,14 @@ def command(
         str | None,
         option("--delay", "S|auto", "Delay of the inputs in s, for the models.", "0; with --rig as the rig says"),
     ] = None,
-    rig: RigFile = None,
-    from_s: From = None,
-    to_s: To = None,
-    rate: Rate = None,
-    gaps: Gaps = None,
-    json: JsonFile = None,
+    rig: opt.RigFile = None,
+    from_s: opt.From = None,
+    to_s: opt.To = None,
+    rate: opt.Rate = None,
+    gaps: opt.Gaps = None,
+    json: opt.JsonFile = None,
     plot: Annotated[Path | None, option("--plot", "FILE.png", "Draw response, levels and models.")] = None,
-    strict: Strict = False,
+    strict: opt.Strict = False,
 ) -> None:
     """Measure a frequency response with its noise and distortion, and fit models to it.
 
@@ -91,34 +70,25 @@ def command(
     """
     from ambid.bearing.measured import measured_text
     from ambid.job import frf
+    from ambid.report.fit_figures import frf_figure
     from ambid.report.fit_text import frf_text
 
-    with Outputs(record, rig) as outputs:
-        outputs.claim(json_path(json), "--json")
-        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
-        between, wanted, n, late = band_of(band), _orders(orders), _order(state_space), _delay(delay)
+    with Outputs(record, rig, json=json, plot=plot) as outputs:
+        between, wanted, n, late = opt.band_of(band), _orders(orders), _order(state_space), _delay(delay)
         with progress("measure") as tick:
             found = frf(
                 record, inputs=inputs or (), outputs=output or (), references=reference or (), open_loop=open_loop,
                 method=method, hold=hold, band=between, orders=wanted, state_space=n, feedthrough=feedthrough,
                 domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
             )  # fmt: skip
-            if plot is not None:
-                from ambid.report.drawing import save
-                from ambid.report.fit_figures import frf_figure
-
-                tick("draw")
-                page = frf_figure(found)
-                outputs.stage(plot, lambda path: save(page, path))
-        written = measured_text(found)
-        outputs.stage_json(json, written)
-    typer.echo(written if json == "-" else frf_text(found, paint=painter()), nl=json != "-")
-    if strict and not found.passed:
-        raise typer.Exit(FAILED_CHECK)
+            outputs.draw(plot, lambda: frf_figure(found), tick)
+        outputs.keep(measured_text(found))
+    outputs.show(lambda paint: frf_text(found, paint=paint))
+    end(failed=strict and not found.passed)
 
 
 def _orders(text: str | None) -> Orders | None:
-    found = None if text is None else orders_of(text)
+    found = None if text is None else opt.orders_of(text)
     if text is not None and found is None:
         raise AmbidError("--orders auto: a transfer function wants its degree. Give nf=2, or use --state-space auto")
     return found

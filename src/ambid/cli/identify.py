@@ -2,54 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
-from ambid.cli.options import (
-    FAILED_CHECK,
-    FIGURE_ENDINGS,
-    PAGE_ENDINGS,
-    From,
-    Gaps,
-    JsonFile,
-    Rate,
-    RigFile,
-    Strict,
-    To,
-    argument,
-    json_path,
-    option,
-    refuse_given,
-    refuse_twice,
-    switch,
-)
-from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter, progress
+from ambid.cli.options import option, switch
+from ambid.cli.output import Outputs, end
+from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
-from ambid.estimation.progress import Tick
-
-if TYPE_CHECKING:
-    from ambid.bearing.magnet.result import NonlinearBearingEstimate
-    from ambid.estimation.estimate import Estimate
-    from ambid.job.data import Reading
-    from ambid.report.figures import BearingEvidence, Evidence
 
 
 def command(
     records: Annotated[
         list[Path],
-        argument(
+        opt.argument(
             "RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; with --nonlinear several, best at several positions."
         ),
     ],
-    rig: RigFile = None,
+    rig: opt.RigFile = None,
     nonlinear: Annotated[
         bool, switch("--nonlinear", "The nonlinear magnet: k_i, k_x and L as curves over position and current.")
     ] = False,
@@ -80,11 +56,11 @@ def command(
         ),
     ] = None,
     second: Annotated[Path | None, option("--validate", "RECORD2", "Judge the estimate on this second record.")] = None,
-    from_s: From = None,
-    to_s: To = None,
-    rate: Rate = None,
-    gaps: Gaps = None,
-    json: JsonFile = None,
+    from_s: opt.From = None,
+    to_s: opt.To = None,
+    rate: opt.Rate = None,
+    gaps: opt.Gaps = None,
+    json: opt.JsonFile = None,
     plot: Annotated[
         Path | None,
         option(
@@ -94,7 +70,7 @@ def command(
         ),
     ] = None,
     report: Annotated[Path | None, option("--report", "FILE.html", "Write a report, all in one file.")] = None,
-    strict: Strict = False,
+    strict: opt.Strict = False,
 ) -> None:
     """Identify the physical parameters of a bench from a record of voltage, current and position.
 
@@ -102,44 +78,44 @@ def command(
     With --nonlinear, one model for all records, and curves with bands; what is known of the magnet stands in [magnet]
     of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
-    from ambid.job.data import Reading
+    from ambid.job import identification as job
+    from ambid.report.estimate_text import estimate_text
+    from ambid.report.figures import overview
 
-    stop, kept, how = Stop(), tuple(held or ()), Reading(from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
-    own = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
-    if not nonlinear:
-        _check_linear(records, {"held": kept, **own})
-    with Outputs(*records, *kept, rig, second) as outputs:
-        outputs.claim(json_path(json), "--json")
-        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
-        outputs.claim(report, "--report", PAGE_ENDINGS)
+    stop, kept = Stop(), tuple(held or ())
+    own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
+    how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
+    with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
+        if nonlinear:
+            if off_below is not None and not isfinite(off_below):
+                raise AmbidError(f"--off-below is {off_below}; it is a voltage in V. Give a number")
+            opt.refuse_twice([*records, *kept])
+        else:
+            _check_linear(records, {"held": kept, **own})
         with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
-            estimate, evidence = (
-                _nonlinear(records, kept, rig, second, how, own, interruptible(show, stop))
+            estimate, used = (
+                job.identify_nonlinear_used(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
-                else _linear(records[0], rig, second, how, show)
+                else job.identify_used(records[0], rig, tick=show, **how)
             )
             stop.torn()
             if plot or report:
-                show("draw")
-                draw(evidence(), outputs, plot=plot, report=report)
-        written = estimate.dumps()
-        outputs.stage_json(json, written)
-    if json == "-":
-        typer.echo(written, nl=False)
-    else:
-        from ambid.report.estimate_text import estimate_text
-
-        typer.echo(estimate_text(estimate, paint=painter()))
+                evidence = job.evidence_of(estimate, used)
+                outputs.draw(plot, lambda: overview(evidence), show)
+                if report:
+                    outputs.stage_text(report, job.report_of(evidence))
+        outputs.keep(estimate.dumps())
+    outputs.show(lambda paint: estimate_text(estimate, paint=paint))
     search = getattr(estimate, "global_search", None)
     if stop.wished() or (search is not None and search["interrupted"]):
         raise typer.Exit(stop.code or INTERRUPTED)
-    if strict and not (estimate.passed and (estimate.validation is None or estimate.validation["passed"])):
-        raise typer.Exit(FAILED_CHECK)
+    validated = estimate.validation is None or bool(estimate.validation["passed"])
+    end(failed=strict and not (estimate.passed and validated))
 
 
 def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
     """Refuse what only the nonlinear magnet has."""
-    refuse_given(
+    opt.refuse_given(
         {f"--{name.replace('_', '-')}": not (x is None or x is False or x == ()) for name, x in given.items()},
         "{} is for the nonlinear magnet. Give --nonlinear too, or leave {} out",
     )
@@ -148,48 +124,3 @@ def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
             f"{len(records)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
             "operating point to the next. Give --nonlinear for one model of all, or one record"
         )
-
-
-def _linear(
-    record: Path, rig: Path | None, second: Path | None, how: Reading, tick: Tick
-) -> tuple[Estimate, Callable[[], Evidence]]:
-    from ambid.job import identify, load
-    from ambid.job.identification import evidence_of
-    from ambid.rig import default_rig, load_rig
-
-    bench, part = default_rig() if rig is None else load_rig(rig), asdict(how)
-    estimate = identify(record, bench, validate=second, tick=tick, **part)
-    return estimate, lambda: evidence_of(estimate, load(record, bench, **part))
-
-
-def _nonlinear(
-    records: Sequence[Path],
-    held: Sequence[Path],
-    rig: Path | None,
-    second: Path | None,
-    how: Reading,
-    own: Mapping[str, Any],
-    tick: Tick,
-) -> tuple[NonlinearBearingEstimate, Callable[[], BearingEvidence]]:
-    from ambid.job.identification import identify_taken, read_records
-    from ambid.report.figures import bearing_evidence
-
-    off_below = own["off_below"]
-    if off_below is not None and not isfinite(off_below):
-        raise AmbidError(f"--off-below is {off_below}; it is a voltage in V. Give a number")
-    refuse_twice([*records, *held])
-    job = read_records(records, rig, held=held, validate=second, how=how, tick=tick, **own)
-    estimate = identify_taken(job, tick=tick)
-    return estimate, lambda: bearing_evidence(estimate, [(t.record, t.start_s) for t in job.taken])
-
-
-def draw(evidence: Evidence | BearingEvidence, outputs: Outputs, *, plot: Path | None, report: Path | None) -> None:
-    """Draw the figures of an estimate, and write its report."""
-    from ambid.job.identification import report_of
-    from ambid.report.drawing import save
-    from ambid.report.figures import overview
-
-    if plot is not None:
-        outputs.stage(plot, lambda path: save(overview(evidence), path))
-    if report is not None:
-        outputs.stage_text(report, report_of(evidence))

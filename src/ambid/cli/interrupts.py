@@ -41,6 +41,11 @@ def signals(take: Callable[[int], None]) -> Iterator[None]:
             signal.signal(number, old if old is not None else signal.SIG_DFL)
 
 
+def interrupts(error: BaseException) -> bool:
+    """Whether an error is an interruption, perhaps one that compiled code turned into an error of its own."""
+    return any(isinstance(e, KeyboardInterrupt) for e in (error, error.__cause__, error.__context__))
+
+
 class Stop:
     """Takes the first signal as a wish to end; the second one interrupts at once; more change nothing.
 

@@ -11,20 +11,24 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
-from ambid.cli.interrupts import signals
-from ambid.cli.terminal import progress
+import typer
+
+from ambid.cli.interrupts import INTERRUPTED, interrupts, signals
+from ambid.cli.output import end, json_path
+from ambid.cli.terminal import painter, progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_figures import TrackHistory
     from ambid.report.track_text import TrackView
-    from ambid.track.lines_file import Tally, TrackWriter
+    from ambid.track.lines_file import Tally
 
 T = TypeVar("T")
 Flag = Literal["track", "hold", "accept", "revert"]
@@ -50,17 +54,24 @@ class Stopped(KeyboardInterrupt):
 class Follower:
     """Follows one run.
 
-    `writer`: where lines are written; `keep`: keep columns for a figure; `live`: show the live view on standard error;
-    `real_time`: whether the record is replayed as it was taken.
+    `json`: as given: where lines are written; `keep`: keep columns for a figure; `quiet`: no live view; `real_time`:
+    whether the record is replayed as it was taken.
     """
 
-    def __init__(self, writer: TrackWriter | None, *, keep: bool, live: bool, real_time: bool) -> None:
+    def __init__(self, json: str | None, *, keep: bool, quiet: bool, real_time: bool) -> None:
         """Begin before the run."""
+        from ambid.track.lines_file import TrackWriter
+
+        self.path, self.table = json_path(json), json != "-"
         self.header: TrackHeader | None = None
         self.last: TrackLine | None = None
         self.history: TrackHistory | None = None
+        self.summary: TrackSummary | None = None
         self.code = 0
-        self._writer, self._keep, self._live, self._real_time = writer, keep, live, real_time
+        target = self.path or (None if self.table else sys.stdout)
+        self._writer = None if target is None else TrackWriter(target)
+        self._live = not quiet and sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
+        self._keep, self._real_time = keep, real_time
         self._tally: Tally | None = None
         self._notable: deque[Event] = deque(maxlen=_TOLD)
         self._latest: dict[str, Event] = {}
@@ -75,40 +86,68 @@ class Follower:
         self._say: Callable[[str], object] = str  # says nothing until there is a line of progress
         self._picture: _Picture | None = None
 
-    def run(self, job: Callable[[], Track]) -> TrackSummary | None:
-        """Let the job run to its end, or until it is stopped, and write the summary.
+    def run(self, job: Callable[[], Track]) -> None:
+        """Let the job, which has the callbacks of this object, run to its end or until it is stopped.
 
-        `job`: runs the tracker with the callbacks of this object. Returns `complete` is False where the run was
-        stopped; None where it was stopped before its first line.
+        The summary is written; it is not `complete` where the run was stopped, and None where that was before its first
+        line.
         """
         found: TrackSummary | None = None
         with self._before_header, signals(self._signalled):
             self._say = self._before_header.enter_context(progress("track"))
             try:
                 found = job().summary
-            except KeyboardInterrupt as stop:
-                if self.header is None:
-                    raise
-                self.code = stop.code if isinstance(stop, Stopped) else 130
-            except Exception as error:
-                if not any(isinstance(e, KeyboardInterrupt) for e in (error.__cause__, error.__context__)):
+            except BaseException as error:
+                if not interrupts(error):
                     self._abandon()
                     raise
                 if self.header is None:
                     raise
-                self.code = 130  # compiled code turns Ctrl-C into an error of its own
+                self.code = error.code if isinstance(error, Stopped) else INTERRUPTED
             finally:
-                self._end_picture()
-        return self._closed(found)
-
-    def _closed(self, found: TrackSummary | None) -> TrackSummary | None:
+                if self._picture is not None:
+                    self._picture.end()
+                    self._picture = None
         if found is None and self._tally is not None:
             taken = float("nan") if self._real_time else time.perf_counter() - self._begin_wall
             found = self._tally.summary(computing_s=taken, complete=False)
         if self._writer is not None and self._writer.begun and found is not None:
             self._writer.summary(found)
             self._writer.close()
-        return None if self.last is None else found
+        self.summary = None if self.last is None else found
+
+    def finish(
+        self, *, drawn: Path | None = None, strict: bool = False, flags: Sequence[tuple[float, Flag]] = ()
+    ) -> None:
+        """Print the table, say what was interrupted or not reached, and end with the exit code.
+
+        `drawn`: the figure of the track; `strict`: whether troubles end with exit code 3; `flags`: as given.
+        """
+        from ambid.report.track_text import track_text, troubles_of
+
+        header, last, summary = self.header, self.last, self.summary
+        if summary is None or header is None or last is None or self._tally is None:
+            if self.code:
+                print("ambid: interrupted before the first line of the track", file=sys.stderr)
+                raise typer.Exit(self.code)
+            raise AmbidError(
+                "the record ends before the first reporting interval. Take a longer one, or a shorter --every"
+            )
+        troubles = troubles_of(header, last, self._tally.open_changes)
+        if not summary.samples:
+            troubles = (*troubles, "no sample of the record was used: these are the values of the start")
+        if self.table:
+            typer.echo(track_text(header, last, summary, events=self.events, troubles=troubles, paint=painter()))
+        if self.code:
+            names = [str(x) for x in (self.path, drawn) if x]
+            holds = f"; {' and '.join(names)} hold{'s' if len(names) == 1 else ''} the track so far" if names else ""
+            print(f"ambid: interrupted at {last.t:.4g} s of record{holds}", file=sys.stderr)
+            raise typer.Exit(self.code)
+        for t, flag in flags:
+            if t > last.t:
+                said = f"the last line is at {last.t:.6g} s, so it was never set. Give a time in the record"
+                print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
+        end(failed=strict and bool(troubles))
 
     def _abandon(self) -> None:
         """After an error: leave a file that says that it is not complete, if it can still be written."""
@@ -118,18 +157,8 @@ class Follower:
             with suppress(OSError, ValueError):
                 self._writer.close()
 
-    def _end_picture(self) -> None:
-        if self._picture is not None:
-            self._picture.end()
-            self._picture = None
-
     @property
-    def open_changes(self) -> tuple[Event, ...]:
-        """Changes that were not answered by accepted values."""
-        return () if self._tally is None else self._tally.open_changes
-
-    @property
-    def told(self) -> tuple[Event, ...]:
+    def events(self) -> tuple[Event, ...]:
         """Events in their order: changes with what was decided on each, and of routine decisions the last."""
         notable = _copied(self._notable)
         routine = [e for e in self._latest.copy().values() if e not in notable]
@@ -146,10 +175,7 @@ class Follower:
             self._latest[event.kind] = event
 
     def tick(self, stage: str, done: float | None = None) -> None:
-        """Take a sign of life from the job.
-
-        `done`: not shown.
-        """
+        """Take a sign of life from the job."""
         del done
         if self._stop is not None:
             raise Stopped(self._stop)
@@ -226,21 +252,12 @@ class Follower:
         samples = header.record.get("samples")
         behind = wall - (line.t - self._begin_s) if self._real_time else None
         return TrackView(
-            header=header,
-            line=line,
-            errors=_copied(self._errors),
-            decisions=self.told,
-            ranges=dict(self._ranges),
+            header=header, line=line, errors=_copied(self._errors), decisions=self.events, ranges=dict(self._ranges),
             begin_s=self._begin_s,
             length_s=samples / header.rate_hz if isinstance(samples, (int, float)) else None,
-            wall_s=wall,
-            behind_s=behind,
-            rejected=tally.rejected_samples,
-            updates=tally.updates,
-            open_changes=len(tally.open_changes),
-            keys=keys,
-            pressed=self._pressed,
-        )
+            wall_s=wall, behind_s=behind, rejected=tally.rejected_samples, updates=tally.updates,
+            open_changes=len(tally.open_changes), keys=keys, pressed=self._pressed,
+        )  # fmt: skip
 
     def _widen(self, line: TrackLine) -> None:
         """Keep the ends of the bars where they are, and move them out where an interval passes them."""
@@ -249,11 +266,8 @@ class Follower:
             low, high = v.value - reach, v.value + reach
             if not (low < high < float("inf")):
                 continue
-            if name not in self._ranges:
-                self._ranges[name] = (low - reach, high + reach)
-            else:
-                before = self._ranges[name]
-                self._ranges[name] = (min(before[0], low), max(before[1], high))
+            before = self._ranges.get(name, (low - reach, high + reach))
+            self._ranges[name] = (min(before[0], low), max(before[1], high))
 
 
 def _copied(things: deque[T]) -> tuple[T, ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
     from ambid.nonlinear.fit import Settings
     from ambid.physics.presets import Preset
 
-FIGURE_ENDINGS = (".png", ".svg", ".pdf")
-PAGE_ENDINGS = (".html", ".htm")
-FAILED_CHECK = 3
 LARGEST = 1e9
 """What a time in s or an amplitude may be at most: beyond it is a slip, and numbers of samples would overflow."""
 
@@ -63,7 +61,35 @@ References = Annotated[
     option("--reference", "COL", "Column of the loop's outer excitation, for methods that use it; repeat for several."),
 ]
 OpenLoop = Annotated[bool, switch("--open-loop", "Say that no feedback was at work in this record.")]
+Force = Annotated[bool, switch("--force", "Write over a record that exists.")]
 SecondRecord = Annotated[Path | None, option("--validate", "RECORD2", "Judge on this record too, all of it.")]
+
+
+Port = Annotated[str, option("--port", "PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
+RigOfDevice = Annotated[Path, option("--rig", "RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
+BandHz = Annotated[
+    str | None,
+    option(
+        "--band",
+        "LO:HI",
+        "Band of the excitation in Hz.",
+        "of a multisine to levitate, where the rotor moves; else what the controller can play",
+    ),
+]
+BenchName = Annotated[
+    str | None,
+    option(
+        "--bench",
+        "PRESET|RIG",
+        "Plant behind an emulated or simulated controller.",
+        "daq.bench of the rig, or its own values",
+    ),
+]
+Pace = Annotated[
+    Literal["fastest", "real-time"],
+    switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
+]
+Seed = Annotated[int, option("--seed", "N", "Seed of excitation and simulated noise.", True, min=0)]
 
 
 def check_positive(given: Mapping[str, float | None]) -> None:
@@ -71,11 +97,6 @@ def check_positive(given: Mapping[str, float | None]) -> None:
     for name, x in given.items():
         if x is not None and not 0 < x <= LARGEST:
             raise AmbidError(f"{name} is {x:g}; it must be a positive number, up to {LARGEST:g}. Correct it")
-
-
-def json_path(json: str | None) -> Path | None:
-    """Return the file that ``--json`` names; None where there is none, or standard output is meant."""
-    return None if json in (None, "-") else Path(str(json))
 
 
 def band_of(text: str | None) -> tuple[float, float] | None:
@@ -119,68 +140,63 @@ def refuse_given(given: Mapping[str, bool], refusal: str) -> None:
             raise AmbidError(refusal.replace("{}", name))
 
 
+def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str, str]:
+    """Read NAME=VALUE, each name once; ``{}`` in `said` stands for a part that is not of that form."""
+    found: dict[str, str] = {}
+    for part in parts:
+        name, _, value = (x.strip() for x in part.partition("="))
+        if not (name and value):
+            raise EstimationError(f"{said.format(repr(part.strip()))}. {remedy}")
+        if name in found:
+            raise EstimationError(f"{where}: {name} stands twice. Leave one out")
+        found[name] = value
+    return found
+
+
+def _read_first(text: str, *kinds: Callable[[str], Any]) -> Any:
+    """Read a text as the first kind that takes it; as it is where none does."""
+    for kind in kinds:
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def _whole_numbers(text: str) -> tuple[int, ...]:
+    parts = [x.strip() for x in text.split("/")]
+    if len(parts) < 2 or not all(x.isdecimal() for x in parts):
+        raise ValueError(text)
+    return tuple(map(int, parts))
+
+
 def orders_of(text: str) -> Orders | None:
     """Read orders as they are written on the command line; None where all are to be chosen."""
     if text.strip() == "auto":
         return None
+    where, remedy = f"--orders {text!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
+    given = _pairs(text.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
     found: dict[str, int | str | tuple[int, ...]] = {}
-    for part in text.split(","):
-        name, sign, value = (x.strip() for x in part.partition("="))
-        numbers = value.split("/")
-        if value == "auto" and sign and name and name not in found:
-            found[name] = "auto"
-            continue
-        if not sign or not name or not all(n.strip().isdecimal() and len(n) < 7 for n in numbers):
-            raise EstimationError(
-                f"--orders {text!r}: {part.strip()!r} is not NAME=NUMBER. Write na=2,nb=2,nk=1 (nb=2/3 for two "
-                "inputs), or auto"
-            )
-        if name in found:
-            raise EstimationError(f"--orders {text!r}: {name} stands twice. Leave one out")
-        found[name] = int(value) if len(numbers) == 1 else tuple(int(n) for n in numbers)
+    for name, value in given.items():
+        if value != "auto" and not all(n.strip().isdecimal() and len(n) < 7 for n in value.split("/")):
+            raise EstimationError(f"{where}: {f'{name}={value}'!r} is not NAME=NUMBER. {remedy}")
+        found[name] = _read_first(value, int, _whole_numbers)
     return found
 
 
 def settings_of(text: str) -> Settings:
     """Read settings as they are written on the command line; what is ``auto`` is left to the method."""
-    found: dict[str, int | float | str | tuple[int, ...]] = {}
     if text.strip() in ("auto", ""):
-        return found
-    named = set[str]()
-    for part in text.split(","):
-        name, sign, value = (x.strip() for x in part.partition("="))
-        if not (name and sign and value):
-            raise EstimationError(f"--settings {text!r}: {part.strip()!r} is not NAME=VALUE. Write ny=2,nu=2,degree=3")
-        if name in named:
-            raise EstimationError(f"--settings {text!r}: {name} stands twice. Leave one out")
-        named.add(name)
-        if value != "auto":
-            found[name] = _value(value)
-    return found
-
-
-def _value(text: str) -> int | float | str | tuple[int, ...]:
-    parts = text.split("/")
-    if len(parts) > 1 and all(x.strip().isdecimal() for x in parts):
-        return tuple(int(x) for x in parts)
-    for read in (int, float):
-        try:
-            return read(text)
-        except ValueError:
-            continue
-    return text
+        return {}
+    where = f"--settings {text!r}"
+    given = _pairs(text.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
+    return {name: _read_first(x, _whole_numbers, int, float) for name, x in given.items() if x != "auto"}
 
 
 def fixed_of(parts: list[str] | None) -> dict[str, float]:
     """Read known coefficients, ``a1=-1.5``."""
-    found: dict[str, float] = {}
-    for part in parts or []:
-        name, _, value = (x.strip() for x in part.partition("="))
-        try:
-            number = float(value)
-        except ValueError:
-            raise EstimationError(f"--fix {part!r} is not NAME=NUMBER. Write, for example, --fix a1=-1") from None
-        if name in found:
-            raise EstimationError(f"--fix: {name} stands twice. Leave one out")
-        found[name] = number
+    said, remedy = "--fix {} is not NAME=NUMBER", "Write, for example, --fix a1=-1"
+    given = _pairs(parts or [], "--fix", said, remedy)
+    found = {name: _read_first(value, float) for name, value in given.items()}
+    for name, number in found.items():
+        if isinstance(number, str):
+            raise EstimationError(f"{said.format(repr(f'{name}={number}'))}. {remedy}")
     return found

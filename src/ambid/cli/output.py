@@ -1,4 +1,4 @@
-"""Files that a verb writes: checked before the work begins, and put in place all together when it is done."""
+"""What a verb gives: files, checked before the work begins and put in place together; text or JSON; an exit code."""
 
 from __future__ import annotations
 
@@ -6,10 +6,31 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
+import typer
+
+from ambid.cli.terminal import painter
 from ambid.errors import AmbidError
 
+if TYPE_CHECKING:
+    from ambid.report.text import Paint
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+PAGE_ENDINGS = (".html", ".htm")
+FAILED_CHECK = 3
 _STREAMED = ("--json",)  # options that take - for standard output
+
+
+def json_path(json: str | None) -> Path | None:
+    """Return the file that ``--json`` names; None where there is none, or standard output is meant."""
+    return None if json in (None, "-") else Path(str(json))
+
+
+def end(*, failed: bool) -> None:
+    """End the verb with exit code 3 where a check failed and that is to be told."""
+    if failed:
+        raise typer.Exit(FAILED_CHECK)
 
 
 class Outputs:
@@ -18,14 +39,20 @@ class Outputs:
     Each is written beside its place under another name; only when everything is there are all of them moved. After an
     error or Ctrl-C nothing is left behind.
 
-    `inputs`: files that are read; none of them may be written over.
+    `inputs`: files that are read; none of them may be written over; `json`, `plot`, `report`: as given.
     """
 
-    def __init__(self, *inputs: Path | None) -> None:
-        """Take note of the `inputs`, which may not be written over."""
+    def __init__(
+        self, *inputs: Path | None, json: str | None = None, plot: Path | None = None, report: Path | None = None
+    ) -> None:
+        """Check that what is asked for can be written."""
         self._inputs = [path for path in inputs if path is not None]
         self._claimed: list[Path] = []
         self._staged: dict[Path, Path] = {}
+        self._json, self._document = json, ""
+        self.claim(json_path(json), "--json")
+        self.claim(plot, "--plot", FIGURE_ENDINGS)
+        self.claim(report, "--report", PAGE_ENDINGS)
 
     def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = ()) -> None:
         """Check that a file can be written, before any work is done.
@@ -83,10 +110,28 @@ class Outputs:
         """
         self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
-    def stage_json(self, json: str | None, text: str) -> None:
-        """Write the file that ``--json`` names, if it names one."""
-        if json not in (None, "-"):
-            self.stage_text(Path(str(json)), text)
+    def draw(self, path: Path | None, figure: Callable[[], Any], tick: Callable[[str], object]) -> None:
+        """Draw a figure, or several, where a file is named for it."""
+        if path is not None:
+            from ambid.report.drawing import save
+
+            tick("draw")
+            pages = figure()
+            self.stage(path, lambda beside: save(pages, beside))
+
+    def keep(self, document: str) -> None:
+        """Take the result's JSON: for the file that ``--json`` names, or for `show`."""
+        self._document = document
+        path = json_path(self._json)
+        if path is not None:
+            self.stage_text(path, document)
+
+    def show(self, text: Callable[[Paint], str]) -> None:
+        """Print the result, once the files are in place: its JSON after ``--json -``, else its text."""
+        if self._json == "-":
+            typer.echo(self._document, nl=False)
+        else:
+            typer.echo(text(painter()))
 
     def __enter__(self) -> Outputs:
         return self

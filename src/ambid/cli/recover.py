@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli.options import FAILED_CHECK, argument, option, switch
-from ambid.cli.output import Outputs
+from ambid.cli.options import Force, argument, option, switch
+from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
@@ -24,7 +24,7 @@ def command(
     delete: Annotated[
         bool, switch("--delete", "Remove the journal once its record is written and nothing was damaged.")
     ] = False,
-    force: Annotated[bool, switch("--force", "Write over a record that exists.")] = False,
+    force: Force = False,
     strict: Annotated[bool, switch("--strict", "End with exit code 3 if something was damaged.")] = False,
 ) -> None:
     """Make the record of a recording that was killed or whose power was cut, from the journal that it left.
@@ -48,8 +48,7 @@ def command(
         typer.echo(f"ambid: {other}", err=True)
     if refused:
         raise refused[0]
-    if strict and not sound:
-        raise typer.Exit(FAILED_CHECK)
+    end(failed=strict and not sound)
 
 
 def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -> bool:

@@ -4,38 +4,21 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED
-from ambid.cli.options import (
-    FAILED_CHECK,
-    FIGURE_ENDINGS,
-    From,
-    Inputs,
-    OpenLoop,
-    OutputColumns,
-    Rate,
-    RecordFile,
-    References,
-    RigFile,
-    To,
-    TrackFile,
-    json_path,
-    option,
-    orders_of,
-    switch,
-)
+from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs
-from ambid.cli.terminal import painter
 from ambid.errors import AmbidError, nearest
 
 if TYPE_CHECKING:
     from ambid.cli.live import Flag, Follower
-    from ambid.recursive.lines import TrackHeader, TrackSummary
+    from ambid.recursive.lines import TrackHeader
 
 _NAMES = {
     "every_s": "--every", "limit": "--limit", "memory": "--memory", "start": "--start", "start_s": "--start-seconds"
@@ -43,8 +26,8 @@ _NAMES = {
 
 
 def command(
-    record: RecordFile,
-    rig: RigFile = None,
+    record: opt.RecordFile,
+    rig: opt.RigFile = None,
     method: Annotated[
         str,
         option(
@@ -55,11 +38,11 @@ def command(
             True,
         ),
     ] = "rpem",
-    inputs: Inputs = None,
-    output: OutputColumns = None,
+    inputs: opt.Inputs = None,
+    output: opt.OutputColumns = None,
     orders: Annotated[str | None, option("--orders", "na=2,nb=2,nk=1", "Orders of coefficients.")] = None,
-    reference: References = None,
-    open_loop: OpenLoop = False,
+    reference: opt.References = None,
+    open_loop: opt.OpenLoop = False,
     step: Annotated[float | None, option("--step", "X", "Step of lms and nlms, for signals of size one.")] = None,
     start: Annotated[
         Path | None,
@@ -90,10 +73,10 @@ def command(
         list[str] | None,
         option("--flag", "T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeat."),
     ] = None,
-    from_s: From = None,
-    to_s: To = None,
-    rate: Rate = None,
-    json: TrackFile = None,
+    from_s: opt.From = None,
+    to_s: opt.To = None,
+    rate: opt.Rate = None,
+    json: opt.TrackFile = None,
     plot: Annotated[
         Path | None,
         option("--plot", "FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
@@ -109,70 +92,54 @@ def command(
     On a terminal a live view shows parameters, error, state and decisions; h, t, a and r set flags, q ends.
     """
     from ambid.cli.live import Follower
-    from ambid.job.tracking import check_settings, track
+    from ambid.job.following import check_settings
+    from ambid.job.tracking import track
     from ambid.rig import load_rig
-    from ambid.track.lines_file import TrackWriter
 
-    remembered, flags = memory_of(memory), flags_of(flag)
-    check_settings(
-        record, start=start, start_s=start_seconds, every_s=every, limit=limit, memory=remembered, pace=pace,
-        flags=flags, rate_hz=rate, names=_NAMES,
-    )  # fmt: skip
+    times = _flags(flag)
+    how: dict[str, Any] = {
+        "start": start, "start_s": start_seconds, "every_s": every, "limit": limit, "memory": _memory(memory),
+        "pace": pace, "flags": times, "rate_hz": rate,
+    }  # fmt: skip
+    check_settings(record, how, _NAMES)
     settings: dict[str, Any] = {
-        "inputs": tuple(inputs or ()),
-        "outputs": tuple(output or ()),
-        "references": tuple(reference or ()),
-        "orders": None if orders is None else orders_of(orders),
-        "open_loop": open_loop,
-        "step": step,
-    }
+        "inputs": tuple(inputs or ()), "outputs": tuple(output or ()), "references": tuple(reference or ()),
+        "orders": None if orders is None else opt.orders_of(orders), "open_loop": open_loop, "step": step,
+    }  # fmt: skip
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:
         raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or leave it out")
-    with Outputs(record, rig, start) as outputs:
-        path = json_path(json)
-        outputs.claim(path, "--json")
-        outputs.claim(plot, "--plot", FIGURE_ENDINGS)
+    with Outputs(record, rig, start, json=json, plot=plot) as outputs:
         bench = None if rig is None else load_rig(rig)
-        writer = TrackWriter(path) if path else TrackWriter(sys.stdout) if json == "-" else None
-        same = json == "-" and sys.stdout.isatty()
-        live = not quiet and sys.stderr.isatty() and not same
+        follower = Follower(json, keep=plot is not None, quiet=quiet, real_time=pace == "real-time")
 
         def begin(header: TrackHeader) -> None:
             _check_interval(every, header.rate_hz)
             follower.on_header(header)
 
-        follower = Follower(writer, keep=plot is not None, live=live, real_time=pace == "real-time")
-        summary = follower.run(
+        follower.run(
             lambda: track(
                 record,
                 bench,
                 method=method,
-                start=start,
-                start_s=start_seconds,
-                every_s=every,
-                limit=limit,
-                memory=remembered,
-                pace=pace,
-                flags=flags,
                 from_s=from_s,
                 to_s=to_s,
-                rate_hz=rate,
                 on_header=begin,
                 on_line=follower.on_line,
                 keep=False,
                 tick=follower.tick,
+                **how,
                 **given,
             )
         )
-        if plot is not None and summary is not None:
+        if follower.summary is not None:
             try:
-                _draw(follower, record, rate, plot, outputs)
+                outputs.draw(plot, lambda: _figure(follower, record, rate), str)
             except KeyboardInterrupt:
-                kept = f"; {path} holds the track" if path else ""
+                kept = f"; {follower.path} holds the track" if follower.path else ""
                 print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                 raise typer.Exit(INTERRUPTED) from None
-    finish(follower, summary, [str(p) for p in (path, plot) if p], table=json != "-", strict=strict, flags=flags)
+    follower.finish(drawn=plot, strict=strict, flags=times)
 
 
 def _check_interval(every: float, rate_hz: float) -> None:
@@ -184,7 +151,7 @@ def _check_interval(every: float, rate_hz: float) -> None:
         )
 
 
-def memory_of(text: str) -> Any:
+def _memory(text: str) -> Any:
     """Read ``--memory``: a time in s, or a word, which is judged later."""
     try:
         return float(text)
@@ -192,12 +159,9 @@ def memory_of(text: str) -> Any:
         return text
 
 
-def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
-    """Read ``--flag``.
-
-    `texts`: each a time in s, a colon and a flag. Returns in the order of their times.
-    """
-    from ambid.job.tracking import FLAGS
+def _flags(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
+    """Read ``--flag``, each a time in s, a colon and a flag, in the order of their times."""
+    from ambid.job.following import FLAGS
 
     found: list[tuple[float, Flag]] = []
     for text in texts or []:
@@ -217,16 +181,14 @@ def flags_of(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
     return tuple(sorted(found, key=lambda f: f[0]))
 
 
-def _draw(follower: Follower, record: Path, rate: float | None, plot: Path, outputs: Outputs) -> None:
-    from ambid.report.drawing import save
+def _figure(follower: Follower, record: Path, rate: float | None) -> Any:
     from ambid.report.track_figures import track_figure
 
     assert follower.header is not None
     assert follower.history is not None
     units = follower.header.units
     truth = truth_columns(record, rate, {name: units.get(name, "") for name in follower.history.names})
-    page = track_figure(follower.history, truth=truth)
-    outputs.stage(plot, lambda path: save(page, path))
+    return track_figure(follower.history, truth=truth)
 
 
 def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
@@ -269,43 +231,3 @@ def _may_hold_truth(record: Path) -> bool:
             return b"true_" in file.read(65536)
     except (OSError, EOFError):
         return False
-
-
-def finish(
-    follower: Follower,
-    summary: TrackSummary | None,
-    written: list[str],
-    *,
-    table: bool,
-    strict: bool,
-    flags: Sequence[tuple[float, Flag]],
-) -> None:
-    """Print the table, say what was interrupted or not reached, and end with the exit code.
-
-    `follower`: that followed the run; `summary`: none where the run ended before its first line; `written`: files that
-    hold the track; `table`, `strict`: whether to print the table; whether troubles end with exit code 3; `flags`: as
-    given.
-    """
-    header, last = follower.header, follower.last
-    if summary is None or header is None or last is None:
-        if follower.code:
-            print("ambid: interrupted before the first line of the track", file=sys.stderr)
-            raise typer.Exit(follower.code)
-        raise AmbidError("the record ends before the first reporting interval. Take a longer one, or a shorter --every")
-    from ambid.report.track_text import track_text, troubles_of
-
-    troubles = troubles_of(header, last, follower.open_changes)
-    if not summary.samples:
-        troubles = (*troubles, "no sample of the record was used: these are the values of the start")
-    if table:
-        typer.echo(track_text(header, last, summary, events=follower.told, troubles=troubles, paint=painter()))
-    if follower.code:
-        kept = f"; {' and '.join(written)} hold{'s' if len(written) == 1 else ''} the track so far" if written else ""
-        print(f"ambid: interrupted at {last.t:.4g} s of record{kept}", file=sys.stderr)
-        raise typer.Exit(follower.code)
-    for t, flag in flags:
-        if t > last.t:
-            said = f"the last line is at {last.t:.6g} s, so it was never set. Give a time in the record"
-            print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
-    if strict and troubles:
-        raise typer.Exit(FAILED_CHECK)

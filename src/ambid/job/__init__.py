@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.job.acquisition import acquire as acquire
     from ambid.job.commissioning import commission as commission
     from ambid.job.data import load as load
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of
     from ambid.job.fits import compare as compare
     from ambid.job.fits import fit as fit
-    from ambid.job.fits import fit_nonlinear as fit_nonlinear
     from ambid.job.fits import physics as physics
     from ambid.job.identification import identify as identify
     from ambid.job.identification import identify_nonlinear as identify_nonlinear
-    from ambid.job.identification import judged as judged
     from ambid.job.response import frf as frf
     from ambid.job.results import read_estimate as read_estimate
     from ambid.job.tracking import track as track

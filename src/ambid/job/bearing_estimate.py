@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from ambid.arrays import Array
+from ambid.bearing.magnet.contact import weight_carried
+from ambid.bearing.magnet.likelihood import BearingFit, BearingUncertainty
+from ambid.bearing.magnet.problem import LEVELS, UNITS
+from ambid.bearing.magnet.rescue import RescuedFit
+from ambid.bearing.magnet.result import NonlinearBearingEstimate
+from ambid.bearing.rescue import describe_search
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from ambid.bearing.magnet.likelihood import BearingFit, BearingUncertainty
-    from ambid.bearing.magnet.result import NonlinearBearingEstimate
-    from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
-    from ambid.validate.nonlinear_bearing import WhitenessTest
+from ambid.validate.nonlinear_bearing import WhitenessTest, whiteness
 
 _P_LEAST = 1e-3  # as for the linear model
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
 _ROLES = ("position", "current")
 
 
-def judged(
+def judge_bearing(
     fit: BearingFit, known: BearingUncertainty, taken: Sequence[TakenRecord], *, delay_given: bool
 ) -> NonlinearBearingEstimate:
     """Check a fit on its own records and put the estimate together.
@@ -29,12 +34,6 @@ def judged(
     `fit`: not failed; `known`: of that fit; `taken`: the records that it came from; `delay_given`: whether the rig
     gives the delay. Returns without validation, timings and rig.
     """
-    import numpy as np
-
-    from ambid.bearing.magnet.problem import LEVELS
-    from ambid.bearing.magnet.result import NonlinearBearingEstimate
-    from ambid.validate.nonlinear_bearing import whiteness
-
     problem, names = fit.problem, _names(fit)
     tests = [whiteness(fit, r) for r in range(len(problem.records))]
     residuals = _residuals(tests, names)
@@ -75,8 +74,6 @@ def judged(
 
 def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
     """One-step errors against their own past and against past voltages: a check passes where every record does."""
-    from ambid.estimation.parts import Check
-
     against = {
         "residuals_white": ("their past", [t.p_own for t in tests]),
         "residuals_uncorrelated": ("past voltages", [t.p_input for t in tests]),
@@ -95,9 +92,6 @@ def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str
 
 
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
-    import math
-
-    from ambid.estimation.parts import Delay
 
     found = {}
     for rate in fit.problem.delays:
@@ -110,9 +104,6 @@ def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[
 
 
 def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
-    import math
-
-    from ambid.estimation.parts import OutputFit
 
     found: dict[str, dict[str, OutputFit]] = {}
     for name, record, test in zip(names, fit.problem.records, tests, strict=True):
@@ -125,7 +116,7 @@ def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str])
     return found
 
 
-def _between(low: NDArray[np.float64], high: NDArray[np.float64]) -> dict[str, tuple[float, float]]:
+def _between(low: Array, high: Array) -> dict[str, tuple[float, float]]:
     return {role: (a, b) for role, a, b in zip(_ROLES, low.tolist(), high.tolist(), strict=True)}
 
 
@@ -139,12 +130,6 @@ def _names(fit: BearingFit) -> list[str]:
 
 def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
     """Every number that acts, as it came out."""
-    import numpy as np
-
-    from ambid.bearing.magnet.problem import UNITS
-    from ambid.estimation.parts import EstimatedParameter
-    from ambid.estimation.uncertainty import WEAK
-
     law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
     sds = np.sqrt(np.diag(known.covariance(robust=robust)))
     acts = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair, "a": fit.problem.eddy}
@@ -178,7 +163,6 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
-    from ambid.estimation.parts import Check
 
     hidden = [p.name for p in parameters if not p.identifiable]
     detail = "the records show every number" if not hidden else (
@@ -190,9 +174,6 @@ def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
     """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
-    from ambid.bearing.magnet.contact import weight_carried
-    from ambid.estimation.parts import Check
-
     law, values = fit.problem.law, fit.problem.values(fit.vector)
     weight = values["m"] * values["g"]
     if law.pair or weight == 0.0:
@@ -206,11 +187,9 @@ def _gravity(fit: BearingFit) -> dict[str, Check]:
     return {"carries_its_weight": Check(passed=off < 0.1, detail=detail, values={"largest": off})}
 
 
-def _hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hull(points: Array) -> Array:
     """Corners of the convex hull, counter-clockwise."""
-    from scipy.spatial import ConvexHull
-
-    found: NDArray[np.float64] = points[ConvexHull(points / points.std(axis=0)).vertices]
+    found: Array = points[ConvexHull(points / points.std(axis=0)).vertices]
     return found
 
 
@@ -232,8 +211,6 @@ def _unseen(fit: BearingFit) -> list[str]:
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
-    from ambid.bearing.magnet.rescue import RescuedFit
-    from ambid.bearing.rescue import describe_search
 
     if isinstance(fit, RescuedFit):
         found.append(describe_search(fit.global_search))

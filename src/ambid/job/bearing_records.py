@@ -6,19 +6,20 @@ What they must not be: the same data twice, one channel twice, the stage off, a 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
+import numpy as np
+
+from ambid.bearing.magnet.contact import touching
+from ambid.bearing.magnet.problem import UNITS, BearingRecord
 from ambid.errors import EstimationError, nearest
-from ambid.job.data import Reading, known_rig, load, origin
+from ambid.estimation.progress import Tick
+from ambid.job.data import Reading, Source, known_rig, load, origin
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
-from ambid.record import Record
 from ambid.rig import Rig, RigMagnet
-
-if TYPE_CHECKING:
-    from ambid.bearing.magnet.problem import BearingRecord
 
 Magnet = MagnetLaw | Literal["auto", "single", "pair"]
 
@@ -51,10 +52,12 @@ class MagnetWords(TypedDict, total=False):
     off_below: float | None  # in V; None: as the rig says
 
 
-def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[MagnetWords]) -> Rig:
-    """Return a rig whose `magnet` is known as it says, but for what is given here."""
-    from ambid.bearing.magnet.problem import UNITS
+class BearingWords(MagnetWords, Reading, total=False):
+    """That, and how records are read."""
 
+
+def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> Rig:
+    """Return a rig whose `magnet` is known as it says, but for what is given here."""
     bench, magnet, off_below = known_rig(rig), words.get("magnet"), words.get("off_below")
     parameters = words.get("parameters", ())
     if bench.model != "one-axis":
@@ -80,13 +83,9 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[MagnetWords]) -> R
     if isinstance(magnet, MagnetLaw):
         kind: Literal["single", "pair"] = "pair" if magnet.pair else "single"
         known = replace(
-            known,
-            kind=kind,
-            gap=magnet.gap,
-            asymmetric=magnet.asymmetric if magnet.pair else None,
-            saturation=magnet.saturation,
-            rise=magnet.rise,
-        )
+            known, kind=kind, gap=magnet.gap, asymmetric=magnet.asymmetric if magnet.pair else None,
+            saturation=magnet.saturation, rise=magnet.rise,
+        )  # fmt: skip
     elif magnet is not None:
         known = replace(known, kind=magnet)
     return replace(
@@ -128,22 +127,15 @@ def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[Ma
     return laws, known.rise is None and known.asymmetric is None
 
 
-def take_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
+def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
     """Read a record as the predictor sees it.
 
     `rig`: with a `magnet`; `held`: the rotor is held at rest: all of the record is taken.
     """
-    import numpy as np
-
-    from ambid.bearing.magnet.contact import touching
-    from ambid.bearing.magnet.problem import BearingRecord
-
     if held:
-        rig, how = (
-            replace(rig, record=replace(rig.record, from_s=None, to_s=None)),
-            replace(how, from_s=None, to_s=None),
-        )
-    bench = load(record, rig, **asdict(how))
+        rig = replace(rig, record=replace(rig.record, from_s=None, to_s=None))
+        how = {**how, "from_s": None, "to_s": None}
+    bench = load(record, rig, **how)
     u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
     warnings, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
     if rig.limits is not None:
@@ -174,8 +166,6 @@ def take_record(record: Record | str | Path, rig: Rig, how: Reading, *, held: bo
 
 def _stops(record: BearingRecord) -> list[str]:
     """Say where the rotor touched its stops and where it lay on them; refuse where too little is left."""
-    import numpy as np
-
     found = list[str]()
     if record.knock is not None and record.knock.any():
         found.append(
@@ -198,8 +188,6 @@ def _stops(record: BearingRecord) -> list[str]:
 
 def _check_moves(record: BearingRecord) -> None:
     """Refuse what no number can come from."""
-    import numpy as np
-
     if record.u.size < _LEAST:
         raise EstimationError(
             f"{record.name} has {record.u.size} samples; a nonlinear bearing wants {_LEAST} of each record. "
@@ -212,6 +200,33 @@ def _check_moves(record: BearingRecord) -> None:
                 f"{record.name}: channel {role!r} is constant over the whole record; nothing can be estimated from it. "
                 "Check column and units, or leave it out"
             )
+
+
+def take_all(
+    records: Sequence[Source],
+    held: Sequence[Source],
+    validate: Source | None,
+    rig: Rig,
+    words: BearingWords,
+    say: Tick,
+) -> tuple[tuple[TakenRecord, ...], TakenRecord | None]:
+    """Read the records of one identification: those to identify from, and the one to validate on."""
+    how: Reading = {k: words[k] for k in Reading.__annotations__ if k in words}  # type: ignore[assignment, literal-required]
+    if not records:
+        raise EstimationError("no record, or every one holds the rotor; forces want one in which it moves. Give one")
+    taken: list[TakenRecord] = []
+    for source, is_held in [*((r, False) for r in records), *((r, True) for r in held)]:
+        say("read")
+        taken.append(take_record(source, rig, how, held=is_held))
+    second = None if validate is None else take_record(validate, rig, how)
+    rates = {t.record.rate_hz for t in taken if not t.record.held}
+    if second is not None and second.record.rate_hz not in rates:  # the predictor could not judge it: say so now
+        known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
+        raise EstimationError(
+            f"{second.record.name}, to judge on, is sampled at {second.record.rate_hz:g} Hz, the records at {known}; "
+            "they have to agree. Resample it, or leave --validate out"
+        )
+    return check_together(taken, second), second
 
 
 def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
@@ -238,8 +253,6 @@ def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> 
 
 
 def _refuse_senseless(record: BearingRecord) -> None:
-    import numpy as np
-
     if np.all(record.loose > 0.0):
         raise EstimationError(
             f"{record.name}: every voltage is at or below off_below, where the stage is off; none would be known. "

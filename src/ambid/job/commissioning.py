@@ -14,18 +14,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
+from ambid.acquire.amplitude import Room, looking
 from ambid.acquire.device import Device
 from ambid.acquire.program import program
+from ambid.acquire.recording import Acquired, Listeners, acquire
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.progress import Tick, silent
 from ambid.job import commissioning_steps as judge
-from ambid.job.acquisition import Acquired, Listeners, acquire
 from ambid.job.commissioning_steps import EXCITATION, STEPS, Step, StepName, Wishes
 from ambid.job.data import load
 from ambid.job.identification import evidence_of, identify, report_of
-from ambid.job.look import Room, looking
 from ambid.job.track_live import track_live
 from ambid.rig import Rig, rig_text
 from ambid.track.lines_file import TrackWriter
@@ -93,7 +93,7 @@ def commission(
     tick : callable, optional
         Sign of life while computing.
     **listeners
-        See `ambid.job.acquisition.Listeners`.
+        See `ambid.acquire.recording.Listeners`.
 
     Returns
     -------

@@ -13,12 +13,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ambid.acquire.amplitude import Look, Room, Trial, ended, find_amplitude, moving_band
 from ambid.acquire.device import Device
+from ambid.acquire.recording import Acquired
 from ambid.acquire.session import Course
 from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate
-from ambid.job.acquisition import Acquired
-from ambid.job.look import Look, Room, Trial, ended, find_amplitude, moving_band
 from ambid.job.track_live import LiveTrack
 from ambid.report.numbers import quantity, sized
 
@@ -141,7 +141,7 @@ def self_test(device: Device) -> Step:
 def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     """Look at the sensors with the output off.
 
-    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
+    `look`: see `looking`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
     or a current is shown that cannot be.
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
@@ -176,7 +176,7 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
 def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     """Lift the rotor and let it hover without excitation.
 
-    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
+    `look`: see `looking`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
     tripped, the rotor strays, or no room is left.
     """
     report, seen = look(Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s))
@@ -213,7 +213,7 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
 def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
     """Find the largest excitation that keeps to its part of the room.
 
-    `look`: see `ambid.job.look.looking`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
+    `look`: see `looking`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
     itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
     `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """

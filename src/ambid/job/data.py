@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from ambid.errors import EstimationError, RecordError
 from ambid.physics.models import model
@@ -24,6 +24,9 @@ Part = tuple[float | None, float | None]
 """From and to, in s; None: the record's own begin or end."""
 
 WHOLE: Part = (None, None)
+
+Source = Record | str | Path
+"""A record, or its file."""
 
 
 class Clock:
@@ -66,19 +69,18 @@ def origin(record: Record) -> dict[str, object]:
     }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """How files are read."""
+class Reading(TypedDict, total=False):
+    """How files are read, and which part of a record is used."""
 
-    # part of a record in which the rotor moves, in s; overrides the rig's, which does not apply to held ones
-    from_s: float | None = None
-    to_s: float | None = None
-    rate_hz: float | None = None  # for files without time
-    gaps: str | None = None  # ``"error"``, ``"interpolate"`` or ``"cut"``
+    # part of a record in which the rotor moves, in s; overrides the rig's, and does not apply to held ones
+    from_s: float | None
+    to_s: float | None
+    rate_hz: float | None  # sampling rate of a file without a time column
+    gaps: str | None  # ``"error"``, ``"interpolate"`` or ``"cut"``
 
 
 def load(
-    record: Record | str | Path,
+    record: Source,
     rig: Rig,
     *,
     from_s: float | None = None,
@@ -137,9 +139,22 @@ def signals_of(record: Record, plant: LinearModel) -> Signals:
     )
 
 
+class Columns(TypedDict, total=False):
+    """Which columns of records are inputs, outputs and references, and how their files are read."""
+
+    # names of channels; with a rig its roles or columns, by default all of its model
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    references: Sequence[str]  # channels of the loop's outer excitation, for methods that want it
+    open_loop: bool  # whether no feedback was at work
+    rate_hz: float | None  # sampling rate of a file without a time column
+    gaps: str | None  # ``"error"``, ``"interpolate"`` or ``"cut"``
+    rig: Rig | str | Path | None  # names and calibrates the channels
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channels:
-    """Which columns of records are inputs, outputs and references, and how their files are read."""
+    """Inputs, outputs and references of records, and how their files are read: `Columns`, with the rig loaded."""
 
     inputs: Sequence[str] = ()
     outputs: Sequence[str] = ()
@@ -149,7 +164,14 @@ class Channels:
     gaps: str | None = None
     rig: Rig | None = None
 
-    def read(self, record: Record | str | Path, part: Part = WHOLE) -> IOData:
+    @classmethod
+    def of(cls, columns: Columns) -> Channels:
+        """Take them from what a caller says."""
+        said: dict[str, Any] = dict(columns)
+        rig = said.pop("rig", None)
+        return cls(**said, rig=None if rig is None else known_rig(rig))
+
+    def read(self, record: Source, part: Part = WHOLE) -> IOData:
         """Read a record, cut it and take the columns out of it.
 
         With a rig they are named by role or as in the file, and calibrated; where none are named all of its model are
@@ -165,7 +187,7 @@ class Channels:
             record = cut(record, *part)
         return io_data(record, self.inputs, self.outputs, references=self.references, open_loop=self.open_loop)
 
-    def _through(self, rig: Rig, record: Record | str | Path, part: Part) -> IOData:
+    def _through(self, rig: Rig, record: Source, part: Part) -> IOData:
         from ambid.blackbox.data import io_data
 
         plant = model(rig.model)
@@ -211,32 +233,16 @@ def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
     return found
 
 
-def read_data(
-    record: Record | str | Path,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    references: Sequence[str] = (),
-    *,
-    open_loop: bool = False,
-    part: Part = WHOLE,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
-    rig: Rig | None = None,
-) -> IOData:
+def read_data(record: Source, *, part: Part = WHOLE, **columns: Unpack[Columns]) -> IOData:
     """Read a record, cut it and take inputs and outputs out of it.
 
     Parameters
     ----------
     record : Record, str or Path
-    inputs, outputs, references : sequence of str
-        Channel names.
-    open_loop : bool, optional
     part : (float or None, float or None), optional
         From and to, in s.
-    rate_hz : float, optional
-    gaps : {"error", "interpolate", "cut"}, optional
-    rig : Rig, optional
-        Names inputs and outputs by role and calibrates them; where none are named, all of its model are taken.
+    **columns
+        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see `Columns`.
 
     Returns
     -------
@@ -247,10 +253,7 @@ def read_data(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    channels = Channels(
-        inputs=inputs, outputs=outputs, references=references, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, rig=rig
-    )
-    return channels.read(record, part)
+    return Channels.of(columns).read(record, part)
 
 
 def check_same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:

@@ -1,21 +1,22 @@
-"""The jobs of black-box and nonlinear models: records, channels by name, one structure in; one judged fit out.
+"""The jobs of black-box and nonlinear models: records, channels by name, one structure in; one fit with its checks out.
 
-Read -> cut -> fit -> judge. The second record, if any, is only judged on.
+Read -> cut -> fit -> validate. The second record, if any, is only validated on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Unpack, get_args
 
-from ambid.blackbox.structures import STRUCTURES, Structure, structure
+from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
 from ambid.errors import EstimationError, nearest
+from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
-from ambid.job.data import Channels, Clock, check_same_bench, known_rig
-from ambid.nonlinear.structures import NonlinearStructure, nonlinear_structure
+from ambid.job.data import Channels, Clock, Columns, Source, check_same_bench, known_rig
+from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig
@@ -27,46 +28,39 @@ if TYPE_CHECKING:
     from ambid.nonlinear.fit import NonlinearFit, Settings
     from ambid.validate.comparison import Comparison
 
-    Method = Callable[[Sequence[IOData], IOData | None, Clock], BlackBoxFit | NonlinearFit]
-
 _ORDERS = 0.95  # of a job's time goes into the choice of orders, where they are chosen
 _USUAL_ORDERS = 12  # fits, about half of those that it takes
 _SEARCH = 0.95  # of a nonlinear job's time, by experience; the rest are the checks
 
 
 def fit(
-    record: Record | str | Path,
+    records: Source | Sequence[Source],
     *,
-    inputs: Sequence[str] = (),
-    outputs: Sequence[str] = (),
     structure_name: str,
     orders: Orders | None = None,
     criterion: str = "bic",
     fixed: Mapping[str, float] | None = None,
     at_rest: bool = False,
-    references: Sequence[str] = (),
-    open_loop: bool = False,
+    settings: Settings | None = None,
+    seed: int | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
-    validate: Record | str | Path | None = None,
+    validate: Source | None = None,
     validate_from_s: float | None = None,
     validate_to_s: float | None = None,
-    rig: Rig | str | Path | None = None,
     tick: Tick | None = None,
-) -> BlackBoxFit:
-    """Fit a black-box model to one record, and judge it.
+    **columns: Unpack[Columns],
+) -> BlackBoxFit | NonlinearFit:
+    """Fit a black-box model to one record, or a nonlinear one to one or several, and check it.
 
     Parameters
     ----------
-    record : Record, str or Path
-    inputs, outputs : sequence of str
-        Channel names; no inputs for a time series.
+    records : Record, str or Path, or sequence of these
+        Several: for nonlinear structures, of one bench, with the same channels and rate.
     structure_name : str
-        As in `ambid.blackbox.structures`.
+        As in `ambid.blackbox.structures` or `ambid.nonlinear.structures`.
     orders : Mapping[str, int, "auto" or tuple of int], optional
-        A tuple has one number for each input. None: all are chosen by `criterion`.
+        Of a linear structure; a tuple has one number for each input. None: all are chosen by `criterion`.
     criterion : str, optional
         For the choice of orders, see `ambid.validate.orders`.
     fixed : Mapping[str, float], optional
@@ -74,175 +68,113 @@ def fit(
     at_rest : bool, optional
         Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
         are estimated. For polynomial structures; a record that contradicts it is warned of.
-    references : sequence of str, optional
-        Channels of the loop's outer excitation, for the methods that want it.
-    open_loop : bool, optional
-        Say that no feedback was at work.
-    from_s, to_s : float, optional
-        Part of the record to fit, in s.
-    rate_hz : float, optional
-        Sampling rate for a file without a time column.
-    gaps : {"error", "interpolate", "cut"}, optional
-        What to do about gaps in a file.
-    validate : Record, str or Path, optional
-        A second record to judge on; may be the first, with another part.
-    validate_from_s, validate_to_s : float, optional
-        Part of the second record to use, in s; default all of it.
-    rig : Rig, str or Path, optional
-        Names and calibrates the channels; without `inputs` and `outputs` all of its model are taken.
-    tick : callable, optional
-        Called with the name of the present stage and, where it is known, the share of the job that is over:
-        ``tick(stage, done)``; may raise to interrupt.
-
-    Returns
-    -------
-    BlackBoxFit
-
-    Raises
-    ------
-    AmbidError
-        If the record, its channels or the orders break a rule.
-    EstimationError
-        If nothing can be estimated.
-    """
-    of, say = structure(structure_name), tick or silent
-    channels = Channels(
-        inputs=inputs, outputs=outputs, references=references, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps,
-        rig=None if rig is None else known_rig(rig),
-    )  # fmt: skip
-    bench = channels.rig
-    _check_criterion(criterion, orders)
-    _check_use(of, inputs if bench is None else inputs or model(bench.model).inputs, fixed, at_rest=at_rest)
-    options: dict[str, Any] = {"fixed": dict(fixed)} if fixed else {}
-    options |= {"at_rest": True} if at_rest else {}
-
-    def estimated(data: Sequence[IOData], second: IOData | None, clock: Clock) -> BlackBoxFit:
-        from ambid.validate.blackbox import judge
-
-        chosen: dict[str, object] = {}
-        wanted = orders
-        if wanted is None:
-            wanted, chosen = _choose_orders(of, data[0], criterion, say)
-            clock.lap("orders")
-        say("fit", _ORDERS if chosen else None)
-        found = of.estimator(data[0], wanted, **options)
-        clock.lap("fit")
-        say("check")
-        found = judge(found, data[0], second=second)
-        return replace(found, details={**found.details, **chosen})
-
-    parts = (from_s, to_s), (validate_from_s, validate_to_s)
-    found: Any = _run(estimated, [record], validate, channels, parts, silent)
-    return found  # type: ignore[no-any-return]
-
-
-def fit_nonlinear(
-    records: Sequence[Record | str | Path],
-    *,
-    inputs: Sequence[str] = (),
-    outputs: Sequence[str] = (),
-    structure_name: str,
-    settings: Settings | None = None,
-    open_loop: bool = False,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
-    validate: Record | str | Path | None = None,
-    validate_from_s: float | None = None,
-    validate_to_s: float | None = None,
-    rig: Rig | str | Path | None = None,
-    seed: int = 0,
-    tick: Tick | None = None,
-) -> NonlinearFit:
-    """Fit one nonlinear model to one or several records, and judge it.
-
-    Parameters
-    ----------
-    records : sequence of Record, str or Path
-        Of one bench: same channels, same rate.
-    inputs, outputs : sequence of str
-        Channel names.
-    structure_name : str
-        As in `ambid.nonlinear.structures`.
     settings : Mapping, optional
-        As the register describes them; what is left out the method chooses.
-    open_loop : bool, optional
-        Say that no feedback was at work in any of them.
+        Of a nonlinear structure, as the register describes them; what is left out the method chooses.
+    seed : int, optional
+        Of everything random in a nonlinear structure, 0 or more: equal seeds give equal results.
     from_s, to_s : float, optional
         Part of every record to fit, in s.
-    rate_hz, gaps, rig : optional
-        As `fit`.
     validate : Record, str or Path, optional
-        A further record to judge on; may be one of the first, with another part.
+        A further record to validate on; may be one of the first, with another part.
     validate_from_s, validate_to_s : float, optional
         Part of it to use, in s; default all of it.
-    seed : int, optional
-        Of everything random, 0 or more: equal seeds give equal results.
     tick : callable, optional
-        As `fit`. A KeyboardInterrupt that it raises during the search ends that with the best model so far, status
-        ``stalled``; in the stages ``read`` and ``check`` it ends the job.
+        Called with the name of the present stage and, where it is known, the share of the job that is over:
+        ``tick(stage, done)``; may raise to interrupt. A KeyboardInterrupt during the search of a nonlinear structure
+        ends that with the best model so far, status ``stalled``.
+    **columns
+        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see
+        `ambid.job.data.Columns`; no inputs for a time series.
 
     Returns
     -------
-    NonlinearFit
+    BlackBoxFit or NonlinearFit
 
     Raises
     ------
     AmbidError
-        If a record, its channels or the settings break a rule.
+        If a record, its channels, orders or settings break a rule.
     EstimationError
         If nothing can be estimated.
     """
-    say, of, wanted = tick or silent, nonlinear_structure(structure_name), settings or {}
-    _check_settings(of, records, wanted, seed)
-    channels = Channels(
-        inputs=inputs, outputs=outputs, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps,
-        rig=None if rig is None else known_rig(rig),
-    )  # fmt: skip
-
-    def estimated(data: Sequence[IOData], second: IOData | None, clock: Clock) -> NonlinearFit:
-        from ambid.validate.nonlinear import judge
-
-        found = of.estimator(data, wanted, seed=seed, tick=part_of(say, 0.0, _SEARCH))
-        clock.lap("fit")
-        say("check", _SEARCH)
-        judged_fit = judge(found, data, second=second)
-        say("check", 1.0)
-        return replace(judged_fit, details={**judged_fit.details, "fit_timing_s": dict(judged_fit.timing_s)})
-
-    parts = (from_s, to_s), (validate_from_s, validate_to_s)
-    found: Any = _run(estimated, records, validate, channels, parts, say)
-    return found  # type: ignore[no-any-return]
-
-
-def _run(
-    method: Method,
-    records: Sequence[Record | str | Path],
-    validate: Record | str | Path | None,
-    channels: Channels,
-    parts: tuple[tuple[float | None, float | None], tuple[float | None, float | None]],
-    say: Tick,
-) -> BlackBoxFit | NonlinearFit:
-    """Read the records, let the method estimate and judge, and keep the times."""
-    from ambid.estimation.linear import one_thread
-
-    if validate is None and parts[1] != (None, None):
+    say, channels = tick or silent, Channels.of(columns)
+    sources = [records] if isinstance(records, (Record, str, Path)) else list(records)
+    nonlinear = structure_name in NONLINEAR_STRUCTURES
+    if nonlinear:
+        linear_only = {"--orders": orders, "--fix": fixed, "--reference": channels.references, "--at-rest": at_rest}
+        linear_only["--criterion"] = criterion != "bic"
+        _refuse(linear_only, f"{{}} is for linear structures; {structure_name} has no use for it. Leave it out")
+        _check_settings(structure_name, sources, settings or {}, seed or 0)
+    else:
+        _check_linear(structure_name, sources, {"--settings": settings, "--seed": seed is not None})
+        _check_criterion(criterion, orders)
+        taken = channels.inputs if channels.rig is None else channels.inputs or model(channels.rig.model).inputs
+        _check_use(structure(structure_name), taken, fixed, at_rest=at_rest)
+    if validate is None and (validate_from_s, validate_to_s) != (None, None):
         raise EstimationError(
             "--validate-from and --validate-to cut a second record; none is given. Give --validate, or leave them out"
         )
     clock, data = Clock(), list[Any]()
-    for record in records:
-        say("read")
-        data.append(channels.read(record, parts[0]))
-    second = None if validate is None else channels.read(validate, parts[1])
+    for record in sources:
+        (say if nonlinear else silent)("read")
+        data.append(channels.read(record, (from_s, to_s)))
+    second = None if validate is None else channels.read(validate, (validate_from_s, validate_to_s))
     for other in data[1:] if second is None else (*data[1:], second):
         check_same_bench(data[0].units, data[0].dt, other)
     clock.lap("read")
+    options: dict[str, Any] = {"fixed": dict(fixed)} if fixed else {}
+    options |= {"at_rest": True} if at_rest else {}
     with one_thread():
-        found = method(data, second, clock)
+        found: Any = (
+            _estimate_nonlinear(structure_name, data, second, settings or {}, seed or 0, clock, say)
+            if nonlinear
+            else _estimate_linear(structure(structure_name), data[0], second, orders, criterion, options, clock, say)
+        )
         clock.lap("checks")
-    return replace(found, timing_s=clock.laps)
+    return replace(found, timing_s=clock.laps)  # type: ignore[no-any-return]
+
+
+def _estimate_linear(
+    of: Structure,
+    data: IOData,
+    second: IOData | None,
+    orders: Orders | None,
+    criterion: str,
+    options: Mapping[str, Any],
+    clock: Clock,
+    say: Tick,
+) -> BlackBoxFit:
+    from ambid.validate.blackbox import judge
+
+    chosen: dict[str, object] = {}
+    if orders is None:
+        orders, chosen = _choose_orders(of, data, criterion, say)
+        clock.lap("orders")
+    say("fit", _ORDERS if chosen else None)
+    found = of.estimator(data, orders, **options)
+    clock.lap("fit")
+    say("check")
+    found = judge(found, data, second=second)
+    return replace(found, details={**found.details, **chosen})
+
+
+def _estimate_nonlinear(
+    name: str,
+    data: Sequence[IOData],
+    second: IOData | None,
+    settings: Settings,
+    seed: int,
+    clock: Clock,
+    say: Tick,
+) -> NonlinearFit:
+    from ambid.validate.nonlinear import judge
+
+    found = nonlinear_structure(name).estimator(data, settings, seed=seed, tick=part_of(say, 0.0, _SEARCH))
+    clock.lap("fit")
+    say("check", _SEARCH)
+    checked = judge(found, data, second=second)
+    say("check", 1.0)
+    return replace(checked, details={**checked.details, "fit_timing_s": dict(checked.timing_s)})
 
 
 def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
@@ -272,20 +204,15 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
 
 
 def compare(
-    record: Record | str | Path,
+    record: Source,
     candidates: Sequence[tuple[str, Orders | None]],
     *,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    references: Sequence[str] = (),
-    open_loop: bool = False,
     from_s: float | None = None,
     to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
-    validate: Record | str | Path | None = None,
+    validate: Source | None = None,
     holdout: float = 0.3,
     tick: Tick | None = None,
+    **columns: Unpack[Columns],
 ) -> Comparison:
     """Fit several structures to one record and compare them on data that none of them has seen.
 
@@ -294,13 +221,14 @@ def compare(
     record : Record, str or Path
     candidates : sequence of (str, Mapping or None)
         Structures with their orders; None chooses.
-    inputs, outputs, references : sequence of str
-    open_loop, from_s, to_s, rate_hz, gaps, tick : optional
+    from_s, to_s, tick : optional
         As `fit`.
     validate : Record, str or Path, optional
-        A second record to judge on; without one the last part of the record is held out.
+        A second record to validate on; without one the last part of the record is held out.
     holdout : float, optional
         That part, 0 to 1.
+    **columns
+        As `fit`.
 
     Returns
     -------
@@ -311,14 +239,11 @@ def compare(
     AmbidError
         If the record, its channels or the orders break a rule.
     """
-    from ambid.estimation.linear import one_thread
     from ambid.validate.comparison import compare as compare_fits
 
+    channels = Channels.of(columns)
     for name, _ in candidates:
-        _check_use(structure(name), inputs, None)
-    channels = Channels(
-        inputs=inputs, outputs=outputs, references=references, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps
-    )
+        _check_use(structure(name), channels.inputs, None)
     data = channels.read(record, (from_s, to_s))
     second = None if validate is None else channels.read(validate)
     if second is not None:
@@ -370,14 +295,34 @@ def _check_use(
         )
 
 
-def _check_settings(of: NonlinearStructure, records: Sequence[object], settings: Settings, seed: int) -> None:
+def _check_linear(name: str, records: Sequence[object], given: Mapping[str, object]) -> None:
+    """Refuse a structure that is none, and what a linear one has no use for."""
+    if name in RESPONSE_STRUCTURES:
+        structure(name)  # says where those are fitted
+    every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
+    if name not in STRUCTURES:
+        raise EstimationError(f"structure {name!r} is not known; known: {', '.join(every)}.{nearest(name, every)}")
+    if len(records) > 1:
+        several = ", ".join(NONLINEAR_STRUCTURES)
+        raise EstimationError(f"structure {name} takes one record; {several} take several. Leave {records[1]} out")
+    _refuse(given, f"{{}} is for nonlinear structures; {name} has --orders. Leave it out")
+
+
+def _refuse(given: Mapping[str, object], refusal: str) -> None:
+    """Refuse the first option that was given although it has no use; it replaces ``{}`` in the refusal."""
+    for name, value in given.items():
+        if value:
+            raise EstimationError(refusal.format(name))
+
+
+def _check_settings(name: str, records: Sequence[object], settings: Settings, seed: int) -> None:
+    known = list(nonlinear_structure(name).settings)
     if not records:
         raise EstimationError("there is no record to fit. Give one at least")
     if seed < 0:
         raise EstimationError(f"the seed is {seed}; it is 0 or more. Give another one")
-    for name in settings:
-        if name not in of.settings:
-            known = ", ".join(of.settings)
+    for x in settings:
+        if x not in known:
             raise EstimationError(
-                f"structure {of.name} has no setting {name!r}; it has: {known}.{nearest(name, list(of.settings))}"
+                f"structure {name} has no setting {x!r}; it has: {', '.join(known)}.{nearest(x, known)}"
             )

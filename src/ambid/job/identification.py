@@ -6,13 +6,17 @@ Read -> cut -> identify -> validate. Each arrow is one call below; what a step d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack
+
+import numpy as np
 
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, known_rig, load, origin, remembered, signals_of
+from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, remembered, signals_of
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig
@@ -20,23 +24,19 @@ from ambid.rig import Rig
 if TYPE_CHECKING:
     from ambid.bearing.magnet.result import NonlinearBearingEstimate
     from ambid.bearing.uncertainty import Uncertainty
-    from ambid.estimation.estimate import Estimate
     from ambid.estimation.likelihood import Fit
     from ambid.estimation.parts import Check
-    from ambid.job.bearing_records import MagnetWords, TakenRecord
+    from ambid.job.bearing_records import BearingWords, TakenRecord
     from ambid.report.figures import BearingEvidence, Evidence
 
 
 def identify(
-    record: Record | str | Path,
+    record: Source,
     rig: Rig | str | Path | None = None,
     *,
-    validate: Record | str | Path | None = None,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
+    validate: Source | None = None,
     tick: Tick | None = None,
+    **reading: Unpack[Reading],
 ) -> Estimate:
     """Identify the physical parameters of a bench from one record, and check the result.
 
@@ -47,15 +47,11 @@ def identify(
     rig : Rig, str or Path, optional
         What is known of the bench; default: columns voltage, current and position, everything free.
     validate : Record, str or Path, optional
-        A second record of the same bench to judge the estimate on.
-    from_s, to_s : float, optional
-        Part of the record (and of the second) to use, in s; overrides the rig's.
-    rate_hz : float, optional
-        Sampling rate for a file without a time column.
-    gaps : {"error", "interpolate", "cut"}, optional
-        What to do about gaps in a file.
+        A second record of the same bench to validate the estimate on.
     tick : callable, optional
         Called with the name of the present stage now and then (progress); may raise to interrupt.
+    **reading
+        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps``, of the second record too, see `ambid.job.data.Reading`.
 
     Returns
     -------
@@ -69,19 +65,27 @@ def identify(
     EstimationError
         If nothing can be identified from the record.
     """
+    return identify_used(record, rig, validate=validate, tick=tick, **reading)[0]
+
+
+def identify_used(
+    record: Source,
+    rig: Rig | str | Path | None,
+    *,
+    validate: Source | None = None,
+    tick: Tick | None = None,
+    **reading: Unpack[Reading],
+) -> tuple[Estimate, Record]:
+    """Return what `identify` does, and the part of the record that was used."""
     from ambid.bearing.linear import greybox
     from ambid.bearing.uncertainty import uncertainty
-    from ambid.estimation.linear import one_thread
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
-    bench = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
-    plant = model(rig.model)
+    bench, plant = load(record, rig, **reading), model(rig.model)
     clock.lap("read")
     say("identify")
-    signals = signals_of(bench, plant)
-    wanted = {role: rig.channel(role).delay for role in plant.inputs}
-    delay = wanted[plant.inputs[0]]
-    fit = greybox(plant, signals, rig.parameters, delay=delay, tick=lambda: say("identify"))
+    delay = rig.channel(plant.inputs[0]).delay
+    fit = greybox(plant, signals_of(bench, plant), rig.parameters, delay=delay, tick=lambda: say("identify"))
     if fit.status == "failed":
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     clock.lap("fit")
@@ -90,82 +94,47 @@ def identify(
         clock.split("fit", "global_search", float(str(fit.global_search["seconds"])))
     say("check")
     with one_thread():
-        estimate = judged(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
+        estimate = judge(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
     clock.lap("checks")
     if validate is not None:
         from ambid.validate.second_record import validation
 
         say("validate")
-        other = load(validate, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
-        estimate = replace(estimate, validation=validation(estimate, signals_of(other, plant)))
+        other = signals_of(load(validate, rig, **reading), plant)
+        estimate = replace(estimate, validation=validation(estimate, other))
         clock.lap("validate")
-    return replace(estimate, timing_s=clock.laps)
+    return replace(estimate, timing_s=clock.laps), bench
 
 
-def judged(
+def judge(
     fit: Fit, known: Uncertainty, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]
 ) -> Estimate:
-    """Check a fit on its own record and put the estimate together.
+    """Check a fit that has not failed on its own record, and put the estimate together, without timings.
 
-    Parameters
-    ----------
-    fit : Fit
-        Not failed.
-    known : Uncertainty
-        Of that fit.
-    rig : Rig
-    bench : Record
-        The record it came from, channels named by role.
-    delay_how : {"estimated", "given"}
-
-    Returns
-    -------
-    Estimate
-        Without timings.
-
-    Raises
-    ------
-    EstimationError
-        If the fit has no predictor.
+    `known`: of that fit; `bench`: the record it came from, channels named by role.
     """
-    import numpy as np
-
     from ambid.bearing.result import estimate_of
     from ambid.estimation.sensitivity import innovations
-    from ambid.validate.physical import (
-        agreement,
-        assumption_checks,
-        innovation_checks,
-        physical_checks,
-        simulation_error,
-    )
+    from ambid.validate import physical
     from ambid.validate.residuals import fit_of
 
     problem = fit.problem
     e = innovations(problem, fit.vector)
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
-    moved = agreement(fit)
-    checks = innovation_checks(fit, e, known, moved)
+    moved = physical.agreement(fit)
+    checks = physical.innovation_checks(fit, e, known, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
-    checks |= assumption_checks(fit, known, delay_how)
-    checks |= physical_checks(fit, known, bench, robust=robust)
-    y, error = problem.y[problem.skip :], simulation_error(fit)
+    checks |= physical.assumption_checks(fit, known, delay_how)
+    checks |= physical.physical_checks(fit, known, bench, robust=robust)
+    y, error = problem.y[problem.skip :], physical.simulation_error(fit)
     estimate = estimate_of(
-        fit,
-        known,
-        rig.parameters,
-        robust=robust,
-        delay_how=delay_how,
+        fit, known, rig.parameters, robust=robust, delay_how=delay_how,
         means={role: float(bench[role].mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
-        one_step=fit_of(e * problem.scales.output, y),
-        simulation=None if error is None else fit_of(error, y),
-        checks=checks,
-        warnings=_warnings(fit, checks, robust=robust),
-        record=origin(bench),
-        rig=remembered(rig),
-    )
+        one_step=fit_of(e * problem.scales.output, y), simulation=None if error is None else fit_of(error, y),
+        checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=remembered(rig),
+    )  # fmt: skip
     return replace(estimate, global_search=fit.global_search)
 
 
@@ -186,17 +155,13 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
 
 
 def identify_nonlinear(
-    records: Sequence[Record | str | Path],
+    records: Sequence[Source],
     rig: Rig | str | Path | None = None,
     *,
-    held: Sequence[Record | str | Path] = (),
-    validate: Record | str | Path | None = None,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
+    held: Sequence[Source] = (),
+    validate: Source | None = None,
     tick: Tick | None = None,
-    **magnet: Unpack[MagnetWords],
+    **words: Unpack[BearingWords],
 ) -> NonlinearBearingEstimate:
     """Identify one nonlinear bearing from several records at several operating points at once.
 
@@ -211,10 +176,11 @@ def identify_nonlinear(
     held : sequence of Record, str or Path, optional
         With the rotor held at rest at different distances: they show the coil.
     validate : Record, str or Path, optional
-        A further record, of a rotor that moves, to judge the estimate on.
-    from_s, to_s, rate_hz, gaps, tick : optional
-        As `identify`; the part is of every record in which the rotor moves.
-    **magnet
+        A further record, of a rotor that moves, to validate the estimate on.
+    tick : callable, optional
+        As `identify`.
+    **words
+        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps`` as `identify`, the part of every record in which the rotor moves;
         ``magnet``, ``parameters``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
         `ambid.job.bearing_records.MagnetWords`.
 
@@ -229,75 +195,34 @@ def identify_nonlinear(
     EstimationError
         If nothing can be identified from the records.
     """
-    how = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps)
-    return identify_taken(
-        read_records(records, rig, held=held, validate=validate, how=how, tick=tick, **magnet), tick=tick
-    )
+    return identify_nonlinear_used(records, rig, held=held, validate=validate, tick=tick, **words)[0]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BearingJob:
-    """What was read for one identification."""
-
-    rig: Rig  # with a `magnet` that says all that is known and wished
-    taken: tuple[TakenRecord, ...]  # those in which the rotor moves, then those in which it is held
-    second: TakenRecord | None  # to judge on
-    clock: Clock
-
-
-def read_records(
-    records: Sequence[Record | str | Path],
+def identify_nonlinear_used(
+    records: Sequence[Source],
     rig: Rig | str | Path | None,
     *,
-    held: Sequence[Record | str | Path],
-    validate: Record | str | Path | None,
-    how: Reading,
-    tick: Tick | None = None,
-    **magnet: Unpack[MagnetWords],
-) -> BearingJob:
-    """Read all records of one identification; arguments as those of `identify_nonlinear`."""
-    from ambid.job.bearing_records import bearing_rig, check_together, take_record
-
-    say, clock = tick or silent, Clock()
-    bench = bearing_rig(rig, **magnet)
-    if not records:
-        raise EstimationError("no record, or every one holds the rotor; forces want one in which it moves. Give one")
-    taken: list[TakenRecord] = []
-    for source, is_held in [*((r, False) for r in records), *((r, True) for r in held)]:
-        say("read")
-        taken.append(take_record(source, bench, how, held=is_held))
-    second = None if validate is None else take_record(validate, bench, how)
-    rates = {t.record.rate_hz for t in taken if not t.record.held}
-    if second is not None and second.record.rate_hz not in rates:  # the predictor could not judge it: say so now
-        known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
-        raise EstimationError(
-            f"{second.record.name}, to judge on, is sampled at {second.record.rate_hz:g} Hz, the records at {known}; "
-            "they have to agree. Resample it, or leave --validate out"
-        )
-    checked = check_together(taken, second)
-    clock.lap("read")
-    return BearingJob(rig=bench, taken=checked, second=second, clock=clock)
-
-
-def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBearingEstimate:
-    """Identify from records that were read.
-
-    `tick`: as `identify_nonlinear`.
-    """
+    held: Sequence[Source],
+    validate: Source | None,
+    tick: Tick | None,
+    **words: Unpack[BearingWords],
+) -> tuple[NonlinearBearingEstimate, tuple[TakenRecord, ...]]:
+    """Return what `identify_nonlinear` does, and the records as they were used, held ones last."""
     from ambid.bearing.magnet.estimate import estimate_bearing
     from ambid.bearing.magnet.likelihood import uncertainty
-    from ambid.job.bearing_estimate import judged as judged_bearing
-    from ambid.job.bearing_records import laws_of, numbers_of
+    from ambid.job.bearing_estimate import judge_bearing
+    from ambid.job.bearing_records import bearing_rig, laws_of, numbers_of, take_all
     from ambid.validate.nonlinear_bearing import validation
 
-    say, bench, clock = tick or silent, job.rig, job.clock
+    say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
+    taken, second = take_all(records, held, validate, bench, words, say)
+    clock.lap("read")
     assert bench.magnet is not None
-    laws, extend = laws_of(bench.magnet, [t.record for t in job.taken if not t.record.held])
+    laws, extend = laws_of(bench.magnet, [t.record for t in taken if not t.record.held])
     wanted = bench.channel("voltage").delay
     fit = estimate_bearing(
-        [t.record for t in job.taken], numbers_of(bench), laws=laws,
-        delay=None if wanted == "auto" else float(wanted), extend=extend, eddy=bench.magnet.eddy,
-        drift=bench.magnet.drift, tick=say,
+        [t.record for t in taken], numbers_of(bench), laws=laws, delay=None if wanted == "auto" else float(wanted),
+        extend=extend, eddy=bench.magnet.eddy, drift=bench.magnet.drift, tick=say,
     )  # fmt: skip
     if fit.status == "failed":
         raise EstimationError(
@@ -306,19 +231,21 @@ def identify_taken(job: BearingJob, *, tick: Tick | None = None) -> NonlinearBea
         )
     clock.lap("fit")
     say("check")
-    estimate = judged_bearing(fit, uncertainty(fit), job.taken, delay_given=wanted != "auto")
+    estimate = judge_bearing(fit, uncertainty(fit), taken, delay_given=wanted != "auto")
     clock.lap("checks")
     estimate = replace(estimate, timing_s=clock.laps, rig=remembered(bench))
-    if job.second is None:
-        return estimate
-    return replace(estimate, validation=validation(estimate, job.second.record))
+    if second is not None:
+        estimate = replace(estimate, validation=validation(estimate, second.record))
+    return estimate, taken
 
 
-def evidence_of(estimate: Estimate, used: Record) -> Evidence:
-    """Return what figures and report show beside an estimate: the record `used`, cut, run through it again."""
-    from ambid.report.figures import Evidence
+def evidence_of(estimate: Estimate | NonlinearBearingEstimate, used: Any) -> Evidence | BearingEvidence:
+    """Return what figures and report show beside an estimate: the record or records `used`, run through it again."""
+    from ambid.report.figures import Evidence, bearing_evidence
     from ambid.validate.second_record import replay
 
+    if not isinstance(estimate, Estimate):
+        return bearing_evidence(estimate, [(t.record, t.start_s) for t in used])
     run = replay(estimate, signals_of(used, model(estimate.model)))
     return Evidence(estimate=estimate, run=run, start_s=used.start_s)
 

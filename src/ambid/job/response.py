@@ -5,10 +5,8 @@ Read -> cut -> measure -> fit -> Measured. With a rig, columns are its roles and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Literal
+from typing import Literal, Unpack
 
 import numpy as np
 
@@ -18,10 +16,10 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
+from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Channels, Clock, known_rig
+from ambid.job.data import Channels, Clock, Columns, Source
 from ambid.physics.models import model
-from ambid.record import Record
 from ambid.rig import Rig
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
@@ -30,12 +28,8 @@ Delay = float | Literal["auto"]
 
 
 def frf(
-    record: Record | str | Path,
+    record: Source,
     *,
-    inputs: Sequence[str] = (),
-    outputs: Sequence[str] = (),
-    references: Sequence[str] = (),
-    open_loop: bool = False,
     method: Method = "auto",
     hold: Hold = "zoh",
     band: tuple[float, float] | None = None,
@@ -44,12 +38,10 @@ def frf(
     feedthrough: bool = False,
     domain: Literal["s", "z"] | None = None,
     delay: Delay | None = None,
-    rig: Rig | str | Path | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
-    rate_hz: float | None = None,
-    gaps: str | None = None,
     tick: Tick | None = None,
+    **columns: Unpack[Columns],
 ) -> Measured:
     """Measure a frequency response from one record, and fit models to it.
 
@@ -57,12 +49,6 @@ def frf(
     ----------
     record : Record, str or Path
         With a rig: a file in the rig's columns, or a record whose channels are named by role.
-    inputs, outputs : sequence of str
-        Channel names; with a rig, roles or columns of it, by default all of its model.
-    references : sequence of str, optional
-        Channels of the loop's outer excitation: then the joint method is used, which feedback does not bias.
-    open_loop : bool, optional
-        Say that no feedback was at work.
     method : {"auto", "periodic", "random", "local"}, optional
         As in `ambid.signals.frequency_response`. Periodic: leading periods with a transient are left out, and said so.
     hold : {"zoh", "band-limited"}, optional
@@ -80,16 +66,14 @@ def frf(
     delay : float or "auto", s, optional
         Of the inputs. Default: 0 for the black-box models, the rig's for physical parameters. "auto" estimates it (not
         for a state space).
-    rig : Rig, str or Path, optional
-        Physical parameters of its model are estimated.
     from_s, to_s : float, optional
         Part of the record to use, in s.
-    rate_hz : float, optional
-        Sampling rate for a file without a time column.
-    gaps : {"error", "interpolate", "cut"}, optional
-        What to do about gaps in a file.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
+    **columns
+        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see
+        `ambid.job.data.Columns`. With references the joint method is used, which feedback does not bias; with a rig,
+        physical parameters of its model are estimated.
 
     Returns
     -------
@@ -102,20 +86,11 @@ def frf(
     EstimationError
         If the response cannot be measured, or a model not be fitted to it.
     """
-    say, clock = tick or silent, Clock()
-    _check(orders, state_space, feedthrough, domain, delay, rig)
-    bench = None if rig is None else known_rig(rig)
-    if bench is None and not inputs:
+    say, clock, channels = tick or silent, Clock(), Channels.of(columns)
+    bench = channels.rig
+    _check(orders, state_space, feedthrough, domain, delay, bench)
+    if bench is None and not channels.inputs:
         raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
-    channels = Channels(
-        inputs=inputs,
-        outputs=outputs,
-        references=references,
-        open_loop=open_loop,
-        rate_hz=rate_hz,
-        gaps=gaps,
-        rig=bench,
-    )
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
     say("measure")
@@ -132,14 +107,9 @@ def frf(
         estimate = _identify(response, bench, delay)
         clock.lap("identify")
     return Measured(
-        response=response,
-        references=data.references,
-        open_loop=data.open_loop,
-        fit=found,
-        estimate=estimate,
-        record=data.record,
-        timing_s=clock.laps,
-    )
+        response=response, references=data.references, open_loop=data.open_loop, fit=found, estimate=estimate,
+        record=data.record, timing_s=clock.laps,
+    )  # fmt: skip
 
 
 def _check(
@@ -168,28 +138,18 @@ def _check(
 
 def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
     """Measure the response by the wanted method, in the wanted band."""
-    from ambid.estimation.linear import one_thread
-
     r = data.reference if data.references else None
     if method == "auto":
         method = "periodic" if repeats(data.u if r is None else r) else "local"
     options: dict[str, object] = {"drop_periods": "auto"} if method == "periodic" else {}
     if method == "local" and band is not None:
         options["band"] = band
+    units = {x: data.units[x] for x in (*data.inputs, *data.outputs)}
     with one_thread():
         found = frequency_response(
-            data.u,
-            data.y,
-            1.0 / data.dt,
-            r=r,
-            method=method,
-            open_loop=data.open_loop,
-            hold=hold,
-            inputs=data.inputs,
-            outputs=data.outputs,
-            units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
-            **options,
-        )
+            data.u, data.y, 1.0 / data.dt, r=r, method=method, open_loop=data.open_loop, hold=hold,
+            inputs=data.inputs, outputs=data.outputs, units=units, **options,
+        )  # fmt: skip
     return found if band is None else found.between(*band)
 
 

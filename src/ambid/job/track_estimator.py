@@ -7,7 +7,7 @@ coefficients from named inputs to an output, the joint filters physical paramete
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,8 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, io_data
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
+from ambid.job.data import WHOLE, Reading, Source
+from ambid.job.following import EstimatorWords, Following, Memory
 from ambid.job.track_start import rows_of, start_of
 from ambid.physics.models import model
 from ambid.record import Record, read_record
@@ -36,8 +38,6 @@ from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, Track
 from ambid.rig import Rig, default_rig
 from ambid.signals.conditioning import cut
 from ambid.track.lines_file import Tally
-
-Memory = float | Literal["auto", "all"]
 
 REGRESSIONS = ("rls", "lms", "nlms", "iv")
 POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")
@@ -65,50 +65,35 @@ class _Run:
 
 
 def track_estimator(
-    record: Record | str | Path,
-    rig: Rig | None = None,
-    *,
+    record: Source,
+    rig: Rig | None,
     method: str,
-    inputs: Sequence[str] = (),
-    outputs: Sequence[str] = (),
-    references: Sequence[str] = (),
-    orders: Orders | None = None,
-    open_loop: bool = False,
-    step: float | None = None,
-    start: Estimate | str | Path | None = None,
-    start_s: float | None = None,
-    memory: Memory = "auto",
-    every_s: float = 0.01,
-    limit: float = 1.5,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    rate_hz: float | None = None,
-    on_header: Callable[[TrackHeader], None] | None = None,
-    on_line: Callable[[TrackLine], object] | None = None,
-    keep: bool = True,
+    start: Estimate | str | Path | None,
+    start_s: float | None,
+    part: Reading,
+    how: Following,
+    settings: EstimatorWords,
 ) -> Track:
-    """Follow a record with one of `METHODS` other than ``rpem``.
-
-    `inputs`, `outputs`, `references`, `orders`, `open_loop`: of a regression or polynomial model, as `fit` takes them;
-    `step`: of lms and nlms, for signals of size one; `start`, `start_s`: of a joint filter; the rest as
-    `ambid.job.track`.
-    """
+    """Follow a record with one of `METHODS` other than ``rpem``; `start` and `start_s` are of a joint filter."""
     if method not in METHODS:
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
+    inputs, outputs = settings.get("inputs", ()), settings.get("outputs", ())
+    references, orders = settings.get("references", ()), settings.get("orders")
     if method in JOINT:
         _refuse(method, {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders})
-        made = _joint(method, record, rig, start, start_s, memory, (from_s, to_s), rate_hz)
+        made = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
         _refuse(method, {"--rig": rig, "--start": start, "--start-seconds": start_s})
-        whole = record if isinstance(record, Record) else read_record(record, rate_hz=rate_hz)
-        part = cut(whole, from_s, to_s) if from_s is not None or to_s is not None else whole
-        data = io_data(part, inputs, outputs, references=references, open_loop=open_loop)
+        whole = record if isinstance(record, Record) else read_record(record, rate_hz=part.get("rate_hz"))
+        span = part.get("from_s"), part.get("to_s")
+        used = whole if span == WHOLE else cut(whole, *span)
+        data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
             raise EstimationError(f"{method} follows one output; {data.y.shape[1]} are named. Name one with --output")
         make = _regression if method in REGRESSIONS else _polynomial
-        made = make(method, data, orders, memory, step, part.start_s)
-    label = f"{method}, memory {memory if isinstance(memory, str) else f'{memory:g} s'}"
-    return _follow(made, label, every_s, limit, on_header, on_line, keep)
+        made = make(method, data, orders, how.memory, settings.get("step"), used.start_s)
+    label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
+    return _follow(made, label, how)
 
 
 def _refuse(method: str, given: Mapping[str, object]) -> None:
@@ -223,16 +208,15 @@ def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
 
 def _joint(
     method: str,
-    record: Record | str | Path,
+    record: Source,
     rig: Rig | None,
     start: Estimate | str | Path | None,
     start_s: float | None,
     memory: Memory,
-    part: tuple[float | None, float | None],
-    rate_hz: float | None,
+    part: Reading,
 ) -> _Run:
     """Physical parameters in one filter with the plant's states; with a memory they walk as much as they are unsure."""
-    source = rows_of(record, rig, from_s=part[0], to_s=part[1], rate_hz=rate_hz)
+    source = rows_of(record, rig, **part)
     begin = start_of(source, rig or default_rig(), given=start, start_s=start_s, rig_speaks=rig is not None)
     estimate, rate, of = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
     free = estimate.covariance_names
@@ -252,31 +236,20 @@ def _joint(
     )  # fmt: skip
 
 
-def _follow(
-    run: _Run,
-    method: str,
-    every_s: float,
-    limit: float,
-    on_header: Callable[[TrackHeader], None] | None,
-    on_line: Callable[[TrackLine], object] | None,
-    keep: bool,
-) -> Track:
+def _follow(run: _Run, method: str, how: Following) -> Track:
     """Feed the estimator with one reporting interval after the other."""
-    every = max(1, round(every_s * run.rate_hz))
+    every, lines = max(1, round(how.every_s * run.rate_hz)), list[TrackLine]()
     header = TrackHeader(
-        rate_hz=run.rate_hz, limit=limit, method=method, model=run.model, units=run.units,
+        rate_hz=run.rate_hz, limit=how.limit, method=method, model=run.model, units=run.units,
         every_s=every / run.rate_hz, start=run.start, record=run.origin, warnings=run.warnings,
     )  # fmt: skip
-    tally, lines, begun = Tally(header), [], time.perf_counter()
-    if on_header is not None:
-        on_header(header)
+    tally, take, begun = Tally(header), how.collect(lines), time.perf_counter()
+    if how.on_header is not None:
+        how.on_header(header)
     for first in range(0, run.outputs.shape[0], every):
         line = _line(run, slice(first, first + every))
         tally.add(line)
-        if keep:
-            lines.append(line)
-        if on_line is not None:
-            on_line(line)
+        take(line)
     summary = replace(tally.summary(computing_s=time.perf_counter() - begun), samples=run.estimator.n_used)
     return Track(header=header, lines=tuple(lines), summary=summary)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
 from types import MappingProxyType
+from typing import Unpack
 
 import numpy as np
 
@@ -23,11 +24,12 @@ from ambid.acquire.view import BenchView
 from ambid.arrays import Array
 from ambid.errors import AmbidError, DeviceError
 from ambid.estimation.estimate import Estimate
+from ambid.job.following import Following, FollowingWords
 from ambid.job.track_start import BenchRows, start_of
-from ambid.job.tracking import Flag, Following, Memory, follow
+from ambid.job.tracking import follow
 from ambid.physics.models import model
 from ambid.record import Channel, Record
-from ambid.recursive.lines import Track, TrackHeader, TrackLine
+from ambid.recursive.lines import Track
 from ambid.rig import Rig
 from ambid.track.blocks import Block, Frame
 from ambid.track.replay import Replay
@@ -59,31 +61,27 @@ def track_live(
     *,
     start: Estimate | str | Path | None = None,
     start_s: float | None = None,
-    every_s: float = 0.01,
-    limit: float = 1.5,
-    memory: Memory = "auto",
-    flags: Sequence[tuple[float, Flag]] = (),
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
-    on_header: Callable[[TrackHeader], None] | None = None,
-    on_line: Callable[[TrackLine], Sequence[Flag] | None] | None = None,
-    keep: bool = True,
     on_trouble: Callable[[AmbidError], object] | None = None,
     stopped: Callable[[], bool] = lambda: False,
+    **following: Unpack[FollowingWords],
 ) -> LiveTrack:
     """Let a device do a course, and follow the physical parameters of its bench meanwhile.
 
-    `device`: opened, idle; `rig`: its bench; `course`: what the device is to do; tracking begins when it has settled;
-    `start`: where tracking begins; default: an identification of the first part of the stream; `start_s`: length of
-    that part, s; `every_s`, `limit`, `memory`, `flags`, `on_header`, `on_line`, `keep`: as `ambid.job.tracking.track`;
-    times count from the first sample that is tracked; `taps`: others who listen to the run, such as a recorder;
-    `on_event`: told of the device's events, in the thread of the run; `on_run`: given what came of the run, also where
-    tracking was interrupted. Returns the track up to the end of the course, a fault, or an interrupt.
+    `device`: opened, idle; `course`: what the device is to do; tracking begins when it has settled; `start`: where
+    tracking begins; default: an identification of the first `start_s` of the stream; `taps`: others who listen to the
+    run, such as a recorder; `on_event`: told of the device's events, in the thread of the run; `on_run`: given what
+    came of the run, also where tracking was interrupted; `following`: see `ambid.job.following.Following`; times count
+    from the first sample that is tracked. Returns the track up to the end of the course, a fault, or an interrupt.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
-    wanted_s = _wanted_s(start, start_s, view.rate_hz)
+    if start is not None:
+        wanted_s, lead_s = _CHECKED_S, None
+    else:
+        wanted_s = lead_s = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start_s is None else start_s
     if course.seconds <= wanted_s:
         raise DeviceError(
             f"tracking wants {wanted_s:g} s to begin with, and the run has {course.seconds:g} s. Run longer"
@@ -97,21 +95,9 @@ def track_live(
         runner = LiveRun(device, course, ring_tap, taps, on_event, on_run, on_trouble, stopped, ring)
         with runner:
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
-            begin = start_of(
-                lead.source, rig, given=start, start_s=None if start is not None else wanted_s, rig_speaks=True
-            )
-            how = Following(
-                every_s=every_s, limit=limit, memory=memory, flags=flags, on_header=on_header, on_line=on_line,
-                keep=keep,
-            )  # fmt: skip
-            track = follow(lead.blocks(begin.first), lead.source, begin, rig, how, live=True)
+            begin = start_of(lead.source, rig, given=start, start_s=lead_s, rig_speaks=True)
+            track = follow(lead.blocks(begin.first), lead.source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
-
-
-def _wanted_s(start: object, start_s: float | None, rate_hz: float) -> float:
-    if start is not None:
-        return _CHECKED_S
-    return max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / rate_hz) if start_s is None else start_s
 
 
 class _Lead:

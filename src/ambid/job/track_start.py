@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, RecordError
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import known_rig, load
+from ambid.job.data import Reading, Source, known_rig, load
 from ambid.job.identification import identify
 from ambid.job.results import read_linear_estimate
 from ambid.physics.linear_model import LinearModel
@@ -89,25 +90,21 @@ class BenchRows:
         return part, int(numbers[at]) + length
 
 
-def rows_of(
-    record: Record | str | Path, known: Rig | None, *, from_s: float | None, to_s: float | None, rate_hz: float | None
-) -> BenchRows:
-    """Read the rows of a record through a rig.
+def rows_of(record: Source, known: Rig | None, **reading: Unpack[Reading]) -> BenchRows:
+    """Read the rows of a record through a rig; without one, columns are named like the roles, also of a turning rotor.
 
-    `record`: a file, or a record whose channels are named by role; `known`: none: columns named like the roles, those
-    of a turning rotor with them; `from_s`, `to_s`: part to use, s of record; override the rig's.
+    `record`: a file, or a record whose channels are named by role.
     """
-    rig = known_rig(known)
+    rig, rate_hz = known_rig(known), reading.get("rate_hz")
     if isinstance(record, Record) or not str(record).lower().endswith(_ROWS):
-        bench, stamps = load(record, rig, from_s=from_s, to_s=to_s, rate_hz=rate_hz), None
+        bench, stamps = load(record, rig, **reading), None
     else:
         rows = read_rows(record, rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz)
+        from_s, to_s = reading.get("from_s"), reading.get("to_s")
         bench, stamps = _part(
-            bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig),
-            rows.time_s,
-            rig.record.from_s if from_s is None else from_s,
-            rig.record.to_s if to_s is None else to_s,
-        )
+            bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig), rows.time_s,
+            rig.record.from_s if from_s is None else from_s, rig.record.to_s if to_s is None else to_s,
+        )  # fmt: skip
     plant = model(rig.model)
     forcing = forcing_of(bench) if "force" in plant.disturbances else None
     stream = _stream(bench, plant, forcing)

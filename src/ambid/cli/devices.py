@@ -1,4 +1,4 @@
-"""Options and openings that the verbs with a device share."""
+"""How the verbs with a device choose its mode and open it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
-from ambid.cli.options import option, preset_of, switch
+from ambid.cli.options import preset_of
 
 if TYPE_CHECKING:
     from ambid.acquire.device import Device, Mode
@@ -18,32 +18,6 @@ if TYPE_CHECKING:
     from ambid.rig import Rig
 
 _SAME_RATE = 1e-3  # a rate from a time column is rounded
-
-Port = Annotated[str, option("--port", "PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
-RigOfDevice = Annotated[Path, option("--rig", "RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
-BandHz = Annotated[
-    str | None,
-    option(
-        "--band",
-        "LO:HI",
-        "Band of the excitation in Hz.",
-        "of a multisine to levitate, where the rotor moves; else what the controller can play",
-    ),
-]
-BenchName = Annotated[
-    str | None,
-    option(
-        "--bench",
-        "PRESET|RIG",
-        "Plant behind an emulated or simulated controller.",
-        "daq.bench of the rig, or its own values",
-    ),
-]
-Pace = Annotated[
-    Literal["fastest", "real-time"],
-    switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
-]
-Seed = Annotated[int, option("--seed", "N", "Seed of excitation and simulated noise.", True, min=0)]
 
 
 def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) -> Mode:

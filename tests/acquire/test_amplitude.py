@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from ambid.acquire.amplitude import Room, Trial, find_amplitude, fitting_amplitude
 from ambid.acquire.session import RunReport
 from ambid.errors import DeviceError
-from ambid.job.look import Room, Trial, find_amplitude, fitting_amplitude
 from ambid.rig import rig_from_text
 from tests.job.benches import COIL, THESIS, Spoiled, prototype
 

@@ -75,41 +75,13 @@ def _ordered(rig: Rig, limits: tuple[float, float]) -> tuple[float, float]:
     return max(low, limits[0]), min(high, limits[1])
 
 
-class Kept:
-    """Keeps what a run passes on, seen through the rig.
-
-    `view`: of device and rig.
-    """
-
-    def __init__(self, view: BenchView) -> None:
-        self._view = view
-        self._values: list[Array] = []
-
-    def take(self, frame: Frame) -> None:
-        """Take a block.
-
-        `frame`: as it came.
-        """
-        self._values.append(self._view.block(frame.block).values)
-
-    def roles(self) -> dict[str, Array]:
-        """Return what came, by role.
-
-        Returns (n_samples,), SI, empty arrays where nothing came.
-        """
-        n = len(self._view.units)
-        values = np.concatenate(self._values) if self._values else np.empty((0, n))
-        return {role: values[:, k] for k, role in enumerate(self._view.units)}
-
-
 Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
 
 
 def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
-    """Return a way of running a course and keeping what it shows.
+    """Return a way of running a course: it gives the report, and by role what came, SI, seen through the rig.
 
-    `device`: opened, idle; `rig`: its bench; `stopped`: as `session.run`. Returns takes a course, gives report and
-    values by role.
+    `device`: opened, idle; `stopped`: as `session.run`.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
@@ -117,9 +89,22 @@ def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
     def look(course: Course) -> tuple[RunReport, dict[str, Array]]:
         kept = Kept(view)
         report = run(device, course, taps=[kept], stopped=stopped)
-        return report, kept.roles()
+        values = np.concatenate([np.empty((0, len(view.units))), *kept.values])
+        return report, {role: values[:, k] for k, role in enumerate(view.units)}
 
     return look
+
+
+class Kept:
+    """Keeps what a run passes on, seen through a view."""
+
+    def __init__(self, view: BenchView) -> None:
+        self._view = view
+        self.values: list[Array] = []
+
+    def take(self, frame: Frame) -> None:
+        """Take a block as it came."""
+        self.values.append(self._view.block(frame.block).values)
 
 
 def ended(report: RunReport, what: str) -> tuple[str, ...]:
@@ -140,7 +125,7 @@ def ended(report: RunReport, what: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """What a trial plays."""
+    """What is played, and how long."""
 
     name: str  # excitation, as `ambid.acquire.program` knows it
     band: tuple[float, float] | None  # in Hz
@@ -148,6 +133,13 @@ class Trial:
     settle_s: float  # time after the start, and length of the trial, s
     seconds: float
     seed: int  # of the excitation
+
+    def course(self, amplitude_v: float, rate_hz: float) -> Course:
+        """Return the course that plays it with a peak in V; refuse what a controller of this rate cannot play."""
+        wave = program(
+            self.name, amplitude_v=amplitude_v, band=self.band, rate_hz=rate_hz, seconds=self.seconds, seed=self.seed
+        )
+        return Course(mode=self.mode, seconds=self.seconds, settle_s=self.settle_s, program=wave)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,6 +160,14 @@ def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float
     return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
 
 
+def band_for(trial: Trial, rate_hz: float) -> tuple[float, float] | None:
+    """Return the band as wished; without one, of a multisine that is to levitate, that in which the rotor moves."""
+    if trial.band is not None or trial.mode != "levitate" or trial.name not in ("multisine", "schroeder"):
+        return trial.band
+    low, high = moving_band(rate_hz, trial.seconds)
+    return (low, high) if 3.0 * low < high else None  # a short record has no room for slow lines
+
+
 def find_amplitude(
     look: Look,
     room: Room,
@@ -180,7 +180,7 @@ def find_amplitude(
 ) -> Size:
     """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
 
-    `look`: see `ambid.job.look.looking`; `room`: limits; `trial`: what is played; `resting`: position in m and current
+    `look`: see `looking`; `room`: limits; `trial`: what is played; `resting`: position in m and current
     in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
     reasons where it tripped, or used too much. It may use less than its part where trials have run out.
     """
@@ -192,10 +192,7 @@ def find_amplitude(
     tried: list[tuple[float, float]] = []  # size, and what it used
     findings: list[str] = []
     while True:
-        wave = program(
-            trial.name, amplitude_v=size, band=trial.band, rate_hz=rate_hz, seconds=trial.seconds, seed=trial.seed
-        )
-        report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=wave))
+        report, seen = look(trial.course(size, rate_hz))
         reasons = ended(report, f"excitation of {size:.3g} V")
         if reasons:
             return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.acquire.amplitude import Room, ended, looking
 from ambid.acquire.device import DeviceEvent
 from ambid.acquire.session import Course, RunReport
-from ambid.job.look import Room, ended, looking
 from ambid.rig import rig_from_text
 from tests.job.benches import COIL, PLAIN, Spoiled, prototype
 

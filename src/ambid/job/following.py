@@ -1,0 +1,144 @@
+"""How a track is made and told: its settings, and which of them make no sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, TypedDict
+
+from ambid.blackbox.data import Orders
+from ambid.errors import EstimationError, nearest
+from ambid.record import Record
+from ambid.recursive.lines import TrackHeader, TrackLine
+
+Flag = Literal["track", "hold", "accept", "revert"]
+Memory = float | Literal["auto", "all"]
+Pace = Literal["fastest", "real-time"]
+OnLine = Callable[[TrackLine], Sequence[Flag] | None]
+
+FLAGS: tuple[Flag, ...] = ("track", "hold", "accept", "revert")
+_PACES = ("fastest", "real-time")
+_SHORTEST_S, _LONGEST_S = 1e-3, 1e9  # of a memory: below a block, and beyond any record
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Following:
+    """How a track is made and told."""
+
+    every_s: float = 0.01  # reporting interval, s of record
+    limit: float = 1.5  # acceptable model error, in multiples of that at identification
+    memory: Memory = "auto"  # how long data count: a time constant in s, found from the data, or for ever
+    pace: Pace = "fastest"  # replay as fast as possible, or as the record was taken
+    flags: Sequence[tuple[float, Flag]] = ()  # what an operator sets and when, s of record
+    on_header: Callable[[TrackHeader], None] | None = None  # called once before the first line
+    on_line: OnLine | None = None  # called with each line; flags that it returns are set
+    keep: bool = True  # keep the lines for the result; without, memory stays constant
+
+    def collect(self, lines: list[TrackLine]) -> OnLine:
+        """Return what takes each line: kept in `lines` where that is wanted, and passed on."""
+
+        def take(line: TrackLine) -> Sequence[Flag] | None:
+            if self.keep:
+                lines.append(line)
+            return None if self.on_line is None else self.on_line(line)
+
+        return take
+
+
+class FollowingWords(TypedDict, total=False):
+    """The fields of `Following`."""
+
+    every_s: float
+    limit: float
+    memory: Memory
+    pace: Pace
+    flags: Sequence[tuple[float, Flag]]
+    on_header: Callable[[TrackHeader], None] | None
+    on_line: OnLine | None
+    keep: bool
+
+
+class EstimatorWords(TypedDict, total=False):
+    """What methods with coefficients are told, as `fit`; and the step of lms and nlms, for signals of size one."""
+
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    references: Sequence[str]
+    orders: Orders | None
+    open_loop: bool
+    step: float | None
+
+
+class TrackWords(FollowingWords, EstimatorWords, total=False):
+    """What `track` is told."""
+
+
+def check_settings(record: object, said: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Refuse what `track` is told where it makes no sense or contradicts itself, in the `names` of the caller."""
+    for name in ("every_s", "limit", "start_s", "rate_hz"):
+        if name in said and not (said[name] is None and name in ("start_s", "rate_hz")):
+            _positive(names.get(name, name), said[name])
+    for name in ("from_s", "to_s"):
+        x = said.get(name)
+        if x is not None and math.isnan(_number(x)):
+            raise EstimationError(f"{name} is {_short(x)}; it must be a time in s. Correct it")
+    memory = said.get("memory", "auto")
+    if memory not in ("auto", "all"):
+        name = names.get("memory", "memory")
+        _positive(name, memory, other="'auto', 'all' or ")
+        if not _SHORTEST_S <= _number(memory) <= _LONGEST_S:
+            raise EstimationError(
+                f"{name} is {_short(memory)} s; it must lie between {_SHORTEST_S:g} and {_LONGEST_S:g}. Give 'all'"
+                " where nothing is to be forgotten"
+            )
+    pace = said.get("pace", _PACES[0])
+    if pace not in _PACES:
+        raise EstimationError(f"pace is {pace!r}; known: {', '.join(_PACES)}. Correct it")
+    if not isinstance(record, (Record, str, Path)):
+        raise EstimationError(f"record is {_short(record)}; it must be a Record or the path of a file. Give one")
+    if said.get("start") is not None and said.get("start_s") is not None:
+        raise EstimationError(
+            f"{names.get('start_s', 'start_s')} is for a start identified from the record; "
+            f"{names.get('start', 'start')} gives one. Leave one of them out"
+        )
+    if said.get("rate_hz") is not None and isinstance(record, Record):
+        raise EstimationError(
+            f"rate_hz = {said['rate_hz']} is for files without a time column; this record has {record.rate_hz:g} Hz."
+            " Leave it out, or replace the record's"
+        )
+    for flag in said.get("flags", ()):
+        _check_flag(flag)
+
+
+def _positive(name: str, x: object, *, other: str = "") -> None:
+    number = _number(x)
+    if not (math.isfinite(number) and number > 0):
+        raise EstimationError(f"{name} is {_short(x)}; it must be {other}a positive number. Correct it")
+
+
+def _number(x: object) -> float:
+    """A number as float; NaN for anything else."""
+    try:
+        return math.nan if isinstance(x, (str, bool)) else float(x)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _check_flag(flag: object) -> None:
+    """Refuse a flag that is not a pair of a finite time and a known name."""
+    if isinstance(flag, str) or not isinstance(flag, Sequence) or len(flag) != 2:
+        raise EstimationError(f"flag {_short(flag)} is no pair of a time in s and a name, such as (12.5, 'hold')")
+    t, name = flag
+    if isinstance(t, (str, bool)) or not isinstance(t, (int, float)) or not math.isfinite(t):
+        raise EstimationError(f"flag {_short(flag)}: its time is {_short(t)}; it must be finite, in s. Correct it")
+    if name not in FLAGS:
+        near = nearest(name, FLAGS) if isinstance(name, str) else ""
+        raise EstimationError(f"flag {_short(flag)}: {_short(name)} is unknown; known: {', '.join(FLAGS)}.{near}")
+
+
+def _short(x: object) -> str:
+    text = repr(x)
+    return text if len(text) <= 60 else f"{text[:57]}..."
