@@ -1,11 +1,12 @@
-"""Streaming scalar filters: the off-line ones sample by sample, and the error that the thesis compares them by."""
+"""Scalar filters: the gain and the step response of the thesis, and the error that it compares them by."""
+
+from math import pi, sqrt
 
 import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.streaming import PassiveLowpass, ScalarKalman
-from ambid.signals import kalman_bucy, passive_lowpass
+from ambid.recursive.streaming import PassiveLowpass, ScalarKalman, kalman_bucy_gain
 
 RATE = 1000.0
 
@@ -22,17 +23,57 @@ def walk(seed, n, *, a=0.0, c=1.0, q=60.0, r=1.0, channels=1):
     return x, c * x + np.sqrt(r * RATE) * rng.standard_normal((n, channels))
 
 
-@pytest.mark.parametrize("numbers", [{}, {"a": -3.0, "c": 2.0, "w": 0.5}, {"a": 2.0, "q": 5.0}])
-def test_the_continuous_form_is_the_off_line_filter(numbers):
-    y = walk(0, 2000)[1][:, 0]
-    found = ScalarKalman(RATE, **numbers).update(y)
-    np.testing.assert_allclose(found, kalman_bucy(y, RATE, **numbers), rtol=1e-10, atol=1e-10)
+def test_gain_of_the_thesis():
+    assert kalman_bucy_gain() == pytest.approx(sqrt(60.0))
+    assert round(kalman_bucy_gain(), 3) == 7.746
 
 
-def test_the_passive_form_is_the_off_line_filter():
-    y = walk(0, 2000)[1][:, 0]
-    found = PassiveLowpass(RATE, corner_hz=3.0).update(y)
-    np.testing.assert_allclose(found, passive_lowpass(y, RATE, corner_hz=3.0), rtol=1e-10, atol=1e-10)
+@pytest.mark.parametrize(
+    ("a", "c", "w", "q", "r"), [(-2.0, 0.5, 3.0, 7.0, 0.1), (5.0, 2.0, 1.0, 0.0, 1.0), (1, -1, 1, 1, 1)]
+)
+def test_gain_solves_the_riccati_equation_and_stabilises(a, c, w, q, r):
+    gain = kalman_bucy_gain(a=a, c=c, w=w, q=q, r=r)
+    s = gain * r / c
+    assert 2 * a * s - (s * c) ** 2 / r + w * q * w == pytest.approx(0.0, abs=1e-12)
+    assert s > 0
+    assert a - gain * c < 0
+
+
+def test_step_response_is_the_exact_exponential():
+    y = np.ones(500)
+    t = np.arange(500) / RATE
+    np.testing.assert_allclose(ScalarKalman(RATE, start=0.0).update(y), 1 - np.exp(-sqrt(60.0) * t), atol=1e-13)
+    np.testing.assert_allclose(
+        PassiveLowpass(RATE, corner_hz=2.0, start=0.0).update(y), 1 - np.exp(-4 * pi * t), atol=1e-13
+    )
+
+
+def test_sampled_filter_is_the_continuous_one_at_any_rate():
+    # The same held signal sampled 10 times as fast gives the same values: the discretisation is exact.
+    y = np.random.default_rng(1).standard_normal(200)
+    fast = ScalarKalman(10 * RATE, a=-3.0, c=2.0).update(np.repeat(y, 10))
+    np.testing.assert_allclose(fast[::10], ScalarKalman(RATE, a=-3.0, c=2.0).update(y), atol=1e-12)
+
+
+def test_first_value_and_decay():
+    y = np.zeros(50)
+    x = ScalarKalman(RATE, start=2.0).update(y)
+    np.testing.assert_allclose(x, 2.0 * np.exp(-sqrt(60.0) / RATE) ** np.arange(50))
+    assert ScalarKalman(RATE, c=2.0, a=0.0).update(y + 3.0)[0] == 1.5
+
+
+def test_with_a_0_the_filter_is_the_passive_one_of_corner_L():
+    y = walk(2, 1000)[1][:, 0]
+    same = PassiveLowpass(RATE, corner_hz=sqrt(60.0) / (2 * pi)).update(y)
+    np.testing.assert_allclose(ScalarKalman(RATE).update(y), same, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "numbers", [{"c": 0.0}, {"q": -1.0}, {"r": 0.0}, {"q": 0.0}, {"a": float("nan")}, {"w": float("inf")}]
+)
+def test_numbers_without_a_filter_are_refused(numbers):
+    with pytest.raises(EstimationError, match="Kalman-Bucy"):
+        kalman_bucy_gain(**numbers)
 
 
 FORMS = [
@@ -89,7 +130,8 @@ def test_refusals():
         ScalarKalman(RATE, q=0.0)
     with pytest.raises(EstimationError, match="channels"):
         ScalarKalman(RATE, channels=0)
-    with pytest.raises(EstimationError, match="corner"):
-        PassiveLowpass(RATE, corner_hz=0.0)
+    for corner in (0.0, -1.0, float("nan")):
+        with pytest.raises(EstimationError, match="corner"):
+            PassiveLowpass(RATE, corner_hz=corner)
     with pytest.raises(EstimationError, match=r"shape \(4,\)"):
         ScalarKalman(RATE, channels=3).update(np.ones(4))

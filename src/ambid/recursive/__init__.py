@@ -33,5 +33,6 @@ if TYPE_CHECKING:
     from ambid.recursive.streaming import PassiveLowpass as PassiveLowpass
     from ambid.recursive.streaming import ScalarKalman as ScalarKalman
     from ambid.recursive.streaming import SynchronousFilter as SynchronousFilter
+    from ambid.recursive.streaming import kalman_bucy_gain as kalman_bucy_gain
 
 __getattr__, __dir__, __all__ = exports(__name__)

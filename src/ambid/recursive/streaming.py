@@ -20,7 +20,6 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import as_block, check_channels, kernels
 from ambid.recursive.square_root import covariance_of
-from ambid.signals.scalar_filter import kalman_bucy_gain
 
 _START = 1e6  # variance of each state of the notch before the first sample, over that of the noise
 _BATCHES = 16  # in one memory, to see the density of the noise around the rotation
@@ -94,11 +93,58 @@ class StreamingFilter:
         return deepcopy(self)
 
 
+def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float = 60.0, r: float = 1.0) -> float:
+    """Return the stationary gain L = S C/R of the scalar filter.
+
+    S is the positive root of the Riccati equation 2 A S - S² C²/R + W² Q = 0 (thesis 5.3.2, with W Q Wᵀ where it
+    prints W Q Cᵀ). The defaults are the thesis's: L = √60 = 7.746 1/s.
+
+    Parameters
+    ----------
+    a : float
+        A in 1/s.
+    c : float
+        C, unit of the measurement per unit of the state; not 0.
+    w : float
+        W, unit of the state per second and unit of w.
+    q : float
+        Intensity (two-sided density) of w, its unit squared times s; at least 0.
+    r : float
+        Intensity of the measurement noise, its unit squared times s; over 0. White noise of variance σ² sampled at f
+        Hz has σ²/f.
+
+    Returns
+    -------
+    float
+        L in state unit per measurement unit and second.
+
+    Raises
+    ------
+    EstimationError
+        If C is 0, Q negative or R not positive, or A and W² Q are both 0 (the stationary gain would be 0).
+    """
+    numbers = {"A": a, "C": c, "W": w, "Q": q, "R": r}
+    for label, value in numbers.items():
+        if not isfinite(value):
+            raise EstimationError(f"Kalman-Bucy filter: {label} is {value}; it must be finite. Give a number")
+    if c == 0.0 or q < 0.0 or r <= 0.0:
+        raise EstimationError(
+            f"Kalman-Bucy filter: C = {c:g}, Q = {q:g}, R = {r:g}; C must not be 0, Q not negative and R positive. "
+            f"Give others"
+        )
+    if a == 0.0 and w * w * q == 0.0:
+        raise EstimationError(
+            "Kalman-Bucy filter: A = 0 without process noise has no stationary gain but 0. Give Q > 0"
+        )
+    s = (a + sqrt(a * a + c * c * w * w * q / r)) * r / (c * c)
+    return s * c / r
+
+
 class ScalarKalman(StreamingFilter):
     """Stationary Kalman-Bucy filter of one or several channels that have nothing to do with each other.
 
     x̂' = A x̂ + L (y - C x̂) is solved exactly, each sample of y held until the next; what comes out is x̂ at the sampling
-    instants, from the samples before, as `ambid.signals.kalman_bucy` gives it. The defaults are the thesis's (5.3.2):
+    instants, from the samples before. The defaults are the thesis's (5.3.2):
     A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 = 7.746 1/s. `KalmanFilter` has the discrete and the varying form.
 
     Parameters
@@ -106,7 +152,7 @@ class ScalarKalman(StreamingFilter):
     rate_hz : float
         Sampling rate in Hz.
     a, c, w, q, r : float
-        As in `ambid.signals.kalman_bucy_gain`: intensities, not variances of samples. White noise of variance σ² in
+        As in `kalman_bucy_gain`: intensities, not variances of samples. White noise of variance σ² in
         samples of f Hz has r = σ²/f.
     start : float, optional
         Estimate before the first sample; y/c of the first sample by default.
@@ -147,8 +193,7 @@ class ScalarKalman(StreamingFilter):
 class PassiveLowpass(StreamingFilter):
     """First-order RC low-pass, x' = (y - x)/τ with τ = 1/(2π corner), discretised exactly; y held over a sample.
 
-    Gives the voltage over the capacitor at the sampling instants, as `ambid.signals.passive_lowpass`. Over a missing
-    value it stays where it is.
+    Gives the voltage over the capacitor at the sampling instants. Over a missing value it stays where it is.
 
     Parameters
     ----------

@@ -46,12 +46,8 @@ if TYPE_CHECKING:
     from ambid.signals.periodic_response import frf_periodic as frf_periodic
     from ambid.signals.random_response import frf_random as frf_random
     from ambid.signals.response import FrequencyResponse as FrequencyResponse
-    from ambid.signals.scalar_filter import kalman_bucy as kalman_bucy
-    from ambid.signals.scalar_filter import kalman_bucy_gain as kalman_bucy_gain
-    from ambid.signals.scalar_filter import passive_lowpass as passive_lowpass
     from ambid.signals.spectra import CrossSpectra as CrossSpectra
     from ambid.signals.spectra import PowerSpectrum as PowerSpectrum
-    from ambid.signals.spectra import coherence as coherence
     from ambid.signals.spectra import cross_spectra as cross_spectra
     from ambid.signals.spectra import power_spectrum as power_spectrum
 

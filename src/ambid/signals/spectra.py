@@ -115,13 +115,13 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
     RecordError
         If the segment does not fit the record.
     """
-    from scipy.signal import welch
-
-    length = _segment(x.size, segment)
-    frequency, density = welch(x, fs=rate_hz, nperseg=length)
-    count, step = _count(x.size, length), length - length // 2
-    effective = _effective(_window("hann", length), step, count)
-    return PowerSpectrum(frequency_hz=frequency, density=density, n_segments=count, n_effective=effective)
+    found = cross_spectra(x[:, None], rate_hz, segment=segment)
+    return PowerSpectrum(
+        frequency_hz=found.frequency_hz,
+        density=np.ascontiguousarray(found.density[:, 0, 0].real),
+        n_segments=found.n_segments,
+        n_effective=found.n_effective,
+    )
 
 
 def cross_spectra(
@@ -177,55 +177,12 @@ def cross_spectra(
     )
 
 
-def coherence(u: Array, y: Array, rate_hz: float, *, segment: int | None = None) -> tuple[Array, Array]:
-    """Estimate the coherence ``|S_uy|² / (S_uu S_yy)`` by Welch's method.
-
-    Parameters
-    ----------
-    u, y : ndarray, shape (n_samples,), any units
-        Two signals.
-    rate_hz : float
-        Sampling rate in Hz.
-    segment : int, optional
-        Samples of a segment, as in `power_spectrum`.
-
-    Returns
-    -------
-    frequency_hz : ndarray, shape (n_frequencies,), Hz
-        Frequencies.
-    coherence : ndarray, shape (n_frequencies,), dimensionless
-        0 to 1; a value of about 1/n_segments is what independent signals give. 0 where a signal has no power.
-
-    Raises
-    ------
-    RecordError
-        If lengths differ or the segment leaves fewer than two segments, for which coherence is 1 by construction.
-    """
-    from scipy.signal import csd, welch
-
-    if u.shape != y.shape:
-        raise RecordError(f"coherence of signals of {u.size} and {y.size} samples; both must be as long. Cut one")
-    length = _segment(u.size, segment)
-    if _count(u.size, length) < 2:
-        raise RecordError(
-            f"coherence of {u.size} samples in segments of {length}; one segment always gives 1. Give a shorter segment"
-        )
-    frequency, cross = csd(u, y, fs=rate_hz, nperseg=length)
-    product = welch(u, fs=rate_hz, nperseg=length)[1] * welch(y, fs=rate_hz, nperseg=length)[1]
-    ratio = np.divide(np.abs(cross) ** 2, product, out=np.zeros_like(product), where=product > 0)
-    return frequency, ratio
-
-
 def _segment(n_samples: int, segment: int | None) -> int:
     if segment is None:
         return min(n_samples, max(256, n_samples // 8))
     if not 8 <= segment <= n_samples:
         raise RecordError(f"a segment of {segment} samples; it must have 8 to {n_samples} (the record). Give another")
     return segment
-
-
-def _count(n_samples: int, segment: int) -> int:
-    return (n_samples - segment // 2) // (segment - segment // 2)
 
 
 def _window(name: str, length: int) -> Array:
@@ -248,35 +205,3 @@ def _line_overlap(w: Array) -> float:
     """Return Σ_q |ρ(q)|² over lags of lines, ρ(q) = Σ w² e^{-2πj q t/n}/Σ w²: 1 for a box, 35/18 for Hann."""
     rho = np.fft.fft(w**2) / np.sum(w**2)
     return float(np.sum(np.abs(rho) ** 2))
-
-
-def blackman_tukey(x: Array, rate_hz: float, *, lags: int | None = None) -> PowerSpectrum:
-    """Estimate the power spectral density from the correlation function under a Hann window (Ljung 1999, sec. 6.4).
-
-    `x`: (n_samples,), any unit, samples; their mean is removed; `rate_hz`: sampling rate in Hz. Returns the density in
-    the unit of `x` squared per Hz, with its standard deviation and confidence bounds; no segments.
-    """
-    from scipy.fft import irfft, next_fast_len, rfft
-
-    n = x.size
-    used = min(n // 10, 30 + n // 100) if lags is None else lags
-    if not 2 <= used < n // 2:
-        raise RecordError(
-            f"{used} lags of a record of {n} samples; 2 to {n // 2 - 1} are possible. Give another number"
-        )
-    size = next_fast_len(n + used)
-    correlation = irfft(np.abs(rfft(x - np.mean(x), size)) ** 2, size)[: used + 1] / n
-    window = 0.5 * (1.0 + np.cos(np.pi * np.arange(used + 1) / used))
-    points = 2 * next_fast_len(2 * used)
-    even = np.zeros(points)
-    even[: used + 1] = correlation * window
-    even[-used:] = even[used:0:-1]
-    # a Hann window has small negative side lobes: where nothing is, the estimate may dip below zero
-    density = 2.0 * np.maximum(rfft(even).real, 0.0) / rate_hz
-    density[[0, -1]] *= 0.5
-    return PowerSpectrum(
-        frequency_hz=np.arange(density.size) * rate_hz / points,
-        density=density,
-        n_segments=0,
-        n_effective=float(n / (1.0 + 2.0 * np.sum(window[1:] ** 2))),
-    )
