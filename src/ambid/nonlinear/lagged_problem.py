@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Literal, Self
+from typing import Literal, Protocol, Self
 
 import numpy as np
 
@@ -270,11 +270,22 @@ def laplace(problem: LaggedProblem, theta: Array) -> Laplace:
 
 def sandwiched(problem: LaggedProblem, theta: Array) -> Array | None:
     """Return the covariance that does not take errors as white; None where data and prior leave a direction open."""
-    v = problem.whole(theta)[problem.live]
-    rows = problem.sample_rows(v)
+    return sandwich_at(problem, problem.whole(theta)[problem.live])
+
+
+class SampledProblem(Protocol):
+    """A problem of least squares that tells the rows of each sample."""
+
+    def triangle(self, theta: Array) -> Array: ...  # noqa: D102
+    def sample_rows(self, v: Array) -> list[Array]: ...  # noqa: D102
+    def prior_rows(self, v: Array) -> Array: ...  # noqa: D102
+
+
+def sandwich_at(problem: SampledProblem, v: Array) -> Array | None:
+    """As `sandwiched`, of what is searched."""
+    rows, prior = problem.sample_rows(v), problem.prior_rows(v)[:, :-1]
     scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
-    prior = np.diag(problem.precision[problem.live] ** 2)
-    return sandwich(problem.triangle(v)[:, :-1], scores, prior, [r[:, :, :-1] for r in rows])[0]
+    return sandwich(problem.triangle(v)[:, :-1], scores, prior.T @ prior, [r[:, :, :-1] for r in rows])[0]
 
 
 @dataclass(slots=True, kw_only=True)

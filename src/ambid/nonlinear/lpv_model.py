@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -29,6 +29,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.roots import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
+from ambid.estimation.documents import fields_json, read_as
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.signals import finite, scaled, with_head
 
@@ -574,8 +575,8 @@ class LpvModel:
         return {
             "dt_s": self.dt,
             "n_inputs": self.n_inputs,
-            "shape": {**asdict(self.shape), "columns": list(self.shape.columns)},
-            "schedule": asdict(self.schedule),
+            "shape": fields_json(self.shape),
+            "schedule": fields_json(self.schedule),
             **arrays,
             "cloud": self.cloud.as_json(),
         }
@@ -584,16 +585,13 @@ class LpvModel:
     def from_json(cls, found: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
         try:
-            m, words = int(found["n_inputs"]), ("form", "basis", "offset")
-            sizes: dict[str, Any] = {k: int(v) for k, v in found["shape"].items() if k not in ("columns", *words)}
-            columns = tuple(int(k) for k in found["shape"]["columns"])
-            said: dict[str, Any] = {k: str(found["shape"][k]) for k in words}
-            shape = LpvShape(columns=columns, **sizes, **said)
-            schedule = Schedule(**found["schedule"])
-            known = {"basis": BASES, "form": ("equation", "output"), "offset": ("scheduled", "constant")}
-            if any(getattr(shape, k) not in v for k, v in known.items()) or not schedule.high > schedule.low:
+            m, shape = int(found["n_inputs"]), read_as(LpvShape, found["shape"], "shape")
+            schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
+            words = shape.basis in BASES and shape.form in ("equation", "output")
+            if not words or shape.offset not in ("scheduled", "constant") or not schedule.high > schedule.low:
                 raise ValueError("form, basis, offset or range of the schedule make no sense")
-            if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes.values()) < 0:
+            sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
+            if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
                 raise ValueError("columns or orders make no sense")
             n = {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": 1, "y_scale": 1}
             arrays: dict[str, Any] = {k: finite(found[k], size, k) for k, size in n.items()}

@@ -25,9 +25,9 @@ from ambid.nonlinear.state_start import (
     LARGEST,
     NO_START,
     SHORT,
-    convert_to_continuous,
     find_delay,
     guess_delay,
+    matrices_json,
     search_start,
     shift_inputs,
     start_free,
@@ -130,8 +130,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     state = fitting.state
     if state is not None and s["form"] == "free":
         m = state.layout.matrices(state.theta)
-        both = convert_to_continuous(state.layout, m.A, m.B[:, :-1])
-        fitting.details["continuous"] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
+        fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B[:, :-1], sampled=True)
     used = {**s, "delay": fitting.delay}
     return finish(records, used, fitting, reason, seed=seed, how=s["uncertainty"], tick=part_of(tick, *_SPREAD))
 

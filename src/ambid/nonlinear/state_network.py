@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.documents import fields_json, read_as
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.search import search
 from ambid.nonlinear.cloud import Cloud
@@ -521,42 +522,16 @@ class StateNetwork:
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
-        x = self.layout
+        layout = fields_json(self.layout, without=("dt", "sensor")) | {"anchored": self.layout.anchored}
         arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
-        layout = {
-            "form": x.form,
-            "n_inputs": x.n_inputs,
-            "heads": list(x.heads),
-            "steps": list(x.steps),
-            "entries": [list(e) for e in x.entries],
-            "scale": list(x.scale),
-            "rates": list(x.rates),
-            "rows": list(x.rows),
-            "gain": x.gain,
-            "neurons": x.neurons,
-            "anchored": x.anchored,
-        }
-        return {"dt_s": x.dt, "delay": self.delay, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
+        return {"dt_s": self.dt, "delay": self.delay, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
 
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
         try:
             given = found["layout"]
-            layout = Layout(
-                dt=float(found["dt_s"]),
-                form=str(given["form"]),
-                n_inputs=int(given["n_inputs"]),
-                heads=tuple(int(k) for k in given["heads"]),
-                steps=tuple(float(k) for k in given["steps"]),
-                entries=tuple((int(r), int(c)) for r, c in given["entries"]),
-                scale=tuple(float(k) for k in given["scale"]),
-                rates=tuple(float(k) for k in given["rates"]),
-                rows=tuple(int(k) for k in given["rows"]),
-                gain=bool(given["gain"]),
-                neurons=int(given["neurons"]),
-                sensor=not given["anchored"],
-            )
+            layout = read_as(Layout, {**given, "dt": found["dt_s"], "sensor": not given["anchored"]}, "layout")
             m, p = layout.n_inputs, layout.p
             places = [*layout.rows, *(r for r, _ in layout.entries)]
             columns = [c for _, c in layout.entries]

@@ -27,13 +27,13 @@ from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout, free_entries, largest_pole
 from ambid.nonlinear.state_training import State, add_gain
+from ambid.signals.delay import find_delay as delay
 
 NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
 SHORT = 6  # samples of past that a subspace model looks back: enough where the plant is stable and sampled well
 
 LARGEST = 20  # samples of delay that are looked for
 _HISTORY = 12  # past outputs in the first guess of a delay
-_TAPS = 3  # inputs behind a delay
 _MOST = 5000  # samples that the first guess looks at
 _SHORT = 5  # iterations of a short training
 _WORTH = 2.0  # gain of the log likelihood, times two, for which a neighbour is taken
@@ -169,16 +169,14 @@ def _logarithm(A: Array, B: Array, dt: float) -> tuple[Array, Array] | None:
     return found[:n, :n] / dt, found[:n, n:] / dt
 
 
-def convert_to_continuous(layout: Layout, A: Array, B: Array) -> tuple[Array, Array] | None:
-    """Return continuous A and B in SI of sampled, scaled ones; None where there is no real logarithm."""
-    found = _logarithm(A, B, layout.dt)
-    return None if found is None else in_si(layout, *found)
-
-
-def in_si(layout: Layout, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return scaled A (n, n) and B (n, n_inputs) in SI."""
+def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[str, object] | None:
+    """Return scaled A and B in SI, made continuous if they are those of a sample; None where there is no logarithm."""
+    found = _logarithm(A, B, layout.dt) if sampled else (A, B)
+    if found is None:
+        return None
     n, size = layout.n, np.array(layout.scale)
-    return A * size[:n, None] / size[:n], B * size[:n, None] / size[n:]
+    by = size[:n, None] / size
+    return {"A": (found[0] * by[:, :n]).tolist(), "B": (found[1] * by[:, n:]).tolist()}
 
 
 # --- delay -----------------------------------------------------------------------------------------------------------
@@ -192,41 +190,19 @@ def shift_inputs(data: Scaled, delay: int) -> Scaled:
 
 
 def guess_delay(data: Scaled) -> int:
-    """Return what two readings of a long linear fit on past outputs and inputs agree on at least.
+    """Return the least delay at which a long linear fit of an output on the past sees an input; 0 where it sees none.
 
-    The delay behind which a few inputs explain most, and the number of leading inputs that Bayes' criterion does
-    without; 0 where inputs explain nothing. Where inputs act weakly within a sample (fast sampling, much noise) this
-    cannot tell neighbours apart, and the network itself is trained a little way beside them (`find_delay`).
+    Where inputs act weakly within a sample (fast sampling, much noise) this cannot tell neighbours apart, and the
+    network itself is trained a little way beside them (`find_delay`).
     """
-    m, p = data.u_level.size, data.y_level.size
-    share = _MOST // len(data.parts)
-    parts = [(y[-share:], u[-share:]) for y, u in data.parts]
-    n, shortest = sum(y.shape[0] for y, _ in parts), min(y.shape[0] for y, _ in parts)
-    history = min(_HISTORY, n // (8 * (m + p)))
-    largest = min(LARGEST, n // (5 * max(m, 1)) - 2 * history, shortest - history - 10)
-    if not m or history < _TAPS or largest < 1:
+    y, u = (x[-_MOST:] for x in max(data.parts, key=lambda part: part[0].shape[0]))
+    largest = min(LARGEST, y.shape[0] // 8 - 2 * _HISTORY)
+    if largest < 1 or not u.shape[1]:
         return 0
-    lag, blocks = history + largest, []
-    for y, u in parts:
-        k = y.shape[0]
-        past = [y[lag - j : k - j] for j in range(1, history + 1)]
-        inputs = [u[lag - j : k - j] for j in range(1, lag + 1)]
-        blocks.append(np.hstack([np.ones((k - lag, 1)), *past, *inputs, y[lag:]]))
-    R, n = triangle_of(blocks), sum(b.shape[0] for b in blocks)
-    R = R[1 + history * p :, 1 + history * p :]
-
-    def error(first: int, last: int) -> float:
-        """Log determinant of what inputs of these lags leave, times the samples."""
-        columns = np.r_[(first - 1) * m : (last - 1) * m, R.shape[1] - p : R.shape[1]]
-        left = np.asarray(np.linalg.qr(R[:, columns], mode="r"))[(last - first) * m :, -p:]
-        return float(n * np.linalg.slogdet(left.T @ left / n + 1e-14 * np.eye(p))[1])
-
-    price = m * p * float(np.log(n))
-    if error(1, 1) - error(1, lag + 1) < lag * price:
-        return 0
-    few = int(np.argmin([error(k + 1, k + 1 + _TAPS) for k in range(largest + 1)]))
-    leading = int(np.argmin([error(k + 1, lag + 1) - k * price for k in range(largest + 1)]))
-    return min(few, leading)
+    found = [
+        delay(u[:, i], y[:, o], max_delay=largest, order=_HISTORY) for i in range(u.shape[1]) for o in range(y.shape[1])
+    ]
+    return min((x.samples for x in found if x.samples is not None), default=0)
 
 
 def find_delay(
@@ -294,40 +270,33 @@ def train_one_step(
     N = sum(r.shape[0] for r in rows)
     R = triangle_of(rows)
     known, target = R[:, :d], R[:, d:]
-    prepared = perf_counter() - began
+    seconds = [perf_counter() - began]
 
     def rms(v: Array) -> float:
         return float(np.sqrt(np.sum((target - known @ v) ** 2) / (N * n)))
 
     curvature = float(np.linalg.svd(known, compute_uv=False)[0] ** 2)
     v = np.zeros((d, n))
-    seconds, errors = [prepared], [rms(v)]
+    errors = [rms(v)]
     for _ in range(iterations):
         v = v + known.T @ (target - known @ v) / curvature
         seconds.append(perf_counter() - began)
         errors.append(rms(v))
     again = perf_counter()
     solved: Array = np.asarray(np.linalg.lstsq(known, target, rcond=1e-13)[0], dtype=np.float64)
-    curves = (
-        LearningCurve(
-            method="steepest descent (thesis eq. 5.2), one-step errors of the states",
-            seconds=np.array(seconds),
-            training=np.array(errors),
-        ),
-        LearningCurve(
-            method="Gauss-Newton, one-step errors of the states",
-            seconds=np.array([prepared, prepared + perf_counter() - again]),
-            training=np.array([errors[0], rms(solved)]),
-        ),
-    )
+    last = np.array([seconds[0], seconds[0] + perf_counter() - again]), np.array([errors[0], rms(solved)])
+    descent, gauss_newton = (
+        LearningCurve(method=f"{name}, one-step errors of the states", seconds=took, training=left)
+        for name, took, left in (
+            ("steepest descent (thesis eq. 5.2)", np.array(seconds), np.array(errors)), ("Gauss-Newton", *last)
+        )
+    )  # fmt: skip
     back = np.concatenate([1.0 / size, np.ones(d - n)])
     found: dict[str, object] = {}
     for name, w in (("steepest descent", v), ("Gauss-Newton", solved)):
         M = (w * back[:, None] * size).T
-        convert = convert_to_continuous if layout.form == "one-axis" else in_si
-        both = convert(layout, M[:, :n], M[:, n:-1])
-        found[name] = None if both is None else {"A": both[0].tolist(), "B": both[1].tolist()}
-    return curves, found
+        found[name] = matrices_json(layout, M[:, :n], M[:, n:-1], sampled=layout.form == "one-axis")
+    return (descent, gauss_newton), found
 
 
 # --- global search ---------------------------------------------------------------------------------------------------

@@ -18,16 +18,16 @@ from ambid.blackbox.data import IOData
 from ambid.estimation.linear import information_inverse, least_squares
 from ambid.estimation.progress import Tick, part_of
 from ambid.estimation.search import search
-from ambid.estimation.uncertainty import bootstrapped, sandwich
+from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit, failed_fit, provenance
+from ambid.nonlinear.lagged_problem import sandwich_at
 from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
 _SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
 _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
-_LAGS = 20  # of the test for whiteness
 _PAST = 10  # samples of errors and inputs that a regression of the errors looks at
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
 _FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
@@ -206,19 +206,8 @@ def add_units(state: State, neurons: int, prior: float, seed: list[int]) -> Stat
 
 
 def is_white(state: State, data: Scaled) -> bool:
-    """Return whether the errors are white (Ljung and Box 1978, all outputs together)."""
-    from scipy.stats import chi2
-
-    problem = state.problem(data)
-    total, p = 0.0, state.layout.p
-    for e in problem.errors(state.vector)[1]:
-        w = (e - e.mean(axis=0)) @ problem.weight
-        n = w.shape[0]
-        for lag in range(1, _LAGS + 1):
-            r = w[lag:].T @ w[:-lag] / n
-            total += n * (n + 2) * float(np.sum(r**2)) / (n - lag)
-    freedom = _LAGS * p**2 * len(data.parts)
-    return total < float(chi2.ppf(0.999, freedom))
+    """Return whether past errors say no more of the errors than by chance."""
+    return misfit(state, data, inputs=False).p > _CHANCE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -242,8 +231,8 @@ class Misfit:
         return f"a linear regression on the past explains {100 * self.share:.2g} % of the errors' variance"
 
 
-def misfit(state: State, data: Scaled) -> Misfit:
-    """Regress errors on past errors and inputs; on past inputs alone without gain, where errors may be coloured.
+def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
+    """Regress errors on past inputs, and on past errors with a gain, without which errors may be coloured.
 
     A linear model of high order predicts no better than a network that is at its best, unless the plant has more to it.
     """
@@ -254,7 +243,7 @@ def misfit(state: State, data: Scaled) -> Misfit:
     with np.errstate(over="ignore", invalid="ignore"):
         errors = problem.errors(state.vector)[1]
     for e, (_, u) in zip(errors, problem.parts, strict=True):
-        known = np.hstack([e, u[:, :-1]]) if state.layout.gain else u[:, :-1]
+        known = np.hstack([e] * (state.layout.gain or not inputs) + [u[:, :-1]] * inputs)
         n = e.shape[0]
         past = [known[_PAST - k : n - k] for k in range(1, _PAST + 1)]
         rows.append(np.hstack([*past, np.ones((n - _PAST, 1))]))
@@ -301,10 +290,7 @@ def estimate_spread(
     if how == "auto":
         how = "laplace" if is_white(state, data) else "sandwich"
     if how == "sandwich":
-        rows = problem.sample_rows(v)
-        scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
-        prior = problem.prior_rows(v)[:, :-1]
-        P, _ = sandwich(problem.triangle(v)[:, :-1], scores, prior.T @ prior, [r[:, :, :-1] for r in rows])
+        P = sandwich_at(problem, v)
         assert P is not None
         origin = "sandwich"
     elif how == "bootstrap":
