@@ -11,8 +11,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.hybrid import hybrid
-from ambid.nonlinear.hybrid_choice import choose_noise
-from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem
+from ambid.nonlinear.hybrid_choice import HybridFunction, choose_noise, hybrid_problem
 from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.lagged_problem import laplace
 from ambid.nonlinear.narmax import narmax

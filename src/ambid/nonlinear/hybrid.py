@@ -8,116 +8,50 @@ innovations -> terms that no longer pay, order of C -> covariance by Laplace's a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import CRITERIA
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.blocks import Tanh
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.hybrid_choice import (
-    MOST_NOISE,
     SHARED,
-    Candidates,
-    Tried,
+    HybridFunction,
+    HybridSettings,
     choose_neurons,
     choose_noise,
+    hybrid_problem,
+    hybrid_settings,
     inflation,
+    make_invertible,
     revise,
     train_network,
+    transfer,
 )
-from ambid.nonlinear.hybrid_function import HybridFunction, hybrid_problem, make_invertible, transfer
 from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, cautions, finish, guarded, laplace
 from ambid.nonlinear.narmax import narmax
-from ambid.nonlinear.polynomial import PolynomialFunction, Term, is_noisy, lagged, products, term_name
+from ambid.nonlinear.polynomial import PolynomialFunction, is_noisy, lagged, term_name
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import choice, number, read_settings, whole
 
 _ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
 _NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
 _DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HybridSettings:
-    """Settings of a hybrid fit."""
-
-    ny: int = whole("largest lag of the outputs; 2", 0, 50, 2)
-    nu: int = whole("number of lags of each input; 2", 0, 50, 2)
-    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
-    ne: int | None = whole("order of C; chosen by the criterion, 4 at most", 0, 20)
-    degree: int = whole("of the polynomial; 2", 1, 9, 2)
-    terms: int = whole(
-        "terms of the polynomial that are looked at for each output, at most; 30, fewer on a short record", 1, 2000, 30
-    )
-    constant: int = whole("1 to let a constant be chosen, 0 for none; 1", 0, 1, 1)
-    neurons: int | None = whole("hidden units, 0 for none; chosen by held-out error, 8 at most", 0, 60)
-    starts: int = whole("random starts of the network; 3", 1, 50, 3)
-    held_out: float = number(
-        "part at the end of each record by which the number of neurons is chosen; 0.2", 0.05, 0.5, 0.2
-    )
-    prior: float = number(
-        "standard deviation of the network's weights before the data, scaled signals; 3", 0.01, 1e6, 3.0
-    )
-    iterations: int = whole("of each training, at most; 60", 1, 2000, 60)
-    criterion: str = choice("for terms and ne: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic", *CRITERIA, default="ebic")
-    pruning: str = choice(
-        "prediction (terms are revised once the network is there), none; prediction",
-        "none", "prediction", default="prediction",
-    )  # fmt: skip
-    selection: str = choice("frols, all (every candidate); frols", "frols", "all")
-    innovations: str = choice(
-        "linear (through C alone), network (they are its regressors too); linear", "linear", "network"
-    )
-
-    @property
-    def lag(self) -> int:
-        """Samples of the past that a model may look at."""
-        ne = MOST_NOISE if self.ne is None else self.ne
-        return max(self.ny, self.nk + self.nu - 1 if self.nu else 0, ne, 1)
-
-    @property
-    def polynomial(self) -> dict[str, int | float | str | tuple[int, ...]]:
-        """Settings of the polynomial's estimator."""
-        same = ("ny", "nu", "nk", "degree", "terms", "constant", "criterion", "pruning", "selection")
-        return {k: getattr(self, k) for k in same} | {"ne": 2 if self.ne is None else self.ne}
-
-
-def hybrid_settings(given: Mapping[str, object], *, n_inputs: int) -> HybridSettings:
-    """Check settings and complete them; without inputs there are no lags of them."""
-    s = read_settings(HybridSettings, "hybrid", given)
-    if not n_inputs:
-        s = replace(s, nu=0, nk=1)
-    if not s.ny and not s.nu:
-        raise EstimationError("hybrid: ny and nu are both 0; nothing is left to predict from. Raise one of them")
-    if s.innovations == "network" and 0 in (s.ne, s.neurons):
-        raise EstimationError(
-            "hybrid: innovations = network puts past innovations into the units, and ne or neurons is 0. Raise it, or "
-            "say innovations = linear"
-        )
-    return s
-
-
 @dataclass(slots=True, kw_only=True)
-class _Work(Draft):
-    """A draft with what is known of its polynomial."""
+class _Hybrid(Draft):
+    """A draft whose function is a hybrid one."""
 
-    n_candidates: int = 0  # terms that the polynomial's were chosen from
-    # error reduction ratios in the choice of the polynomial's terms
-    err: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    tried: tuple[Tried, ...] = ()
-    # terms of the polynomial that pay only beside the network, and that it made superfluous
-    added: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
-    drawn_in: float = 1.0  # by what the roots of the first C were multiplied to make it invertible
+    err: Mapping[tuple[str, str], float]  # error reduction ratios in the choice of the polynomial, by output and term
 
     @property
     def model(self) -> HybridFunction:
@@ -146,19 +80,19 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     timing = {"polynomial": perf_counter() - began}
     if not isinstance(first.model, LaggedModel):
         return failed_fit("hybrid", records, asdict(s), seed, first.reason, timing)
-    work = _polynomial(s, first, first.model)
-    work.timing_s.update(timing)
+    draft = _polynomial(s, first, first.model)
+    draft.timing_s.update(timing)
     interrupted = any(w.startswith("interrupted") for w in first.warnings)
 
     def identify() -> None:
         if interrupted:
             raise KeyboardInterrupt
-        _identify(s, data, work, seed, ticks[1:])
-        if work.status == "stalled":
-            work.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+        _identify(s, data, draft, seed, ticks[1:])
+        if draft.status == "stalled":
+            draft.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
 
-    failed = guarded(identify, work, lambda why: failed_fit("hybrid", records, asdict(s), seed, why, work.timing_s))
-    return failed or _finish(s, records, data, work, seed)
+    failed = guarded(identify, draft, lambda why: failed_fit("hybrid", records, asdict(s), seed, why, draft.timing_s))
+    return failed or _finish(s, records, data, draft, seed)
 
 
 def _costs(s: HybridSettings) -> tuple[float, ...]:
@@ -167,7 +101,7 @@ def _costs(s: HybridSettings) -> tuple[float, ...]:
     return 3.0, 1.0, 100.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
 
 
-def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _Work:
+def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _Hybrid:
     """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
     assert isinstance(model.function, PolynomialFunction)
     terms = tuple(tuple(x for x in one if not is_noisy(x)) for one in model.function.numerators)
@@ -179,58 +113,52 @@ def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _
     known = dict(zip(model.names, model.scaled_theta, strict=True))
     start = np.array([known.get(name, 0.0) for name in function.names], dtype=np.float64)
     theta, factor = make_invertible(function, start)
-    found = first.details.get("candidates", 0)
-    return _Work(
+    chosen: Any = first.details["terms"]
+    return _Hybrid(
         function=function,
         theta=theta,
-        n_candidates=found if isinstance(found, int) else 0,
-        err=_ratios(first.details.get("terms")),
+        err={(out, x["term"]): x["err"] for out, own in chosen.items() for x in own},
         curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
-        drawn_in=factor,
-    )
+        details={
+            "candidates": first.details["candidates"], "added_beside_the_network": [],
+            "left_out_beside_the_network": [], "tried": [], "drawn_in": factor,
+        },
+    )  # fmt: skip
 
 
-def _ratios(terms: object) -> dict[tuple[str, str], float]:
-    """Error reduction ratios by output and term, from the details of the polynomial's fit."""
-    if not isinstance(terms, Mapping):
-        return {}
-    return {(out, x["term"]): x["err"] for out, one in terms.items() for x in one if x["err"] is not None}
-
-
-def _identify(s: HybridSettings, data: Scaled, work: _Work, seed: int, ticks: list[Tick | None]) -> None:
+def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks: list[Tick | None]) -> None:
     began = perf_counter()
-    lean = _lean(work.model)
-    work.function = lean
-    _search(s, data, work, "polynomial and noise model", ticks[0])
-    full, start = _prepare(s, lean, work.theta)
+    lean = _lean(draft.model)
+    draft.function = lean
+    _search(s, data, draft, "polynomial and noise model", ticks[0])
+    full, start = _prepare(s, lean, draft.theta)
     neurons = s.neurons
     if neurons is None:
-        neurons, work.tried = choose_neurons(full, start, data.parts, s.prior, s.held_out, seed, ticks[1])
+        neurons, tried = choose_neurons(s, full, start, data.parts, seed, ticks[1])
+        draft.details["tried"] = tried
         if not neurons:
-            why = (
-                "predicts held-out data as well as with a network" if work.tried else "is all that so few samples carry"
-            )
-            work.warnings.append(f"the polynomial alone {why}: no neurons were added")
-    began = work.timed("choice of neurons", began)
+            why = "predicts held-out data as well as with a network" if tried else "is all that so few samples carry"
+            draft.warnings.append(f"the polynomial alone {why}: no neurons were added")
+    began = draft.timed("choice of neurons", began)
     if neurons:
         function = replace(full, neurons=neurons)
-        theta, found, alone = train_network(function, start, data.parts, s.prior, s.starts, seed, ticks[2])
-        work.take(function, theta)
-        work.note(found, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
-        problem = _search(s, data, work, "all together", ticks[3])
+        theta, found, alone = train_network(s, function, start, data.parts, seed, ticks[2])
+        draft.take(function, theta)
+        draft.note(found, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
+        problem = _search(s, data, draft, "all together", ticks[3])
         if s.pruning == "prediction":
-            candidates = Candidates(terms=_candidates(s, full), criterion=s.criterion, prior=s.prior)
-            revise(problem.at(work.theta), work.theta, candidates, work.take, ticks[4])
-            old, new = (x.names[: x.n_terms] for x in (lean, work.model))
-            work.added, work.dropped = (tuple(x for x in a if x not in b) for a, b in ((new, old), (old, new)))
+            revise(s, problem.at(draft.theta), draft.theta, draft.take, ticks[4])
+            old, new = (x.names[: x.n_terms] for x in (lean, draft.model))
+            draft.details["added_beside_the_network"] = [x for x in new if x not in old]
+            draft.details["left_out_beside_the_network"] = [x for x in old if x not in new]
     if s.ne is None:
-        problem = hybrid_problem(work.model, data.parts, work.theta, s.prior)
-        work.take(*choose_noise(problem, work.theta, s.prior, s.criterion, ticks[5]))
+        problem = hybrid_problem(draft.model, data.parts, draft.theta, s.prior)
+        draft.take(*choose_noise(problem, draft.theta, s.prior, s.criterion, ticks[5]))
         if not neurons:
-            function = _lean(work.model)
-            work.take(function, transfer(work.model, work.theta, function))
-    _search(s, data, work, "all together", ticks[6])
-    work.timed("all together", began)
+            function = _lean(draft.model)
+            draft.take(function, transfer(draft.model, draft.theta, function))
+    _search(s, data, draft, "all together", ticks[6])
+    draft.timed("all together", began)
 
 
 def _prepare(s: HybridSettings, lean: HybridFunction, theta: Array) -> tuple[HybridFunction, Array]:
@@ -243,12 +171,6 @@ def _prepare(s: HybridSettings, lean: HybridFunction, theta: Array) -> tuple[Hyb
     return function, transfer(lean, theta, function)
 
 
-def _candidates(s: HybridSettings, function: HybridFunction) -> tuple[Term, ...]:
-    """What the terms of the polynomial are chosen from."""
-    factors = lagged(function.p, function.m, ny=s.ny, nu=s.nu, nk=s.nk, ne=0)
-    return products(factors, s.degree, constant=bool(s.constant))
-
-
 def _lean(function: HybridFunction) -> HybridFunction:
     """Without neurons, no more lags than the polynomial looks at: a model of as little past as there can be."""
     reach = {"y": 0, "u": 0}
@@ -257,56 +179,56 @@ def _lean(function: HybridFunction) -> HybridFunction:
     return replace(function, ny=reach["y"], nu=reach["u"]) if any(reach.values()) else function
 
 
-def _search(s: HybridSettings, data: Scaled, work: _Work, stage: str, tick: Tick | None) -> LaggedProblem:
+def _search(s: HybridSettings, data: Scaled, draft: _Hybrid, stage: str, tick: Tick | None) -> LaggedProblem:
     """Search for all numbers, errors of unit variance."""
-    function = work.model
-    problem = hybrid_problem(function, data.parts, work.theta, s.prior)
+    function = draft.model
+    problem = hybrid_problem(function, data.parts, draft.theta, s.prior)
     if tick is not None:
         tick(stage, 0.0)
     found = search(
         problem,
-        work.theta,
+        draft.theta,
         stage=stage,
         most=s.iterations,
         tolerance=1e-8 if function.neurons else 1e-10,
         enough=_ENOUGH if function.neurons else 0.0,
         damping=1e-4,
         tick=tick,
-        keep=partial(work.take, function),
+        keep=partial(draft.take, function),
     )
-    work.take(function, found.theta)
-    work.note(found, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
-    work.status = "converged" if found.converged else "stalled"
+    draft.take(function, found.theta)
+    draft.note(found, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
+    draft.status = "converged" if found.converged else "stalled"
     return problem
 
 
-def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, work: _Work, seed: int) -> NonlinearFit:
-    of = work.model
+def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _Hybrid, seed: int) -> NonlinearFit:
+    of = draft.model
     used = {**asdict(s), "ne": of.ne, "neurons": of.neurons}
-    problem = hybrid_problem(of, data.parts, work.theta, s.prior)
-    if not np.isfinite(problem.cost(work.theta)):
-        return failed_fit("hybrid", records, used, seed, _DIVERGED, work.timing_s)
-    found = laplace(problem, work.theta)
+    problem = hybrid_problem(of, data.parts, draft.theta, s.prior)
+    if not np.isfinite(problem.cost(draft.theta)):
+        return failed_fit("hybrid", records, used, seed, _DIVERGED, draft.timing_s)
+    found = laplace(problem, draft.theta)
     if s.ne == 0 and records[0].n_inputs and not all(x.open_loop for x in records):
-        work.warnings.append(
+        draft.warnings.append(
             "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: raise "
             "ne, or say --open-loop if there was no feedback"
         )
-    work.warnings += [*cautions(work, problem, found, "neurons or terms"), *_cautions(work, found)]
-    covariance, spare = found.covariance, _spare_units(of, work.theta, problem, found)
+    draft.warnings += [*cautions(draft, problem, found, "neurons or terms"), *_cautions(draft, found)]
+    covariance, spare = found.covariance, _spare_units(of, draft.theta, problem, found)
     if covariance is None:
-        work.warnings.append(
+        draft.warnings.append(
             "no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons"
         )
     elif spare:
         covariance = None
-        work.warnings.append(
+        draft.warnings.append(
             f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and "
             f"intervals beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
         )
-    work.details = _details(records, data, work, problem)
+    draft.details |= _details(records, data, draft, problem)
     return finish(
-        "hybrid", records, used, data, work, problem, found, covariance=covariance, origin="laplace", seed=seed
+        "hybrid", records, used, data, draft, problem, found, covariance=covariance, origin="laplace", seed=seed
     )
 
 
@@ -329,9 +251,9 @@ def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found
     return spare
 
 
-def _cautions(work: _Work, found: Laplace) -> list[str]:
-    of, out = work.model, []
-    radius = of.noise_radius(work.theta)
+def _cautions(draft: _Hybrid, found: Laplace) -> list[str]:
+    of, out = draft.model, []
+    radius = of.noise_radius(draft.theta)
     if not of.deep and radius > _NEAR:
         out.append(
             f"C has a root at {radius:.4g}, nearly on the unit circle, where the search must not cross: its standard "
@@ -349,28 +271,24 @@ def _cautions(work: _Work, found: Laplace) -> list[str]:
     return out
 
 
-def _details(records: Sequence[IOData], data: Scaled, work: _Work, problem: LaggedProblem) -> dict[str, object]:
-    of, y_all = work.model, np.concatenate([y for y, _ in data.parts])
+def _details(records: Sequence[IOData], data: Scaled, draft: _Hybrid, problem: LaggedProblem) -> dict[str, object]:
+    of, y_all = draft.model, np.concatenate([y for y, _ in data.parts])
     terms: dict[str, list[dict[str, object]]] = {}
     for o, out in enumerate(records[0].outputs):
         named = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
-        terms[out] = [{"term": x, "err": work.err.get((out, x))} for x in named]
-    layer, own = of.blocks[2], of.split(work.theta)[2]
+        terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in named]
+    layer, own = of.blocks[2], of.split(draft.theta)[2]
     assert isinstance(layer, Tanh)
-    rows = [of.predict(work.theta, r)[1] for r in problem.rows()]
+    rows = [of.predict(draft.theta, r)[1] for r in problem.rows()]
     hidden = np.concatenate([layer.values(own, r.prepared[2]) for r in rows])
-    by_network = np.std(hidden, axis=0) / np.maximum(np.std(y_all, axis=0), 1e-300)
+    by_netdraft = np.std(hidden, axis=0) / np.maximum(np.std(y_all, axis=0), 1e-300)
     return {
         "terms": terms,
-        "candidates": work.n_candidates,
-        "added_beside_the_network": list(work.added),
-        "left_out_beside_the_network": list(work.dropped),
-        "network_share": dict(zip(records[0].outputs, by_network.tolist(), strict=True)),
+        "network_share": dict(zip(records[0].outputs, by_netdraft.tolist(), strict=True)),
         "noise_model": {
-            "largest_root": of.noise_radius(work.theta),
-            "coefficients": work.theta[of.n_terms : of.n_linear].tolist(),
-            "start_drawn_in_by": work.drawn_in,
+            "largest_root": of.noise_radius(draft.theta),
+            "coefficients": draft.theta[of.n_terms : of.n_linear].tolist(),
+            "start_drawn_in_by": draft.details.pop("drawn_in"),
         },
-        "tried": [{"neurons": x.neurons, "held_out_rms": x.held_out} for x in work.tried],
         "levels": data.levels(records[0]),
     }

@@ -28,6 +28,7 @@ from ambid.nonlinear.records import Parts, Scaled
 _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled
 _APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
+_DEPENDENT = 1e-10  # squared length left of a column that others hold already
 _CROWDED = 0.8  # part of the errors that numbers may take up
 
 
@@ -218,6 +219,19 @@ def whitening(noise: Array) -> Array:
     np.fill_diagonal(alike, 1.0)
     out: Array = np.linalg.inv(np.linalg.cholesky(alike)) / size
     return out
+
+
+def column_gains(R: Array, inside: Mask) -> Array:
+    """Return what each column outside explains of the last one, made orthogonal to those inside first.
+
+    `R` is the triangle of columns and errors; 0 where nothing is left of a column.
+    """
+    Q, left = np.linalg.qr(R[:, :-1][:, inside])[0], R[:, :-1][:, ~inside]
+    size, rest = np.sum(left**2, axis=0), R[:, -1] - Q @ (Q.T @ R[:, -1])
+    left = left - Q @ (Q.T @ left)
+    squared = np.sum(left**2, axis=0)
+    live = squared > _DEPENDENT * size
+    return np.asarray(np.where(live, (left.T @ rest) ** 2 / np.where(live, squared, 1.0), 0.0))
 
 
 def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:

@@ -33,7 +33,7 @@ from ambid.estimation.criteria import CRITERIA, information, penalty
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
-from ambid.nonlinear.lagged_problem import LaggedProblem, plain_problem
+from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, plain_problem
 from ambid.nonlinear.nn_magnitude import pole_grid
 from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term, lagged, products
 from ambid.nonlinear.records import Parts
@@ -484,11 +484,7 @@ def _promising(found: Choice, terms: tuple[Term, ...], parts: Parts) -> list[Ter
     R, k = wide.problem(parts, free=True).triangle(wide.theta), len(inside)
     if not outside or not np.all(np.isfinite(R)):
         return []
-    Q = np.linalg.qr(R[:, :k])[0]
-    rest, left = R[:, -1] - Q @ (Q.T @ R[:, -1]), R[:, k:-1] - Q @ (Q.T @ R[:, k:-1])
-    squared = np.sum(left**2, axis=0)
-    live = squared > 1e-12 * np.sum(R[:, k:-1] ** 2, axis=0)
-    ratio = np.where(live, (left.T @ rest) ** 2 / np.where(live, squared, 1.0), -1.0)
+    ratio = column_gains(R, np.arange(wide.theta.size) < k)
     return [outside[int(i)] for i in np.argsort(-ratio, kind="stable") if ratio[i] > 0]
 
 
