@@ -10,7 +10,7 @@ nothing came before: all residuals count, and there are neither impulses nor a c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -90,6 +90,24 @@ class Layout:
         theta = np.zeros(self.n_theta)
         for (letter, _), place in self.places.items():
             theta[place.start] = float(letter != "B")
+        return theta
+
+    def coefficients(
+        self,
+        A: Array | None = None,
+        B: Sequence[Array] = (),
+        C: Array | None = None,
+        D: Array | None = None,
+        F: Sequence[Array] = (),
+    ) -> Array:
+        """Return the coefficients of polynomials; what is not given is 1, B zero."""
+        theta = self.start()
+        for letter, p in (("A", A), ("C", C), ("D", D)):
+            if p is not None:
+                theta[self.places[letter, None]] = p
+        for letter, several in (("B", B), ("F", F)):
+            for i, p in enumerate(several):
+                theta[self.places[letter, i]] = p
         return theta
 
     def polynomials(self, theta: Array) -> Polynomials:

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ambid.arrays import Array
@@ -30,6 +29,7 @@ from ambid.blackbox.polynomial_predictor import (
 from ambid.blackbox.polynomial_search import BLIND, LARGEST_DELAY, SMOOTH, Minimum, search, starts
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.roots import root_derivative, roots_at, roots_of
+from ambid.estimation.linear import directions
 
 _LEAST_SEEN = 1e-14  # singular value, of scaled columns, that stands for a direction not seen at all
 _FAR = 10.0  # standard deviations of y: an offset beyond is put on the input
@@ -65,7 +65,7 @@ def polynomial_fit(
         warnings.append(f"the delay was looked for up to {LARGEST_DELAY} samples and may be longer: give nk")
     details: dict[str, object] = {
         "iterations": [f.iterations for f in fits],
-        "condition": [_condition(f) for f in fits],
+        "condition": [min(f.directions.condition, 1e300) for f in fits],
     }
     if scaled.at_rest:
         details["at_rest"] = True
@@ -86,40 +86,19 @@ def polynomial_fit(
     )
 
 
-def _condition(fit: Minimum) -> float:
-    """Condition number of the gradients with columns of unit length."""
-    s = fit.directions[1]
-    if not s.size:
-        return 1.0
-    return float(min(s[0] / max(s[-1], 1e-300), 1e300))
-
-
-def _inverse(R: Array) -> Array:
-    """R^-1, with a huge but finite inverse along directions that the data do not see."""
-    scale, U, s, Vt = _singular(R)
-    return np.asarray((Vt.T / s) @ U.T / scale[:, None])
-
-
 def _spread(fit: Minimum, variance: float) -> Array:
     """Covariance; as large as the coefficients themselves along directions that the data do not see."""
-    _, s, Vt, scale = fit.directions
-    s = np.maximum(s, _LEAST_SEEN * max(float(s[0]) if s.size else 1.0, 1e-150))
-    directions = Vt.T / scale[:, None]
-    length = np.sqrt(variance) / s
+    s, sides = fit.directions.s, fit.directions.root(_LEAST_SEEN) * np.sqrt(variance)
     blind = s * BLIND < (s[0] if s.size else 0.0)
     if blind.any():
-        whole = max(1.0, float(np.linalg.norm(fit.theta[fit.free])))
-        length[blind] = np.maximum(length[blind], whole / np.linalg.norm(directions[:, blind], axis=0))
-    sides = directions * length
+        whole, length = max(1.0, float(np.linalg.norm(fit.theta[fit.free]))), np.linalg.norm(sides[:, blind], axis=0)
+        sides[:, blind] *= np.maximum(whole / length, 1.0)
     return np.asarray(sides @ sides.T)
 
 
-def _singular(R: Array) -> tuple[Array, Array, Array, Array]:
-    """Column lengths of R, and singular values and directions of R with unit columns."""
-    scale = np.maximum(np.linalg.norm(R, axis=0), 1e-150)
-    U, s, Vt = np.linalg.svd(R / scale)
-    s = np.maximum(s, _LEAST_SEEN * max(float(s[0]) if s.size else 1.0, 1e-150))
-    return scale, U, s, Vt
+def _inverse(R: Array) -> Array:
+    """R^-1, zero along directions that the data do not see."""
+    return directions(R).solve(np.eye(R.shape[0]))
 
 
 def _covariances(scaled: ScaledData, layouts: Sequence[Layout], fits: Sequence[Minimum]) -> tuple[Array, Array]:
@@ -194,10 +173,7 @@ def _offsets(scaled: ScaledData, layouts: Sequence[Layout], fits: Sequence[Minim
     return Offsets(u=scaled.u_mean + scaled.u_scale * u, y=scaled.y_mean + scaled.y_scale * y)
 
 
-Complex = NDArray[np.complex128]
-
-_SDS = 2.0  # two roots nearer than so many standard deviations of their distance are not told apart
-_NEAR = 0.5  # roots farther apart do not cancel, however vague
+_SDS = 2.0  # standard deviations by which a root is surely inside the unit circle, or outside
 _OUTER = 0.9  # roots inside are not at the border, however vague
 
 
@@ -209,10 +185,7 @@ def cautions(model: PolynomialModel, covariance: Array, fits: Sequence[Minimum])
     found = []
     for o, fit in enumerate(fits):
         where = f"output {o}: " if len(fits) > 1 else ""
-        roots = _roots(model, o)
-        found += [where + x for x in _blind(model, o, fit)]
-        found += [where + x for x in _cancelling(roots, covariance)]
-        found += [where + x for x in _at_border(roots, covariance, fit)]
+        found += [where + x for x in (*_blind(model, o, fit), *_at_border(model, o, covariance, fit))]
     return found
 
 
@@ -228,12 +201,11 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
             continue
         roots = roots_of(theta)
         k = int(np.argmax(np.abs(roots)))
-        scale = np.maximum(np.linalg.norm(fit.triangle, axis=0), 1e-150)
         row = np.zeros(armax.n_theta, dtype=np.complex128)
         row[armax.places["A", None]] = root_derivative(theta, roots[k : k + 1])[0]
         slope = np.real(row * np.conj(roots[k]))[armax.free] / abs(roots[k])
         variance = fit.cost / max(fit.n_rows - fit.nuisance.size - armax.free.size, 1)
-        sd = np.sqrt(variance) * np.linalg.norm(np.linalg.lstsq((fit.triangle / scale).T, slope / scale, rcond=None)[0])
+        sd = np.sqrt(variance) * np.linalg.norm(slope @ fit.directions.root())
         if abs(roots[k]) > 1.0 + _SDS * sd:
             found.append(
                 f"output {o}: the plant looks unstable (armax finds a pole of magnitude {abs(roots[k]):.4g}, "
@@ -243,28 +215,8 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
     return found
 
 
-def _roots(model: PolynomialModel, o: int) -> dict[str, tuple[Complex, Complex]]:
-    """Roots of those polynomials of one output that have a partner or a border, with derivatives by all coefficients.
-
-    B is looked at beside F or A and C, A and D beside C alone; there may be hundreds of roots that need no look.
-    """
-    p, several, out = model.outputs[o], model.n_inputs > 1, {}
-    if p.C.size == 1 and all(f.size == 1 for f in p.F):
-        return {}
-    theta, noisy = model.theta, p.C.size > 1
-    for output, letter, i, place in model.blocks():
-        if output != o or not np.any(theta[place]):
-            continue
-        if letter in "AD" and not noisy:
-            continue
-        if letter == "B" and not (p.F[i or 0].size > 1 or (noisy and p.A.size > 1)):
-            continue
-        out[letter + (f".{i}" if several and i is not None else "")] = roots_at(theta, place)
-    return out
-
-
 def _blind(model: PolynomialModel, o: int, fit: Minimum) -> Iterator[str]:
-    _, s, Vt, _ = fit.directions
+    s, Vt = fit.directions.s, fit.directions.Vt
     if not s.size or s[-1] * BLIND >= s[0]:
         return
     names = [name for name, place in _free_names(model, o, fit)]
@@ -282,61 +234,24 @@ def _free_names(model: PolynomialModel, o: int, fit: Minimum) -> Iterator[tuple[
         yield model.names[places[int(k)]], places[int(k)]
 
 
-def _cancelling(roots: dict[str, tuple[Complex, Complex]], covariance: Array) -> Iterator[str]:
-    """Name roots that numerator and denominator share within their uncertainty."""
-    if not roots:
-        return
-    nothing = (np.empty(0, dtype=np.complex128), np.empty((0, covariance.shape[0]), dtype=np.complex128))
-    numerators = [x for x in roots if x.startswith("B")]
-    for b in numerators:
-        f = b.replace("B", "F")
-        for r in _common(roots[b], roots.get(f, nothing), covariance):
-            where = _root_text(r)
-            yield f"a zero of {b} and a pole of {f} near {where} cancel within their uncertainty. Lower nb and nf"
-    for r in _common(roots["C"], roots.get("D", nothing), covariance):
-        yield f"roots of C and D near {_root_text(r)} cancel within their uncertainty. Lower nc and nd"
-    if roots["C"][0].size and roots["A"][0].size:
-        shared = [_common(roots["A"], roots[x], covariance) for x in ("C", *numerators)]
-        for r in shared[0]:
-            if all(r in x for x in shared[1:]):
-                which = ", ".join(("A", *numerators, "C"))
-                yield f"roots of {which} near {_root_text(r)} cancel within their uncertainty. Lower the orders"
-
-
-def _common(p: tuple[Complex, Complex], q: tuple[Complex, Complex], covariance: Array) -> list[complex]:
-    """Roots of p (one of each conjugate pair) that are not told apart from some root of q."""
-    found = []
-    for r, dr in zip(*p, strict=True):
-        if r.imag < 0:
+def _at_border(model: PolynomialModel, o: int, covariance: Array, fit: Minimum) -> Iterator[str]:
+    """Name roots of C and F that are not surely inside the unit circle."""
+    theta, several = model.theta, model.n_inputs > 1
+    for output, letter, i, place in model.blocks():
+        if output != o or letter not in "CF" or place.stop - place.start < 2:
             continue
-        for s, ds in zip(*q, strict=True):
-            d = dr - ds
-            if np.all(np.isfinite(d)):
-                variance = float(np.real(d @ covariance @ np.conj(d)))
-                if abs(r - s) <= _NEAR and abs(r - s) ** 2 <= _SDS**2 * max(variance, 1e-24):
-                    found.append(complex(r))
-                    break
-    return found
-
-
-def _at_border(roots: dict[str, tuple[Complex, Complex]], covariance: Array, fit: Minimum) -> Iterator[str]:
-    for name, (values, rows) in roots.items():
-        if name[0] not in "CF" or not values.size:
-            continue
+        values, rows = roots_at(theta, place)
         k = int(np.argmax(np.abs(values)))
         r = values[k]
         slope = np.real(rows[k] * np.conj(r)) / max(abs(r), 1e-300)
         sd = np.sqrt(max(float(slope @ covariance @ slope), 0.0)) if np.all(np.isfinite(slope)) else 0.0
         if (abs(r) > _OUTER and abs(r) + _SDS * sd >= 1.0) or (fit.at_border and abs(r) > 0.999):
+            name = f"F.{i}" if letter == "F" and several else letter
             yield (
                 f"a root of {name} of magnitude {abs(r):.6g} (sd {sd:.1g}) is at the border of stability: its standard "
                 "deviation is not to be trusted. "
-                + ("Lower nc" if name[0] == "C" else "If the plant integrates or is unstable, use armax or arx")
+                + ("Lower nc" if letter == "C" else "If the plant integrates or is unstable, use armax or arx")
             )
-
-
-def _root_text(r: complex) -> str:
-    return f"{r.real:.3g}" if not r.imag else f"{r.real:.3g} ± {abs(r.imag):.3g}j"
 
 
 _LEVEL = 1e-3  # of records at rest, and of fits that found their minimum, so many are flagged

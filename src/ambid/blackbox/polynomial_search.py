@@ -27,14 +27,12 @@ from ambid.arrays import Array
 from ambid.blackbox.polynomial_predictor import Layout, Predictor, arx_layout, filter_signal, liveliest_part, predictor
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
-
-Directions = tuple[Array, Array, Array, Array]
+from ambid.estimation.linear import Directions, directions
 
 _ENOUGH = 1e-6  # squared length of the last step in standard deviations
 _NOTHING_LEFT = 1e-24  # squared residual over squared output where the data are matched to rounding
 _MOST = 100
 BLIND = 1e8  # condition number, columns of unit length, beyond which a direction counts as not seen
-_UNSEEN = 1e-11  # singular value, of scaled columns, below which no step is taken along a direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,7 +43,7 @@ class Minimum:
     free: NDArray[np.int64]  # (n_free,), places of the estimated ones
     nuisance: Array  # (n_nuisance,), initial states and constant
     triangle: Array  # (n_free, n_free), R of the free coefficients, nuisance taken out
-    directions: Directions  # U, s, Vt and column lengths: `triangle` with columns of unit length is U diag(s) Vt
+    directions: Directions  # of `triangle`
     cost: float  # squared residual
     n_rows: int
     converged: bool
@@ -103,11 +101,10 @@ def search(
         at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
     damping, converged, shortened, exact, count = 0.0, False, False, False, 1
     while True:
-        directions = _directions(at, n)
-        U, s, Vt, scale = _seen(*directions)
+        seen = directions(at.R[n:-1, n:-1])
         spread = max(at.rest / max(n_rows - n - free.size, 1), 1e-300)
-        left = float(np.sum((U.T @ at.gradient) ** 2))
-        step = _step(U, s, Vt, scale, at.gradient, 0.0)
+        left = seen.explain(at.gradient)
+        step = seen.solve(-at.gradient)
         if left <= _ENOUGH * spread or at.cost <= floor or _linear(predictor):
             theta = _moved(at.theta, free, step)
             if _linear(predictor) or stable_predictor(predictor.layout, theta):
@@ -118,8 +115,7 @@ def search(
             # where rounding allows no further descent and less than a hundredth of a standard deviation is left
             converged = damping > 1e12 and left <= 1e-4 * spread
             break
-        step = _step(U, s, Vt, scale, at.gradient, damping)
-        step, cut = _kept_stable(predictor, at.theta, free, step)
+        step, cut = _kept_stable(predictor, at.theta, free, seen.solve(-at.gradient, damping))
         trial = evaluated(_moved(at.theta, free, step), at.nuisance + _nuisance_step(at, step))
         count += 1
         if trial.cost < at.cost:  # not where it is no number
@@ -137,7 +133,7 @@ def search(
         free=free,
         nuisance=at.nuisance,
         triangle=at.R[n:-1, n:-1],
-        directions=directions,
+        directions=seen,
         cost=at.cost,
         n_rows=n_rows,
         converged=converged,
@@ -149,24 +145,6 @@ def search(
 def _linear(predictor: Predictor) -> bool:
     x = predictor.layout
     return not (x.nc or x.nd or any(x.nf))
-
-
-def _directions(at: _Point, n: int) -> Directions:
-    """Singular directions of the scaled triangle."""
-    R = at.R[n:-1, n:-1]
-    scale = np.maximum(np.sqrt(np.einsum("ij,ij->j", R, R)), 1e-150)
-    U, s, Vt = np.linalg.svd(R / scale)
-    return U, s, Vt, scale
-
-
-def _seen(U: Array, s: Array, Vt: Array, scale: Array) -> Directions:
-    """Those directions that the data see."""
-    seen = s > _UNSEEN * max(s[0] if s.size else 0.0, 1e-300)
-    return (U, s, Vt, scale) if seen.all() else (U[:, seen], s[seen], Vt[seen], scale)
-
-
-def _step(U: Array, s: Array, Vt: Array, scale: Array, gradient: Array, damping: float) -> Array:
-    return np.asarray(-(Vt.T @ ((s / (s * s + damping)) * (U.T @ gradient))) / scale)
 
 
 def _nuisance_step(at: _Point, step: Array) -> Array:
@@ -289,23 +267,12 @@ def _pieces(n: int, history: int, most_rows: int | None) -> Iterator[slice]:
         yield slice(int(first), int(first) + _CHUNK + history)
 
 
-def _set(theta: Array, layout: Layout, letter: str, i: int | None, values: Array) -> None:
-    theta[layout.places[letter, i]] = values
-
-
 def _least_squares(layout: Layout, y: Array, u: Array) -> Array:
     """A and B as if the noise went through 1/A; C = D = 1."""
-    na = max([layout.na, *layout.nf])
-    arx = arx_layout(na, layout.nb, layout.nk, at_rest=layout.at_rest)
-    found = arx_coefficients(arx, y, u)
-    theta = layout.start()
-    for i in range(layout.n_inputs):
-        _set(theta, layout, "B", i, found[arx.places["B", i]])
-        if layout.nf[i]:
-            _set(theta, layout, "F", i, reflect(found[arx.places["A", None]][: layout.nf[i] + 1]))
-    if layout.na:
-        _set(theta, layout, "A", None, found[arx.places["A", None]])
-    return theta
+    arx = arx_layout(max([layout.na, *layout.nf]), layout.nb, layout.nk, at_rest=layout.at_rest)
+    found = arx.polynomials(arx_coefficients(arx, y, u))
+    F = [reflect(found.A[: n + 1]) for n in layout.nf]
+    return layout.coefficients(A=found.A[: layout.na + 1], B=found.B, F=F)
 
 
 def _long_order(layout: Layout, n_samples: int) -> int:
@@ -316,9 +283,9 @@ def _long_order(layout: Layout, n_samples: int) -> int:
 def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
     n = _long_order(layout, y.size)
     arx = arx_layout(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
-    found, R = _regression(arx, y, u, _ROWS)
-    Q = tuple(found[arx.places["B", i]] for i in range(layout.n_inputs))
-    return LongModel(P=found[arx.places["A", None]], Q=Q, nk=layout.nk, triangle=R)
+    theta, R = _regression(arx, y, u, _ROWS)
+    found = arx.polynomials(theta)
+    return LongModel(P=found.A, Q=found.B, nk=layout.nk, triangle=R)
 
 
 def reduce_long_model(long: LongModel, inputs: Sequence[int], nb: Sequence[int], nf: int) -> tuple[list[Array], Array]:
@@ -381,15 +348,9 @@ def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     """ARMAX and ARMA: the long model's innovations as one more input."""
     e = _long_innovations(layout, y, u)
     arx = arx_layout(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
-    found = arx_coefficients(arx, y, np.vstack([u, e]))
-    theta = layout.start()
-    if layout.na:
-        _set(theta, layout, "A", None, found[arx.places["A", None]])
-    for i in range(layout.n_inputs):
-        _set(theta, layout, "B", i, found[arx.places["B", i]])
-    c = found[arx.places["B", layout.n_inputs]]
-    _set(theta, layout, "C", None, reflect(np.concatenate([[1.0], c[1:]])))
-    yield theta
+    found = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
+    C = reflect(np.concatenate([[1.0], found.B[-1][1:]]))
+    yield layout.coefficients(A=found.A, B=found.B[:-1], C=C)
 
 
 def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
@@ -397,29 +358,20 @@ def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
     n = max(1, min(10 + 2 * (layout.nc + layout.nd), v.size // 8))
     u = np.empty((0, v.size))
     long = arx_layout(n, (), ())
-    e = filter_signal(_regression(long, v, u, _ROWS)[0][long.places["A", None]], np.ones(1), v)
+    e = filter_signal(long.polynomials(_regression(long, v, u, _ROWS)[0]).A, np.ones(1), v)
     nb = (layout.nc,) if layout.nc else ()
     arx = arx_layout(layout.nd, nb, (1,) * len(nb))
-    found = arx_coefficients(arx, v, e[None, :] if nb else u)
-    D = found[arx.places["A", None]]
-    C = np.concatenate([[1.0], found[arx.places["B", 0]][1:]]) if nb else np.ones(1)
-    return reflect(C), reflect(D)
+    found = arx.polynomials(arx_coefficients(arx, v, e[None, :] if nb else u))
+    return reflect(np.concatenate([[1.0], *(b[1:] for b in found.B)])), reflect(found.A)
 
 
 def _generalised(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     """ARARX and ARARMAX: the plant from the long model, as output error or by least squares, then its residual."""
-    theta = layout.start()
     B, A = reduce_long_model(_long_model(layout, y, u), range(layout.n_inputs), layout.nb, layout.na)
-    _set(theta, layout, "A", None, A)
-    for i, b in enumerate(B):
-        _set(theta, layout, "B", i, b)
-    plants = [theta, _least_squares(layout, y, u)]
+    plants = [layout.coefficients(A=A, B=B), _least_squares(layout, y, u)]
     if layout.n_inputs == 1 and layout.na:
         b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.na, layout.nk[0], at_rest=layout.at_rest)
-        theta = layout.start()
-        _set(theta, layout, "A", None, f)
-        _set(theta, layout, "B", 0, b)
-        plants.insert(1, theta)
+        plants.insert(1, layout.coefficients(A=f, B=[b]))
     for plant in plants:
         _set_noise(plant, layout, y, u)
         yield plant
@@ -428,13 +380,11 @@ def _generalised(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
 def _set_noise(theta: Array, layout: Layout, y: Array, u: Array) -> None:
     if not layout.nc and not layout.nd:
         return
-    places = layout.places
-    v = filter_signal(theta[places["A", None]], np.ones(1), y)
-    for i, x in enumerate(u):
-        v -= filter_signal(theta[places["B", i]], theta[places["F", i]], x)
-    C, D = _noise(layout, v - np.mean(v))
-    _set(theta, layout, "C", None, C)
-    _set(theta, layout, "D", None, D)
+    plant, places = layout.polynomials(theta), layout.places
+    v = filter_signal(plant.A, np.ones(1), y)
+    for b, f, x in zip(plant.B, plant.F, u, strict=True):
+        v -= filter_signal(b, f, x)
+    theta[places["C", None]], theta[places["D", None]] = _noise(layout, v - np.mean(v))
 
 
 def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
@@ -447,11 +397,8 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         yield theta
     if coloured:  # the plant searched for with white noise, then the noise
         white = Layout(na=0, nb=layout.nb, nc=0, nd=0, nf=layout.nf, nk=layout.nk, at_rest=layout.at_rest)
-        found = search(predictor(white), y, u, ways[0](white, y, u), most=15).theta
-        theta = layout.start()
-        for i in range(layout.n_inputs):
-            _set(theta, layout, "B", i, found[white.places["B", i]])
-            _set(theta, layout, "F", i, found[white.places["F", i]])
+        found = white.polynomials(search(predictor(white), y, u, ways[0](white, y, u), most=15).theta)
+        theta = layout.coefficients(B=found.B, F=found.F)
         _set_noise(theta, layout, y, u)
         yield theta
 
@@ -472,20 +419,14 @@ def weighted_starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
 
 
 def _from_data(layout: Layout, y: Array, u: Array) -> Array:
-    theta = layout.start()
     b, f = steiglitz_mcbride(y, u[0], layout.nb[0], layout.nf[0], layout.nk[0], at_rest=layout.at_rest)
-    _set(theta, layout, "B", 0, b)
-    _set(theta, layout, "F", 0, f)
-    return theta
+    return layout.coefficients(B=[b], F=[f])
 
 
 def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
-    long, theta = _long_model(layout, y, u), layout.start()
-    for i in range(layout.n_inputs):
-        (b,), f = reduce_long_model(long, [i], [layout.nb[i]], layout.nf[i])
-        _set(theta, layout, "B", i, b)
-        _set(theta, layout, "F", i, reflect(f, 0.999))
-    return theta
+    long = _long_model(layout, y, u)
+    found = [reduce_long_model(long, [i], [layout.nb[i]], layout.nf[i]) for i in range(layout.n_inputs)]
+    return layout.coefficients(B=[b for (b,), _ in found], F=[reflect(f, 0.999) for _, f in found])
 
 
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest: bool = False) -> tuple[Array, Array]:
@@ -551,10 +492,8 @@ def _given(layout: Layout, C: Array, D: Array, y: Array, u: Array) -> tuple[floa
     fu = np.array([filter_signal(D, C, x) for x in u]).reshape(u.shape)
     R = p.triangle(filter_signal(D, C, y), fu, found, np.zeros(p.n_nuisance))
     found[arx.free] -= solve_triangle(R[:-1, :-1], R[:-1, -1])[p.n_nuisance :]
-    theta, places = layout.start(), layout.places
-    for letter, i in places:
-        theta[places[letter, i]] = {"C": C, "D": D}.get(letter, found[arx.places[letter, i]])
-    return float(R[-1, -1] ** 2), theta
+    plant = arx.polynomials(found)
+    return float(R[-1, -1] ** 2), layout.coefficients(A=plant.A, B=plant.B, C=C, D=D, F=plant.F)
 
 
 LARGEST_DELAY = 20  # samples

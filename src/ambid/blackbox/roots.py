@@ -9,16 +9,18 @@ from ambid.arrays import Array
 
 Complex = NDArray[np.complex128]
 
+_ROUNDING = 1e-13
+
 
 def stable(p: Array) -> bool:
-    """Return whether all roots in z are inside the unit circle.
+    """Return whether all roots in z are inside the unit circle, by more than rounding may move them out again.
 
     `p`: (n + 1,), coefficients of q^0, q^-1, ..., the first is 1.
     """
     c = [float(x) for x in p]
     while len(c) > 1:
         k = c[-1]
-        if not abs(k) < 1.0:
+        if not abs(k) < 1.0 - _ROUNDING:
             return False
         rest = 1.0 - k * k
         c = [(a - k * b) / rest for a, b in zip(c[:-1], c[:0:-1], strict=True)]
