@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.estimation.start import candidates, moments, regress
+from ambid.estimation.start import Regressors, candidates, moments
 from tests.bearing.benches import run
 
 
@@ -46,7 +46,7 @@ def test_ordinary_least_squares_is_exact_without_noise():
     a, b = (rng.standard_normal(50) + 1j * rng.standard_normal(50) for _ in range(2))
     y = 2.5 * a - 0.3 * b
     one = np.ones(50)
-    got = regress([("", 0 * one, y), ("a", one, a), ("b", one, b)], one, {})
+    got = Regressors([("a", one, a), ("b", one, b)], one, {}).regress(("", 0 * one, y))
     np.testing.assert_allclose(got, [2.5, -0.3], rtol=1e-12)
 
 
@@ -55,13 +55,14 @@ def test_errors_in_variables_have_no_bias():
     clean = rng.standard_normal(n) + 1j * rng.standard_normal(n)
     noise = [0.5 * (rng.standard_normal(n) + 1j * rng.standard_normal(n)) for _ in range(2)]
     one = np.ones(n)
-    terms = [("y", one, 2.0 * clean + noise[0]), ("x", one, clean + noise[1])]
-    assert regress(terms, one, {})[0] == pytest.approx(2.0 / 1.25, rel=0.02)  # attenuated
-    assert regress(terms, one, {"x": 0.5, "y": 0.5})[0] == pytest.approx(2.0, rel=0.02)
+
+    def regress(levels):
+        return Regressors([("x", one, clean + noise[1])], one, levels).regress(("y", one, 2.0 * clean + noise[0]))
+
+    assert regress({})[0] == pytest.approx(2.0 / 1.25, rel=0.02)  # attenuated
+    assert regress({"x": 0.5, "y": 0.5})[0] == pytest.approx(2.0, rel=0.02)
     # only ratios of the levels matter
-    np.testing.assert_allclose(
-        regress(terms, one, {"x": 5.0, "y": 5.0}), regress(terms, one, {"x": 0.5, "y": 0.5}), rtol=1e-6
-    )
+    np.testing.assert_allclose(regress({"x": 5.0, "y": 5.0}), regress({"x": 0.5, "y": 0.5}), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_some_band_is_near_the_truth(name, known):
     m = moments(columns, bench.model.inputs, bench.signals.rate_hz)
     noise = dict(zip(bench.model.outputs, bench.sensor, strict=True))
     given = {k: bench.truth[k] for k in known}
-    found = list(candidates(bench.model.name, m, noise, bench.delay, bench.signals.rate_hz, given))
+    found = [v for _, v in candidates(bench.model.name, m, noise, [bench.delay], bench.signals.rate_hz, given)]
     assert len(found) == 8
     assert all(set(f) == set(bench.truth) for f in found)
     assert all(f[k] == given[k] for f in found for k in known)
@@ -92,7 +93,7 @@ def test_start_values_take_the_delay_into_account():
     bench = run("coil", 8000, 6, delay=3.0)
     columns = {"voltage": bench.signals.u[:, 0], "current": bench.signals.y[:, 0] - bench.signals.y.mean()}
     m = moments(columns, ("voltage",), bench.signals.rate_hz)
-    right, wrong = (list(candidates("coil", m, {}, d, bench.signals.rate_hz, {}))[6] for d in (3.0, 0.0))
+    (_, right), (_, wrong) = list(candidates("coil", m, {}, (3.0, 0.0), bench.signals.rate_hz, {}))[12:14]
     assert right["L"] == pytest.approx(bench.truth["L"], rel=0.05)
     # up to 125 Hz a delay d looks like an inductance R d
     assert wrong["L"] == pytest.approx(bench.truth["L"] + bench.truth["R"] * 3e-4, rel=0.05)

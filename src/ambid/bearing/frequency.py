@@ -115,7 +115,8 @@ def start_values(
     if set(model.outputs) - set(signals):
         return
     moments = weak_form.Moments(omega=omega, signals=signals)
-    yield from weak_form.candidates(model.name, moments, noise, delay, 1.0 / ln.dt, known)
+    for _, values in weak_form.candidates(model.name, moments, noise, [delay], 1.0 / ln.dt, known):
+        yield values
 
 
 _FAR = 1e100  # standard deviations: worse than anything

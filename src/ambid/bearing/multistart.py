@@ -83,12 +83,18 @@ def starts(
             "excitation, or voltage, current and position are not what the rig says. Check columns and signs, or give "
             "start values"
         )
-    racers: list[Candidate] = []
+    racers = _unlike(scored)[:_RACE]
+    return sorted((raced(c, tick) for c in racers), key=lambda c: c.criterion) if len(racers) > 1 else racers
+
+
+def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
+    """Those of the best, which come first, that differ in more than their criterion says is chance."""
+    found: list[Candidate] = []
     for candidate in scored:
         close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
-        if close and not any(candidate.like(r) for r in racers):
-            racers.append(candidate)
-    return sorted((raced(c, tick) for c in racers[:_RACE]), key=lambda c: c.criterion)
+        if close and not any(candidate.like(r) for r in found):
+            found.append(candidate)
+    return found
 
 
 def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
@@ -117,12 +123,13 @@ def _scored(
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
     columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u, centred.y]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
-    coarse = _coarse(model, centred, parameters, moments, delays)
     found, work = [], None
-    for _, problem, values in sorted(coarse[:_KEPT], key=lambda c: c[1].delay):
+    kept = _unlike(_coarse(model, centred, parameters, moments, delays))[:_KEPT]
+    for candidate in sorted(kept, key=lambda c: c.problem.delay):
+        problem = replace(candidate.problem, u=centred.u, y=centred.y)
         work = Workspace(problem) if work is None else work.of(problem)
         for level in _LEVELS:
-            vector = _with_level(problem, _vector(problem, values), level)
+            vector = at_first_sample(problem, _with_level(problem, candidate.vector, level))
             value, _ = evaluate(problem, vector, work)
             if np.isfinite(value):
                 found.append(Candidate(criterion=value, problem=problem, vector=vector))
@@ -135,23 +142,25 @@ def _coarse(
     parameters: Sequence[Parameter],
     moments: weak_form.Moments,
     delays: Sequence[float],
-) -> list[tuple[float, PredictorProblem, dict[str, float]]]:
-    """Criterion on the busiest stretch, problem and start values of each band and delay, best first."""
-    stretch, floor, spread = busiest(centred.u, _STRETCH), noise_floor(centred.y), np.std(centred.u, axis=0)
+) -> list[Candidate]:
+    """Each band and delay on the busiest stretch, best first."""
+    floor, spread = noise_floor(centred.y), np.std(centred.u, axis=0)
+    stretch = busiest(centred.u, _STRETCH)
+    part = replace(centred, u=centred.u[stretch], y=centred.y[stretch])
     noise = dict(zip(model.outputs, floor.tolist(), strict=True))
-    found: list[tuple[float, PredictorProblem, dict[str, float]]] = []
-    motion: dict[tuple[float, bool], Array] = {}
+    from_data = list(
+        weak_form.candidates(model.name, moments, noise, delays, centred.rate_hz, fixed_values(parameters))
+    )
+    found: list[Candidate] = []
     for d in delays:
         work: Workspace | None = None
-        known = fixed_values(parameters)
-        from_data = weak_form.candidates(model.name, moments, noise, d, centred.rate_hz, known, motion)
-        for values, sizes in _possible(model, list(from_data), parameters):
+        for values, sizes in _possible(model, [v for own, v in from_data if own == d], parameters):
             scales = scales_for(model, values, spread, floor, centred.rate_hz)
-            problem = candidate_problem(model, centred, parameters, sizes, scales, d, int(max(delays)) + 2)
-            part = replace(problem, u=problem.u[stretch], y=problem.y[stretch])
-            work = work or Workspace(part)  # the scaled data are the same for all candidates of a delay
-            found.append((evaluate(part, _vector(part, values), work)[0], problem, values))
-    return sorted(found, key=lambda c: c[0])
+            problem = candidate_problem(model, part, parameters, sizes, scales, d, int(max(delays)) + 2)
+            vector = _vector(problem, values)
+            work = work or Workspace(problem)  # the scaled data are the same for all candidates of a delay
+            found.append(Candidate(criterion=evaluate(problem, vector, work)[0], problem=problem, vector=vector))
+    return sorted(found, key=lambda c: c.criterion)
 
 
 def fixed_values(parameters: Sequence[Parameter]) -> dict[str, float]:

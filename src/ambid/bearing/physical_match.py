@@ -192,7 +192,7 @@ def _possible(
 ) -> Iterator[dict[str, float]]:
     """Start values that make a plant: from the response, and with the values that were given."""
     for m in target.moments:
-        for values in candidates(model.name, m, {}, delay, 1.0 / target.period_s, fixed):
+        for _, values in candidates(model.name, m, {}, [delay], 1.0 / target.period_s, fixed):
             for trial in (values, {**values, **given}) if given != fixed else (values,):
                 finite = all(np.isfinite(v) for v in trial.values())
                 if finite and all(trial[p.name] > 0 for p in model.parameters if p.positive):

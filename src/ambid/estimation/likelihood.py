@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import BLIND, directions, least_squares, triangle_of
+from ambid.estimation.linear import BLIND, directions, triangle_of
 from ambid.estimation.problem import PredictorProblem
 from ambid.estimation.search import Status
 from ambid.estimation.sensitivity import Workspace, innovations, linearise
@@ -24,6 +24,7 @@ _NOTHING = 1e-12  # radius of the trust region below which no step is left
 _ROUNDING = 1e-15  # singular value, over the largest, below which there is nothing but rounding
 _SECULAR = 30  # Newton steps towards the damping that gives a step its length
 _SETTLED = 0.01  # Newton step of every physical parameter, in standard deviations, below which a search has converged
+_POOR = 0.1  # share of the squares that offsets and initial state would take off, above which they are set first
 _FLAT = 0.001  # fall of the criterion in one step below which a search has converged; a needless number earns one
 
 
@@ -162,18 +163,12 @@ def freed(fit: Fit, name: str) -> tuple[float, float]:
 
 
 def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:
-    """Return a copy with the offsets and the initial state that fit best; they enter linearly, so one solve finds
-    them.
+    """Return a copy with the offsets and the initial state that fit best.
 
     `vector`: (size,). Returns (size,), unchanged where there is no predictor at `vector`.
     """
-    _, covariance = evaluate(problem, vector, work)
-    at = None if covariance is None else linearise(problem, vector, weight_of(covariance), work)
-    if at is None:
-        return vector.copy()
-    out, linear = vector.copy(), slice(problem.slices["offset"].start, problem.size)
-    out[linear] -= least_squares(at.J[:, linear], at.r)
-    return out
+    at = _point(problem, vector, work)
+    return vector.copy() if at is None else at.with_linear_part()
 
 
 def _step_left(J: Array, r: Array, n_physical: int) -> float:
@@ -198,11 +193,13 @@ def search(
     problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor at `start`.
     """
     work = Workspace(problem) if work is None else work.of(problem)
-    at = _point(problem, with_linear_part(problem, start, work), work)
+    at = _point(problem, start, work)
+    if at is not None and at.linear_fall() > _POOR * float(at.r @ at.r):
+        at = _point(problem, at.with_linear_part(), work)
     if at is None:
         return _failed(problem, start)
     status: Status = "stalled"
-    region, fall = _Region(problem), np.inf
+    region, fall = _Region(), np.inf
     count = 1
     for _ in range(steps):
         step, promise = region.step(at)
@@ -246,6 +243,17 @@ class _Point:
     r: Array  # (n_rows,), weighted by the covariance here: the gradient of the criterion is 2 J^T r
     J: Array  # (n_rows, size)
     n_priors: int
+    linear: int  # from here on numbers enter linearly: offsets and initial state
+
+    def linear_fall(self) -> float:
+        """Return by how much the sum of squares falls where the numbers that enter linearly are set to their best."""
+        return directions(self.J[:, self.linear :]).explain(self.r)
+
+    def with_linear_part(self) -> Array:
+        """Return the vector with those set to their best; one solve finds them."""
+        out = self.vector.copy()
+        out[self.linear :] -= directions(self.J[:, self.linear :]).solve(self.r)
+        return out
 
     def fall(self, problem: PredictorProblem, vector: Array, covariance: Array | None) -> float:
         """Return by how much the sum of squares, weighted as here, falls to a vector with that covariance."""
@@ -276,6 +284,7 @@ def _point(
         r=np.concatenate([at.r, r]),
         J=np.vstack([at.J, J]),
         n_priors=r.size,
+        linear=problem.slices["offset"].start,
     )
 
 
@@ -286,14 +295,13 @@ class _Region:
     about the same length, whatever the data say of them. Offsets and initial state, which enter linearly, follow.
     """
 
-    def __init__(self, problem: PredictorProblem) -> None:
-        self.linear = problem.slices["offset"].start
+    def __init__(self) -> None:
         self.radius = 1.0
         self.length, self.bound = 0.0, False  # of the last step, and whether it was cut
 
     def step(self, at: _Point) -> tuple[Array, float]:
         """Return the best step inside the region, and the fall of the sum of squares that it promises."""
-        n = self.linear
+        n = at.linear
         easy = directions(at.J[:, n:])
         rows = np.column_stack([at.J[:, :n], at.r])
         rows = rows - easy.U @ (easy.U.T @ rows)

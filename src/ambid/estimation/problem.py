@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Literal
 
 import numpy as np
@@ -60,20 +61,13 @@ class PredictorProblem:
     # (n_states, n_outputs), predictor gain in scaled units, for noise "given"
     gain: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
+    slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
+
     def __post_init__(self) -> None:
         if self.skip < self.delay + 2 or self.y.shape[0] <= self.skip:
             raise ValueError(f"skip {self.skip} must exceed the delay {self.delay} by two and leave samples")
         if self.stride > 1 and self.noise == "levels":
             raise ValueError("a stride above 1 wants the noise as a gain")
-
-    @property
-    def n_physical(self) -> int:
-        """Number of estimated physical parameters."""
-        return len(self.estimated)
-
-    @property
-    def slices(self) -> dict[str, slice]:
-        """Places of the groups in the vector."""
         n, n_y, n_d = len(self.model.states), len(self.model.outputs), len(self.model.disturbances)
         sizes = {
             "physical": self.n_physical,
@@ -82,10 +76,13 @@ class PredictorProblem:
             "offset": n_d,
             "initial": n,
         }
-        edges = [0]
-        for size in sizes.values():
-            edges.append(edges[-1] + size)
-        return {name: slice(a, b) for name, a, b in zip(sizes, edges[:-1], edges[1:], strict=True)}
+        ends = list(accumulate(sizes.values(), initial=0))
+        object.__setattr__(self, "slices", {name: slice(*ends[j : j + 2]) for j, name in enumerate(sizes)})
+
+    @property
+    def n_physical(self) -> int:
+        """Number of estimated physical parameters."""
+        return len(self.estimated)
 
     @property
     def size(self) -> int:

@@ -129,7 +129,7 @@ def _stands_still(x: Array, starts: np.ndarray, lengths: np.ndarray, shortest: i
     """Runs too long for chance that are not the slow turning point of a quantised channel, nor rest without noise."""
     if starts.size == 1:
         return np.ones(1, dtype=bool)
-    if _without_noise(x):
+    if not np.any(lengths >= shortest) or _without_noise(x):
         return np.zeros(starts.size, dtype=bool)
     changes = np.abs(np.diff(x[starts]))
     jump = np.maximum(np.concatenate((changes, [0.0])), np.concatenate(([0.0], changes)))
