@@ -18,7 +18,7 @@ multiplied.
 
 from __future__ import annotations
 
-from math import lgamma, log
+from math import erfc, exp, inf, lgamma, log, sqrt
 
 import numpy as np
 
@@ -98,3 +98,14 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
     raise EstimationError(
         f"criterion {criterion!r} is not known; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
     )
+
+
+def chi_squared_tail(degrees: int, x: float) -> float:
+    """Return the probability that chi-squared with that many degrees of freedom exceeds `x`: a finite sum, all of one
+    sign (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5).
+    """
+    half, shift = 0.5 * x, 0.5 * (degrees % 2)
+    if not 0.0 < half < inf:
+        return 0.0 if half == inf else 1.0
+    terms = (exp((j + shift) * log(half) - half - lgamma(j + shift + 1.0)) for j in range(degrees // 2))
+    return min(1.0, sum(terms, erfc(sqrt(half)) if shift else 0.0))

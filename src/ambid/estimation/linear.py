@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -128,7 +129,7 @@ def information_inverse(R: Array) -> tuple[Array | None, float]:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Keep the linear algebra library to one thread inside a ``with`` block."""
-    libraries = _controller()
+    libraries = _controller("scipy.linalg" in sys.modules)
     if all(x.num_threads == 1 for x in libraries.lib_controllers if x.user_api == "blas"):
         yield  # so already, from the environment or a caller: setting it would take longer than a small fit's algebra
         return
@@ -137,9 +138,8 @@ def one_thread() -> Iterator[None]:
 
 
 @cache
-def _controller() -> Any:
-    """Controller of the linear algebra libraries that NumPy and SciPy have loaded."""
-    import scipy.linalg  # noqa: F401  (SciPy brings a library of its own, which has to be there to be found)
+def _controller(_with_scipy: bool) -> Any:
+    """Controller of the linear algebra libraries that are loaded: SciPy brings one of its own."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.physics.linear_model import StateSpace
@@ -34,12 +36,10 @@ def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
     `A`: (n_states, n_states), complex for a complex step; `B`: (n_states, n_inputs); `period_s`: sampling period in s.
     Returns `A_d`: (n_states, n_states); `B_d`: (n_states, n_inputs).
     """
-    from scipy.linalg import expm
-
     n, n_u = B.shape
     block = np.zeros((n + n_u, n + n_u), dtype=np.result_type(A, B))
     block[:n, :n], block[:n, n:] = A, B
-    full = np.asarray(expm(block * period_s))
+    full = _exponential(block * period_s, n)
     return full[:n, :n], full[:n, n:]
 
 
@@ -55,8 +55,6 @@ def discretise(
     passed on. Returns `discrete`: the discrete matrices; `directional`: their derivatives, one for each direction;
     where `fraction` is given, one more: along the fraction itself.
     """
-    from scipy.linalg import expm
-
     n, nu = space.B.shape
     size = n + nu + space.E.shape[1]
     kind = np.result_type(space.A, space.B, space.E)
@@ -68,8 +66,8 @@ def discretise(
             stack[:, :n, columns.start + size : columns.stop + size] = [getattr(d, name) for d in derivatives]
     stack[:, size : size + n, size:] = stack[:, :n, :size]
     stack *= period_s
-    full = expm(stack)
-    late = full if fraction is None else expm(stack * (1.0 - fraction))
+    full = _exponential(stack, n)
+    late = full if fraction is None else _exponential(stack * (1.0 - fraction), n)
 
     def split(now: Array, partial: Array, c: Array) -> DiscreteSpace:
         b = partial[:n, n : n + nu]
@@ -84,3 +82,27 @@ def discretise(
             DiscreteSpace(A=zero(discrete.A), B=slope, B_late=-slope, E=zero(discrete.E), C=zero(space.C))
         )
     return discrete, tuple(directional)
+
+
+_PADE = (17297280.0, 8648640.0, 1995840.0, 277200.0, 25200.0, 1512.0, 56.0, 1.0)  # of order 7
+_REACH = 0.95  # norm up to which it is right to rounding (Higham 2005)
+
+
+def _exponential(a: NDArray[Any], n: int) -> NDArray[Any]:
+    """Exponential of one or several matrices by scaling and squaring (Higham 2005).
+
+    Scaled by their first `n` rows and columns, which the others only follow: large inputs cost no digits.
+    `a`: (..., size, size).
+    """
+    norm = float(np.max(np.sum(np.abs(a[..., :n, :n]), axis=-2)))
+    squarings = max(0, int(np.ceil(np.log2(norm / _REACH)))) if norm > 0.0 and np.isfinite(norm) else 0
+    a = a / 2.0**squarings
+    square = a @ a
+    fourth = square @ square
+    even = (np.eye(a.shape[-1]), square, fourth, square @ fourth)
+    odd = a @ sum(c * power for c, power in zip(_PADE[1::2], even, strict=True))
+    rest = sum(c * power for c, power in zip(_PADE[::2], even, strict=True))
+    out = np.linalg.solve(rest - odd, rest + odd)
+    for _ in range(squarings):
+        out = out @ out
+    return np.asarray(out)

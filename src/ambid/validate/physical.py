@@ -25,6 +25,8 @@ from ambid.arrays import Array
 from ambid.bearing.linear import carry
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import Uncertainty, experiment_hint
+from ambid.estimation.criteria import chi_squared_tail
+from ambid.estimation.innovations import predictor_gain
 from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.parts import Check
@@ -127,14 +129,12 @@ def _test_columns(
     fit: Fit, found: Products, white: Array, lagged: Array, lags: tuple[int, ...], which: slice
 ) -> ResidualTest:
     """Score test of some lagged columns as further regressors of every whitened innovation."""
-    from scipy.special import chdtrc
-
     columns = lagged[:, which]
     statistic, degrees = _explain_columns(fit, found, columns.T @ columns, which)
     correlation = (white.T @ columns) / np.linalg.norm(white, axis=0)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     return ResidualTest(
-        p=float(chdtrc(max(degrees, 1), statistic)),
+        p=chi_squared_tail(max(degrees, 1), statistic),
         statistic=statistic,
         degrees=degrees,
         largest=float(np.abs(correlation[place])),
@@ -222,8 +222,6 @@ def agreement(fit: Fit) -> Agreement:
 
 def _sparse_gain(fit: Fit, stride: int) -> Array:
     """Predictor gain for every stride-th output, from the innovations form of the fit: x+ = A x + K e, y = C x + e."""
-    from scipy.linalg import solve_discrete_are
-
     predictor = _predictor(fit)
     A, C, K, S = predictor.A, predictor.C, predictor.gain, fit.covariance
     if not np.any(K):  # sensor noise alone: no state is ever corrected
@@ -231,8 +229,9 @@ def _sparse_gain(fit: Fit, stride: int) -> Array:
     powers = [np.linalg.matrix_power(A, stride - 1 - j) for j in range(stride)]
     Q = sum((p @ K @ S @ K.T @ p.T for p in powers), np.zeros_like(A))
     cross, whole = powers[0] @ K @ S, A @ powers[0]
-    P = solve_discrete_are(whole.T, C.T, Q, S, s=cross)
-    return np.asarray(np.linalg.solve(C @ P @ C.T + S, (whole @ P @ C.T + cross).T).T)
+    # what the innovation says of the noise that comes after it is known, and leaves noises that do not correlate
+    shown = np.linalg.solve(S, cross.T).T
+    return np.asarray(predictor_gain(whole - shown @ C, C, Q - shown @ cross.T, S).K + shown)
 
 
 def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
@@ -250,13 +249,11 @@ def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimate
 
 def _fixed_agree(fit: Fit) -> Check:
     """Score test of each fixed value: would the record, if asked, put it elsewhere?"""
-    from scipy.special import chdtrc
-
     units = {p.name: p.unit for p in fit.problem.model.parameters}
     worst, detail = 1.0, "the record does not speak against any fixed value"
     for name, value in fit.problem.known.items():
         statistic, there = freed(fit, name)
-        p = float(chdtrc(1, statistic))
+        p = chi_squared_tail(1, statistic)
         if p < min(worst, P_LEAST):
             detail = (
                 f"the record speaks against {name} = {value:.4g} {units[name]}, which was fixed, and wants a "

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.estimation.criteria import chi_squared_tail
 from ambid.estimation.linear import column_sizes, directions, triangle_of
 from ambid.estimation.parts import Check, OutputFit
 
@@ -126,8 +127,6 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
     (n_used, n_regressors), known before each residual, or, where the residuals have a `colour` (see `autoregression`),
     independent of all of them.
     """
-    from scipy.special import chdtrc
-
     n, rows = e.size, np.hstack([J, np.ones((e.size, 1)), regressors, e[:, None]])
     colour = None if colour is None or colour.size == 1 else colour
     if colour is None:  # inner products are all that counts: those of the triangle are the same
@@ -150,7 +149,7 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
         W = triangle_of([M @ half])
         statistic = float(np.sum(np.linalg.lstsq(W.T, z, rcond=1e-8)[0] ** 2)) / gain
     return Score(
-        p=float(chdtrc(z.size, statistic)) if z.size else 1.0,
+        p=chi_squared_tail(z.size, statistic) if z.size else 1.0,
         statistic=statistic,
         degrees=z.size,
         correlation=inner / np.sqrt(power),
@@ -179,12 +178,10 @@ def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
 
 def score_of(triangles: Sequence[Array], n_directions: int) -> tuple[float, float, int]:
     """Return what `joint_score` does, from the triangles of all samples."""
-    from scipy.special import chdtrc
-
     L, rest, _ = _project(triangle_of([np.vstack(triangles)]), n_directions)
     _, z = _explain(L, rest @ L, _SAME)
     statistic = float(z @ z)
-    return (float(chdtrc(z.size, statistic)) if z.size else 1.0), statistic, z.size
+    return (chi_squared_tail(z.size, statistic) if z.size else 1.0), statistic, z.size
 
 
 def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array | None) -> Score:
