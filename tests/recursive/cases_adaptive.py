@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.recursive.arx import RecursiveArx, RecursiveIvArx
-from ambid.recursive.instrumental import RecursiveInstrumentalVariables
-from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
+from ambid.recursive.regression import Lms, Nlms, RecursiveInstrumentalVariables, RecursiveLeastSquares
 from tests.recursive.cases import Case
 
 Array = NDArray[np.float64]
@@ -79,13 +78,8 @@ CASES = [
     ),
     Case(name="arx-iv-reference", make=lambda: RecursiveIvArx(2, 2, instruments="reference"), signals=loop),
     Case(
-        name="arx-iv-delayed",
-        make=lambda: RecursiveIvArx(2, 2, instruments="delayed input", memory=100, offset=True),
-        signals=input_alone,
-    ),
-    Case(
         name="arx-iv-auxiliary",
-        make=lambda: RecursiveIvArx(2, 2, instruments="auxiliary model", memory=100),
+        make=lambda: RecursiveIvArx(2, 2, instruments="auxiliary model", memory=100, offset=True),
         signals=input_alone,
     ),
 ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.instrumental import RecursiveInstrumentalVariables
+from ambid.recursive.regression import RecursiveInstrumentalVariables
 
 
 def data(m: int, n: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive.estimator import RecursiveEstimator
-from ambid.recursive.instrumental import RecursiveInstrumentalVariables
-from ambid.recursive.regression import Lms, Nlms, RecursiveLeastSquares
+from ambid.recursive.regression import Lms, Nlms, RecursiveInstrumentalVariables, RecursiveLeastSquares
 
 RUNS = 400
 TRUTH = np.array([1.5, -0.7, 1.0, 0.5])

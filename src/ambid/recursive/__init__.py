@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ambid.recursive.fusion import Motion as Motion
     from ambid.recursive.fusion import SensorFusion as SensorFusion
     from ambid.recursive.fusion import free_motion as free_motion
-    from ambid.recursive.instrumental import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
     from ambid.recursive.joint import JointEkf as JointEkf
     from ambid.recursive.joint import JointStart as JointStart
     from ambid.recursive.joint import JointUkf as JointUkf
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from ambid.recursive.polynomial import RecursivePolynomial as RecursivePolynomial
     from ambid.recursive.regression import Lms as Lms
     from ambid.recursive.regression import Nlms as Nlms
+    from ambid.recursive.regression import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares
     from ambid.recursive.streaming import PassiveLowpass as PassiveLowpass
     from ambid.recursive.streaming import ScalarKalman as ScalarKalman

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import RecursiveEstimator, as_blocks
-from ambid.recursive.instrumental import RecursiveInstrumentalVariables
+from ambid.recursive.estimator import RecursiveEstimator, as_blocks, kernels
+from ambid.recursive.regression import RecursiveInstrumentalVariables
 
-Instruments = Literal["reference", "delayed input", "auxiliary model"]
+Instruments = Literal["reference", "auxiliary model"]
 
 _REFRESH = 64  # samples with one auxiliary model
 _NO_MODEL = np.zeros(0)
@@ -135,7 +135,6 @@ class RecursiveIvArx(_OnSignals):
 
     - ``"reference"``: past values of an external signal r, the last input column, that enters the loop. Consistent
       under feedback.
-    - ``"delayed input"``: na + nb past inputs, from lag nk on, of each input's share. **Open loop only.**
     - ``"auxiliary model"``: past inputs and outputs of the model without noise, with the estimate of up to 64 samples
       ago while it is stable. Near the best in **open loop; biased under feedback** with coloured v, because then u
       itself holds v. Before the first stable estimate the model is a delay: the instruments are past inputs.
@@ -144,15 +143,13 @@ class RecursiveIvArx(_OnSignals):
     ----------
     na, nb, nk : int
         One input: orders and delay.
-    instruments : {"reference", "delayed input", "auxiliary model"}
+    instruments : {"reference", "auxiliary model"}
     offset : bool
         Whether a constant is estimated; it is its own instrument.
     open_loop : bool
-        Say that no feedback is at work: the last two want that, and `warnings` tells it.
+        Say that no feedback is at work: the auxiliary model wants that, and `warnings` tells it.
     n_instruments : int, optional
         Past values of the reference, na + nb or more; na + nb + 2 if not given.
-    reference_delay : int
-        Lag of the first of them; 0 is allowed where r acts at once and v does not depend on it.
     **settings : object
         Of `RecursiveInstrumentalVariables`.
 
@@ -182,24 +179,21 @@ class RecursiveIvArx(_OnSignals):
         offset: bool = False,
         open_loop: bool = False,
         n_instruments: int | None = None,
-        reference_delay: int = 1,
         **settings: Any,
     ) -> None:
         columns, names = columns_of(na, [nb], [nk], offset=offset)
         p = len(columns)
         n = na + nb + 2 if n_instruments is None else n_instruments
         if instruments == "reference":
-            more = [(2, lag, 1) for lag in range(reference_delay, reference_delay + n)]
-        elif instruments == "delayed input":
-            more = [(1, lag, 1) for lag in range(nk, nk + na + nb)]
+            more = [(2, lag, 1) for lag in range(1, 1 + n)]
         elif instruments == "auxiliary model":
             more = [(2, lag, -1) for lag in range(1, na + 1)] + columns[na : na + nb]
         else:
-            raise EstimationError(f"instruments is {instruments!r}; reference, delayed input or auxiliary model")
+            raise EstimationError(f"instruments is {instruments!r}; it is reference or auxiliary model")
         more += columns[na + nb :]
         self._kind, self._na, self._nb, self._p, self._open_loop = instruments, na, nb, p, open_loop
         self._n_inputs = 2 if instruments == "reference" else 1
-        self._lines = DelayLines([*columns, *more], 2 if instruments == "delayed input" else 3)
+        self._lines = DelayLines([*columns, *more], 3)
         self._estimator = RecursiveInstrumentalVariables(names, n_instruments=len(more), **settings)
         self._model, self._count = np.zeros(p), 0
         self._modelled = nb == 0
@@ -282,19 +276,6 @@ class DelayLines:
     def __init__(self, columns: Sequence[tuple[int, int, int]], n_channels: int) -> None:
         self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
         self._past = np.full((max(1, int(self._table[:, 1].max())), n_channels), np.nan)
-        self._prepare()
-
-    def _prepare(self) -> None:
-        from ambid.recursive.regression_kernels import tapped
-
-        self._run = tapped
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "_run"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._prepare()
 
     def rows(self, x: Array, theta: Array = _NO_MODEL, first: int = 0) -> Array:
         """Return the columns for the next samples.
@@ -304,7 +285,7 @@ class DelayLines:
         begins. Returns (n_samples, n_columns).
         """
         rows = np.empty((x.shape[0], self._table.shape[0]))
-        self._run(self._past, self._table, x, rows, theta, first)
+        kernels("regression").tapped(self._past, self._table, x, rows, theta, first)
         return rows
 
     def silence(self, channel: int) -> None:

@@ -1,9 +1,13 @@
-"""Compiled recursions of linear regressions over the square-root core: least squares, LMS, and delay lines.
+"""Compiled recursions of linear regressions: least squares and LMS, instrumental variables, delay lines.
 
-A recursion is one array, since a call from Python costs by the number of arrays: head | estimate p | factors of P p p |
-factors of its companion p p | both at the start | walk p | prior variance p | scratch 3 p. The companion is the
-information of squared weights for least squares, else the covariance of the error. Least squares of four coefficients
-stay in registers.
+A recursion is one array, since a call from Python costs by the number of arrays. Over the square-root core: head |
+estimate p | factors of P p p | factors of its companion p p | both at the start | walk p | prior variance p | scratch
+4 p. The companion is the information of squared weights for least squares, else the covariance of the error. Least
+squares of four coefficients stay in registers.
+
+Instrumental variables: head | estimate p | R m (m + p + 1) | T p p | long-run covariance m m | ring lags m | its sum m
+| prior p | size of the instruments m | work. R is the upper part of the triangle of the weighted rows [ζᵀ φᵀ y], T the
+triangle of its columns of φ.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.square_root_kernels import project, shrink, size, solve, variance, widen
+from ambid.recursive.square_root_kernels import project, shrink, size, variance, widen
 
 Table = NDArray[np.int64]
 
@@ -40,35 +44,20 @@ Table = NDArray[np.int64]
     SETTLED,  # weight of the noise variance from which it is the unit of the covariance; infinite where it is known
     UNIT,  # variance in which C is counted; 0: that of the moment
     NOW,  # noise variance of the last look over the unit
-) = range(21)
-HEAD = 24
+    INSTRUMENTS,  # m
+    LAGS,
+    SINGULAR,  # samples after which the instruments did not determine the estimate
+    SUM_OF_SQUARES,  # of the weights of the samples
+    PRIOR_LEFT,  # squared weight that the prior still has
+) = range(26)
+HEAD = 26
 
 LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
 
 # A sample that leads there is rejected; variance over the best one, in place of a prior; least noise over the unit.
 _HUGE, _WORSE, _SILENT = 1e200, 1e9, 1e-12
-
-
-@compiled(error_model="numpy")
-def _views(s: Array, p: int) -> tuple[Array, Array, Array, Array]:
-    """Return estimate, factors of P, factors of its companion, and the rows walk, prior and three to work with."""
-    a, q = HEAD + p, p * p
-    return (
-        s[HEAD:a],
-        s[a : a + q].reshape(p, p),
-        s[a + q : a + 2 * q].reshape(p, p),
-        s[a + 4 * q :].reshape(5, p),
-    )
-
-
-@compiled(error_model="numpy")
-def _add_noise(s: Array, e: float, spread: float, leverage: float) -> None:
-    """Track σ² = E e² / (1 + φᵀCφ). A sample that says little of the estimate says little of its noise."""
-    w = 1.0 / (1.0 + spread)
-    share = leverage / (leverage + s[TYPICAL])
-    keep = 1.0 - s[NOISE_RATE] * share
-    s[NOISE_SUM] = keep * s[NOISE_SUM] + share * (w * e) ** 2
-    s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
+_SINGULAR = 1e-12
+_LITTLE = 0.1  # of the usual leverage, at which a sample counts half
 
 
 @compiled(error_model="numpy")
@@ -80,7 +69,7 @@ def noise_of_now(s: Array) -> float:
 @compiled(error_model="numpy")
 def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> int:
     """Least squares of four coefficients, all in registers: d, u are the factors of P; g, w those of its companion."""
-    theta, F, G, _ = _views(s, 4)
+    theta, F, G = s[HEAD : HEAD + 4], s[HEAD + 4 : HEAD + 20].reshape(4, 4), s[HEAD + 20 : HEAD + 36].reshape(4, 4)
     th0, th1, th2, th3 = theta[0], theta[1], theta[2], theta[3]
     d0, d1, d2, d3 = F[0, 0], F[1, 1], F[2, 2], F[3, 3]
     u10, u20, u21, u30, u31, u32 = F[1, 0], F[2, 0], F[2, 1], F[3, 0], F[3, 1], F[3, 2]
@@ -159,149 +148,118 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
 
 
 @compiled(error_model="numpy")
-def _joseph(G: Array, K: Array, phi: Array, f: Array, k: Array, r: float) -> float:
-    """C becomes (I - Kφᵀ) C (I - Kφᵀ)ᵀ + r K Kᵀ for any gain: the best gain's, and a square of what K differs from it.
+def _widen(s: Array, F: Array, walk: Array, x: Array, a: Array) -> None:
+    """Widen P before a sample: by a random walk, or so that the information that x meets is forgotten (Cao-Schwartz).
 
-    Returns φᵀCφ of before; K is used up.
+    The latter is P + (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
     """
-    project(G, phi, f)
-    alpha = shrink(G, f, r, k)
-    root = np.sqrt(alpha)
-    for j in range(K.size):
-        K[j] = root * K[j] - k[j] / root
-    widen(G, K, 1.0)
-    return alpha - r
-
-
-@compiled(error_model="numpy")
-def _widen(s: Array, F: Array, walk: Array, phi: Array, a: Array) -> None:
-    """Widen P before a sample: by a random walk, or so that the information that φ meets is forgotten (Cao-Schwartz).
-
-    The latter is P + (1/λ - 1) φ φᵀ / (φᵀ P⁻¹ φ).
-    """
-    p = phi.size
+    p = x.size
     if s[KIND] == WALK:
         for i in range(p):
             if walk[i] > 0.0:
-                a[:] = 0.0
+                for j in range(i):
+                    a[j] = 0.0
                 a[i] = 1.0
                 widen(F, a[: i + 1], walk[i])
         return
-    a[:] = phi
-    solve(F, a)
+    for j in range(p):
+        a[j] = x[j]
     met = 0.0
-    for j in range(p):
+    for j in range(p - 1, -1, -1):  # xᵀ P⁻¹ x by U⁻¹ x
         met += a[j] / F[j, j] * a[j]
+        for i in range(j):
+            a[i] -= a[j] * F[j, i]
     if 0.0 < met < _HUGE:
-        a[:] = phi
-        widen(F, a, (1.0 / s[FACTOR_NOW] - 1.0) / met)
-
-
-@compiled(error_model="numpy")
-def _by_least_squares(s: Array, theta: Array, F: Array, G: Array, rest: Array, phi: Array, e: float) -> None:
-    """Take in one sample: P and its companion, the estimate, the noise."""
-    walk, f, k, a = rest[0], rest[2], rest[3], rest[4]
-    p, kind, now = theta.size, s[KIND], s[NOW]
-    if kind == LEAST_SQUARES:
-        grow, drop = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW]
         for j in range(p):
-            F[j, j] *= grow
-            G[j, j] *= drop
-    else:
-        _widen(s, F, walk, phi, a)
-        project(F, phi, f)
-    alpha = shrink(F, f, 1.0, k)
-    for j in range(p):
-        theta[j] += k[j] * (e / alpha)
-        a[j] = k[j] / alpha
-    spread = alpha - 1.0  # not less than what C says, but where the noise has just fallen
-    if kind == LEAST_SQUARES:
-        project(G, k, f)
-        spread = min(size(G, f) / now, spread)
-    elif kind == DIRECTIONAL:
-        now = noise_of_now(s)
-        project(G, phi, f)
-        spread = min(size(G, f) / now, spread)
-    _add_noise(s, e, spread, alpha - 1.0)
-    if kind == LEAST_SQUARES:
-        a[:] = phi
-        widen(G, a, now)
-    elif kind == DIRECTIONAL:
-        _joseph(G, a, phi, f, k, noise_of_now(s))
-
-
-@compiled(error_model="numpy")
-def _by_gradient(s: Array, theta: Array, G: Array, rest: Array, phi: Array, e: float, power: float) -> None:
-    """Take in one sample: a step along the regressor, with the exact covariance of what it leaves."""
-    f, k, a, step = rest[2], rest[3], rest[4], s[STEP]
-    if s[KIND] == NLMS:
-        step /= s[SMALL] + power
-    elif step * power > 1.0:
-        step = 1.0 / power
-        s[LIMITED] += 1.0
-    for j in range(theta.size):
-        a[j] = step * phi[j]
-        theta[j] += a[j] * e
-    spread, leverage = _joseph(G, a, phi, f, k, 1.0), step * power
-    if leverage > 0.0:
-        if s[TYPICAL] == 0.0:
-            s[TYPICAL] = 0.1 * leverage
-        _add_noise(s, e, spread, leverage)
-        s[TYPICAL] += s[NOISE_RATE] * leverage / (leverage + s[TYPICAL]) * (0.1 * leverage - s[TYPICAL])
+            a[j] = x[j]
+        widen(F, a, (1.0 / s[FACTOR_NOW] - 1.0) / met)
 
 
 @compiled(error_model="numpy")
 def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: float) -> int:
     """Take in samples t, ... until so many have been used; return the first that was not taken."""
-    theta, F, G, rest = _views(s, p)
-    f, gradient = rest[2], s[KIND] >= LMS
+    first, q = HEAD + p, p * p
+    theta, F, G = s[HEAD:first], s[first : first + q].reshape(p, p), s[first + q : first + 2 * q].reshape(p, p)
+    rest = s[first + 4 * q :].reshape(6, p)
+    walk, f, k, a, x = rest[0], rest[2], rest[3], rest[4], rest[5]  # views here: in the loop they would be counted
+    kind, gradient, now = s[KIND], s[KIND] >= LMS, s[NOW]
+    grow, drop, one = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0
+    seen = G if gradient else F
     while t < y.size and s[USED] < until:
-        row, e, power = phi[t], y[t], 0.0
+        e, power = y[t], 0.0
         for j in range(p):
-            e -= row[j] * theta[j]
-            power += row[j] * row[j]
-        seen = G if gradient else F
-        project(seen, row, f)
-        if size(seen, f) + power + e * e < _HUGE:
-            if gradient:
-                _by_gradient(s, theta, G, rest, row, e, power)
-            else:
-                _by_least_squares(s, theta, F, G, rest, row, e)
-            s[USED] += 1.0
-            out[t] = e
-        else:
+            x[j] = phi[t, j]
+            e -= x[j] * theta[j]
+            power += x[j] * x[j]
+        project(seen, x, f)
+        if not (size(seen, f) + power + e * e < _HUGE):
             out[t] = np.nan
             s[REJECTED] += 1.0
+            t += 1
+            continue
+        if gradient:  # a step along the regressor
+            step = s[STEP]
+            if kind == NLMS:
+                step /= s[SMALL] + power
+            elif step * power > 1.0:
+                step = 1.0 / power
+                s[LIMITED] += 1.0
+            for j in range(p):
+                a[j] = step * x[j]
+                theta[j] += a[j] * e
+            leverage = step * power
+            if s[TYPICAL] == 0.0:
+                s[TYPICAL] = 0.1 * leverage
+            spread = size(G, f)
+        else:
+            if kind == LEAST_SQUARES:
+                for j in range(p):
+                    F[j, j] *= grow
+                    G[j, j] *= drop
+            else:
+                _widen(s, F, walk, x, a)
+                project(F, x, f)
+            alpha = shrink(F, f, one, k)
+            leverage = spread = alpha - 1.0
+            for j in range(p):
+                theta[j] += k[j] * (e / alpha)
+                a[j] = k[j] / alpha
+            if kind != WALK:  # not more than P says, but where the noise has just fallen
+                if kind == DIRECTIONAL:
+                    now = noise_of_now(s)
+                project(G, k if kind == LEAST_SQUARES else x, f)
+                spread = min(size(G, f) / now, spread)
+        if leverage > 0.0:  # σ² = E e² / (1 + φᵀCφ): a sample that says little of the estimate says little of its noise
+            w, share = 1.0 / (1.0 + spread), leverage / (leverage + s[TYPICAL])
+            keep = 1.0 - s[NOISE_RATE] * share
+            s[NOISE_SUM] = keep * s[NOISE_SUM] + share * (w * e) ** 2
+            s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
+            if gradient:
+                s[TYPICAL] += s[NOISE_RATE] * share * (0.1 * leverage - s[TYPICAL])
+        if kind == LEAST_SQUARES:
+            widen(G, x, now)
+        elif kind != WALK:
+            # C becomes (I - Kφᵀ) C (I - Kφᵀ)ᵀ + r K Kᵀ: the best gain's, and a square of what K differs from it
+            alpha = shrink(G, f, one if gradient else noise_of_now(s), k)
+            root = np.sqrt(alpha)
+            for j in range(p):
+                a[j] = root * a[j] - k[j] / root
+            widen(G, a, one)
+        s[USED] += 1.0
+        out[t] = e
         t += 1
     return t
 
 
 @compiled(error_model="numpy")
-def _govern(s: Array, p: int) -> None:
-    """Reset where it is due, and choose the factor with which P cannot pass its limit before the next look."""
-    a, q = HEAD + p, 2 * p * p
-    if s[RESET_EVERY] > 0 and s[USED] > 0 and s[USED] % s[RESET_EVERY] == 0:
-        s[a : a + q] = s[a + q : a + 2 * q]
-        s[UNIT] *= max(1.0, noise_of_now(s))
-    if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
-        s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
-    s[NOW] = noise_of_now(s)
-    _, F, _, rest = _views(s, p)
-    prior, total = rest[1], 0.0
-    for i in range(p):
-        now = variance(F, i)
-        if s[VAGUE] > 0:
-            prior[i] = min(prior[i], _WORSE * now)
-        total += now / (prior[i] * p * s[LIMIT])
-    s[FACTOR_NOW] = min(1.0, total ** (1.0 / s[EVERY])) if total > s[FACTOR] ** s[EVERY] else s[FACTOR]
-    s[TYPICAL] = 0.1 * p / min(s[USED] + 1.0, s[MEMORY])
-
-
-@compiled(error_model="numpy")
 def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
-    """Take in rows of phi (n, p) and y (n,); write errors of prediction into out (n,), NaN where one is rejected."""
+    """Take in rows of phi (n, p) and y (n,); write errors of prediction into out (n,), NaN where one is rejected.
+
+    At fixed counts P is reset where that is due, and the factor chosen with which it cannot pass its limit before the
+    next look.
+    """
     p, t = int(s[SIZE]), 0
-    four = p == 4 and s[KIND] == LEAST_SQUARES
+    four, a, q = p == 4 and s[KIND] == LEAST_SQUARES, HEAD + p, p * p
     while t < y.size:
         until = np.inf
         if s[KIND] < LMS:
@@ -309,8 +267,173 @@ def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
             if s[RESET_EVERY] > 0:
                 until = min(until, (np.floor(s[USED] / s[RESET_EVERY]) + 1.0) * s[RESET_EVERY])
         t = _four(s, phi, y, out, t, until) if four else _any(s, p, phi, y, out, t, until)
-        if s[USED] == until:
-            _govern(s, p)
+        if s[USED] < until:
+            continue
+        if s[RESET_EVERY] > 0 and s[USED] % s[RESET_EVERY] == 0:
+            for i in range(a, a + 2 * q):
+                s[i] = s[i + 2 * q]
+            s[UNIT] *= max(1.0, noise_of_now(s))
+        if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
+            s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
+        s[NOW] = noise_of_now(s)
+        F, prior, total = s[a : a + q].reshape(p, p), s[a + 4 * q + p :], 0.0
+        for i in range(p):
+            now = variance(F, i)
+            if s[VAGUE] > 0:
+                prior[i] = min(prior[i], _WORSE * now)
+            total += now / (prior[i] * p * s[LIMIT])
+        s[FACTOR_NOW] = min(1.0, total ** (1.0 / s[EVERY])) if total > s[FACTOR] ** s[EVERY] else s[FACTOR]
+        s[TYPICAL] = 0.1 * p / min(s[USED] + 1.0, s[MEMORY])
+
+
+@compiled(error_model="numpy")
+def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> bool:
+    """Least squares of the columns of φ on that of y: triangle into T, solution into theta unless it is singular."""
+    for i in range(m):
+        for j in range(p + 1):
+            work[i, j] = R[i, m + j]
+    sound = True
+    for k in range(p):
+        size, all_of_it = 0.0, 0.0
+        for i in range(m):
+            all_of_it += work[i, k] ** 2
+            if i >= k:
+                size += work[i, k] ** 2
+        sound = sound and size > _SINGULAR**2 * all_of_it
+        length = -np.sqrt(size) if work[k, k] > 0 else np.sqrt(size)
+        head = work[k, k] - length
+        if head != 0.0:
+            for j in range(k + 1, p + 1):
+                dot = head * work[k, j]
+                for i in range(k + 1, m):
+                    dot += work[i, k] * work[i, j]
+                dot /= length * head
+                work[k, j] += dot * head
+                for i in range(k + 1, m):
+                    work[i, j] += dot * work[i, k]
+        work[k, k] = length
+    if not sound:
+        return False
+    for i in range(p):
+        for j in range(i, p):
+            T[i, j] = work[i, j]
+    for i in range(p - 1, -1, -1):
+        x = work[i, p]
+        for j in range(i + 1, p):
+            x -= T[i, j] * theta[j]
+        theta[i] = x / T[i, i]
+    return True
+
+
+@compiled(error_model="numpy")
+def _length(T: Array, x: Array, solved: Array) -> float:
+    """Return xᵀ (TᵀT)⁻¹ x for an upper triangle."""
+    total = 0.0
+    for i in range(x.size):
+        v = x[i]
+        for j in range(i):
+            v -= T[j, i] * solved[j]
+        solved[i] = v / T[i, i]
+        total += solved[i] ** 2
+    return total
+
+
+@compiled(error_model="numpy")
+def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
+    """Take in rows [φ, ζ] (n, p + m) and y (n,); errors of prediction into out (n,)."""
+    p, m, lags = int(s[SIZE]), int(s[INSTRUMENTS]), int(s[LAGS])
+    a = HEAD
+    theta = s[a : a + p]
+    a += p
+    R = s[a : a + m * (m + p + 1)].reshape(m, m + p + 1)
+    a += m * (m + p + 1)
+    T = s[a : a + p * p].reshape(p, p)
+    a += p * p
+    omega = s[a : a + m * m].reshape(m, m)
+    a += m * m
+    ring = s[a : a + lags * m].reshape(lags, m)
+    a += lags * m
+    total, prior = s[a : a + m], s[a + m : a + m + p]
+    a += m + p + m
+    work = s[a : a + m * (p + 1)].reshape(m, p + 1)
+    a += m * (p + 1)
+    new = s[a : a + m + p + 1]
+    a += m + p + 1
+    unit, solved = s[a : a + p], s[a + p : a + p + m]
+    for t in range(y.size):
+        e, power = y[t], y[t] ** 2
+        for j in range(p):
+            e -= rows[t, j] * theta[j]
+        for j in range(p + m):
+            power += rows[t, j] ** 2
+        if not (power + e * e < _HUGE):
+            out[t] = np.nan
+            s[REJECTED] += 1.0
+            continue
+        for j in range(m):
+            new[j] = rows[t, p + j]
+        for j in range(p):
+            unit[j] = new[m + j] = rows[t, j]
+        new[m + p] = y[t]
+        factor = s[FACTOR_NOW]
+        root, spread = np.sqrt(factor), _length(T, unit, solved) / (1.0 + factor)
+        for i in range(m):  # rotate the row into the weighted rows of before; what remains of it is dropped
+            r, x = root * R[i, i], new[i]
+            length = np.hypot(r, x)
+            c, d = (r / length, x / length) if length > 0 else (1.0, 0.0)
+            R[i, i] = length
+            for j in range(i + 1, new.size):
+                b, x = root * R[i, j], new[j]
+                R[i, j] = c * b + d * x
+                new[j] = c * x - d * b
+        if not _solve(R, T, work, theta, m, p):
+            s[SINGULAR] += 1.0
+        for j in range(m):
+            new[j] = rows[t, p + j]
+        _account(s, R, omega, ring, total, new[:m], e, 1.0 / (1.0 + spread), solved)
+        s[USED] += 1.0
+        if s[USED] % s[EVERY] == 0:  # the factor that keeps the mean of the variances over the prior's below its limit
+            mean = 0.0
+            for i in range(p):
+                for j in range(p):
+                    unit[j] = 1.0 if j == i else 0.0
+                now = _length(T, unit, solved)
+                if s[VAGUE] > 0:
+                    prior[i] = min(prior[i], _WORSE * now)
+                mean += now / (prior[i] * p * s[LIMIT])
+            s[FACTOR_NOW] = min(1.0, mean ** (1.0 / s[EVERY])) if mean > s[FACTOR] ** s[EVERY] else s[FACTOR]
+        out[t] = e
+
+
+@compiled(error_model="numpy")
+def _account(
+    s: Array, R: Array, omega: Array, ring: Array, total: Array, zeta: Array, e: float, w: float, solved: Array
+) -> None:
+    """Track noise and weights, a sample by what its instruments add to those of before.
+
+    The long-run covariance of ζ e has Bartlett's weights: the mean square of its sums over `lags` samples.
+    """
+    m, lags, factor = zeta.size, ring.shape[0], s[FACTOR_NOW]
+    leverage = _length(R, zeta, solved)
+    share = leverage / (leverage + _LITTLE * m / min(s[USED] + 1.0, s[MEMORY]))
+    keep, weighted = 1.0 - s[NOISE_RATE] * share, w * e
+    place = int(s[USED] % lags)
+    for i in range(m):
+        total[i] -= ring[place, i]
+        ring[place, i] = zeta[i] * weighted
+        total[i] += ring[place, i]
+        if place == lags - 1:  # afresh, or rounding adds up
+            total[i] = 0.0
+            for k in range(lags):
+                total[i] += ring[k, i]
+    for i in range(m):
+        for j in range(i + 1):
+            omega[i, j] = keep * omega[i, j] + share / lags * total[i] * total[j]
+            omega[j, i] = omega[i, j]
+    s[NOISE_SUM] = keep * s[NOISE_SUM] + share * weighted * weighted
+    s[NOISE_WEIGHT] = keep * s[NOISE_WEIGHT] + share * w
+    s[SUM_OF_SQUARES] = factor * factor * s[SUM_OF_SQUARES] + (1.0 + _LITTLE) * share
+    s[PRIOR_LEFT] *= factor * factor
 
 
 @compiled(error_model="numpy")
