@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
 from ambid.blackbox.response import Offsets
-from ambid.recursive.polynomial import Forgetting, RecursivePolynomial
+from ambid.recursive.polynomial import RecursivePolynomial
 from tests.recursive.cases import Case
 
 A, B, C, D = (1.0, -1.5, 0.7), (0.0, 1.0, 0.5), (1.0, 0.5, 0.3), (1.0, -0.6)
@@ -80,7 +80,7 @@ def case(name: str, structure: str, n: int, **options: object) -> Case:
 CASES = [
     case("polynomial-arx", "arx", 400),
     case("polynomial-armax", "armax", 400),
-    case("polynomial-armax-forgetting", "armax", 400, forgetting=Forgetting(final=0.99, first=0.95)),
+    case("polynomial-armax-forgetting", "armax", 400, forgetting=0.99),
     case("polynomial-oe", "oe", 400, forgetting=0.98),
     case("polynomial-bj", "bj", 400),
     case("polynomial-armax-from-nothing", "armax", 600, start="nothing"),

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from ambid.blackbox.polynomial_predictor import Layout
 from ambid.recursive.polynomial_kernels import run
-from ambid.recursive.polynomial_state import Forgetting, new_state
+from ambid.recursive.polynomial_state import new_state
 
 N, SETTLED = 700, 600
 LAYOUTS = {
@@ -59,7 +59,7 @@ def test_gradient_is_that_of_the_residual(name: str) -> None:
         noise_variance=1.0,
         weight=1.0,
         centre=np.zeros(1 + layout.n_inputs),
-        forgetting=Forgetting(),
+        forgetting=1.0,
     )
     errors, psi, one = np.zeros(N), np.zeros((N, free.size)), np.zeros(1)
     for t in range(N):

@@ -8,6 +8,7 @@ counts once.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Self
 
@@ -22,10 +23,9 @@ from ambid.blackbox.polynomial_predictor import compact_orders, layout_of, read_
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure as structure_named
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_blocks
+from ambid.recursive.estimator import as_blocks, kernels
 from ambid.recursive.polynomial_state import (
     COUNTED,
-    Forgetting,
     Identity,
     State,
     covariance_of_state,
@@ -69,8 +69,9 @@ class RecursivePolynomial:
         Sampling interval, s.
     n_inputs : int or None, optional
         One, or none for a time series, unless said otherwise.
-    forgetting : Forgetting or float, optional
-        A number is `Forgetting.final`. Below 20 samples for each coefficient `warnings` tells of C, D and F.
+    forgetting : float, optional
+        Weight of the last sample beside the present one; 1 forgets nothing. Below 20 samples of memory for each
+        coefficient `warnings` tells of C, D and F.
     burn_in : int or None, optional
         Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
         the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
@@ -93,7 +94,7 @@ class RecursivePolynomial:
         *,
         dt: float = 1.0,
         n_inputs: int | None = None,
-        forgetting: Forgetting | float = 1.0,
+        forgetting: float = 1.0,
         burn_in: int | None = None,
         open_loop: bool = False,
     ) -> None:
@@ -122,7 +123,7 @@ class RecursivePolynomial:
         cls,
         fit: BlackBoxFit,
         *,
-        forgetting: Forgetting | float = 1.0,
+        forgetting: float = 1.0,
         samples: int | None = None,
         open_loop: bool = False,
     ) -> Self:
@@ -132,7 +133,7 @@ class RecursivePolynomial:
         ----------
         fit : BlackBoxFit
             Of a polynomial structure, one output. Its record and the samples to come must not overlap.
-        forgetting : Forgetting or float, optional
+        forgetting : float, optional
         samples : int or None, optional
             How many samples `fit` saw, where those to come stand at the same operating point: its offsets and noise
             then count so much. None: both are learnt anew.
@@ -153,14 +154,14 @@ class RecursivePolynomial:
         made._begin(fit, samples)
         return made
 
-    def _prepare(self, who: Identity, forgetting: Forgetting | float, *, open_loop: bool) -> None:
-        from ambid.recursive.polynomial_kernels import run
-
-        self._who, self._open_loop = who, open_loop
-        self._forgetting = forgetting if isinstance(forgetting, Forgetting) else Forgetting(final=float(forgetting))
+    def _prepare(self, who: Identity, forgetting: float, *, open_loop: bool) -> None:
+        if not 0.0 < forgetting <= 1.0:
+            raise EstimationError(f"forgetting is {forgetting}; it must be above 0 and at most 1. Correct it")
+        self._who, self._open_loop, self._forgetting = who, open_loop, float(forgetting)
+        self._memory = 1.0 / (1.0 - forgetting) if forgetting < 1.0 else float("inf")
         model = PolynomialModel(outputs=(who.layout.polynomials(who.layout.start()),), dt=who.dt)
         self._names = tuple(model.names[k] for k in who.layout.free)
-        self._n_u, self._run = who.layout.n_inputs, run
+        self._n_u = who.layout.n_inputs
         self._window = None
         self._state: State | None = None
         self._arrays = ()
@@ -242,9 +243,7 @@ class RecursivePolynomial:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return _warnings_of(
-            self._who, self._state, self._forgetting, open_loop=self._open_loop, doubtful=self._doubtful
-        )
+        return _warnings_of(self._who, self._state, self._memory, open_loop=self._open_loop, doubtful=self._doubtful)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -268,7 +267,7 @@ class RecursivePolynomial:
         if type(outputs) in _NUMBERS and type(inputs) in _NUMBERS and self._window is None and self._n_u == 1:
             u, y, e = self._one  # the way of a loop that lives: no checks, no new arrays
             u[0, 0], y[0] = inputs, outputs
-            self._run(u, y, e, True, *self._arrays)
+            self._run(u, y, e)
             return np.array(e[0])
         return self._take(inputs, outputs, learn=True)
 
@@ -304,8 +303,11 @@ class RecursivePolynomial:
         if self._window is not None:
             first = self._with_window(u, y, errors)
         if first < y.size:
-            self._run(u[first:], y[first:], errors[first:], learn, *self._arrays)
+            self._run(u[first:], y[first:], errors[first:], learn=learn)
         return errors.reshape(shape)
+
+    def _run(self, u: Array, y: Array, errors: Array, *, learn: bool = True) -> None:
+        kernels("polynomial").run(u, y, errors, learn, *self._arrays)
 
     def _with_window(self, u: Array, y: Array, errors: Array) -> int:
         """Store samples and fit them at fixed counts; return how many of the block were dealt with."""
@@ -313,7 +315,7 @@ class RecursivePolynomial:
         while self._window is not None and at < y.size:
             n, gap = self._window.take(u[at:], y[at:])
             if self._state is not None and n:
-                self._run(u[at : at + n], y[at : at + n], errors[at : at + n], True, *self._arrays)
+                self._run(u[at : at + n], y[at : at + n], errors[at : at + n])
             at += n
             if gap and self._state is not None and not self._doubtful:
                 self._window = None  # the recursion goes on alone
@@ -322,7 +324,7 @@ class RecursivePolynomial:
                 if self._state is None:
                     self._used_before, self._rejected_before = self._used_before + n, self._rejected_before + 1
                 else:
-                    self._run(u[at : at + 1], y[at : at + 1], errors[at : at + 1], True, *self._arrays)
+                    self._run(u[at : at + 1], y[at : at + 1], errors[at : at + 1])
                 at += 1
             elif self._window.filled == self._window.target:
                 self._fit_window(self._window)
@@ -337,15 +339,15 @@ class RecursivePolynomial:
         grown, none = window.grow(), self._state is None
         if none or self._doubtful:  # a later window may do better
             self._used_before += (0 if grown else window.drop_half()) * none
-        elif not (grown and window.target <= self._forgetting.memory):
+        elif not (grown and window.target <= self._memory):
             self._window = None  # later samples would count more than these
 
     def _begin_anew(self, fit: BlackBoxFit, window: _Window) -> None:
         """Go on from an off-line fit of all samples so far."""
         before, n = self._state, window.filled
         now = self._begin(fit, n)
-        self._run(window.u[:n], window.y[:n], np.empty(n), False, *self._arrays)
-        now.go_on_counting(before, n)
+        self._run(window.u[:n], window.y[:n], np.empty(n), learn=False)
+        now.count[list(COUNTED)] = [n, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
 
     def _count(self, k: int) -> int:
         return 0 if self._state is None else int(self._state.count[k])
@@ -355,14 +357,25 @@ class RecursivePolynomial:
         """The estimate as a model: poles, frequency response and the rest."""
         full = self._start.copy()
         full[self._who.layout.free] = self.estimate
-        return _model_of(self._who, full)
+        return PolynomialModel(outputs=(self._who.layout.polynomials(full),), dt=self._who.dt)
 
     @property
     def offsets(self) -> Offsets:
-        """Operating point for which the model holds, SI; NaN until the first window is full."""
+        """Operating point for which the model holds, SI; NaN until the first window is full.
+
+        The constant of A y = (B/F) u + constant is the output's, unless A sums to zero: an integrating plant has any
+        level, and the constant stands for an offset of its inputs.
+        """
         if self._state is None:
             return Offsets(u=np.full(self._n_u, np.nan), y=np.full(1, np.nan))
-        return _offsets_of(self.model, self._state)
+        centre, constant, p = self._state.levels.copy(), float(self._state.at[-1]), self.model.outputs[0]
+        level = float(p.A.sum())
+        gain = np.array([b.sum() / f.sum() if f.sum() else np.inf for b, f in zip(p.B, p.F, strict=True)])
+        if abs(level) > _INTEGRATES * float(np.abs(p.A).sum()):
+            centre[0] += constant / level
+        elif gain.size and np.all(np.isfinite(gain)) and np.any(gain):
+            centre[1:] -= constant * gain / float(gain @ gain)
+        return Offsets(u=centre[1:], y=centre[:1])
 
     def fit(self) -> BlackBoxFit:
         """Return the present estimate in the form of an off-line fit.
@@ -381,20 +394,26 @@ class RecursivePolynomial:
             raise EstimationError(
                 f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
             )
-        found = _fit_of(
-            self._who, self.model, self._state, self.covariance, samples=self.n_used, warnings=self.warnings
+        who, model, free = self._who, self.model, self._who.layout.free
+        covariance = np.zeros((model.theta.size,) * 2)
+        covariance[np.ix_(free, free)] = self.covariance
+        found = BlackBoxFit(
+            structure=who.structure,
+            orders=compact_orders(who.structure, who.layout),
+            model=model,
+            covariance=covariance,
+            n_estimated=free.size,
+            offsets=self.offsets,
+            noise_covariance=np.array([[self.noise_variance]]),
+            inputs=who.inputs,
+            outputs=who.outputs,
+            units=dict(who.units),
+            dt=who.dt,
+            record={"samples": self.n_used, "rate_hz": 1.0 / who.dt},
+            warnings=self.warnings,
+            details={"recursive": True, **self._state.counts()},
         )
         return replace(found, status="stalled") if self._doubtful else found
-
-    def __getstate__(self) -> dict[str, object]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_run", "_arrays")}
-
-    def __setstate__(self, kept: dict[str, object]) -> None:
-        from ambid.recursive.polynomial_kernels import run
-
-        self.__dict__.update(kept)
-        self._run = run
-        self._arrays = () if self._state is None else self._state.arrays()
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state.
@@ -403,35 +422,19 @@ class RecursivePolynomial:
         -------
         RecursivePolynomial
         """
-        twin = type(self).__new__(type(self))
-        twin.__dict__.update(self.__dict__)
-        twin._one = tuple(x.copy() for x in self._one)  # type: ignore[assignment]
-        if self._window is not None:
-            twin._window = self._window.copy()
-        if self._state is not None:
-            twin._state = self._state.copy()
-            twin._arrays = twin._state.arrays()
-        return twin
+        return deepcopy(self)
 
 
 class _Window:
     """Samples without a gap, and the counts at which they are fitted.
 
-    `first`, `last`: samples at the first and at most at the last fit.
-
-    `u`: (last, n_inputs), (last,); `y`: (last, n_inputs), (last,); `filled`: samples stored; samples at the next fit;
-    `target`: samples stored; samples at the next fit.
+    `first`, `last`: samples at the first and at most at the last fit. `filled` of `u` (last, n_inputs) and `y` (last,)
+    are stored; `target` is where the next fit is.
     """
 
     def __init__(self, *, first: int, last: int, n_inputs: int) -> None:
         self.u, self.y = np.zeros((last, n_inputs)), np.zeros(last)
         self.first, self.filled, self.target = first, 0, first
-
-    def copy(self) -> _Window:
-        """Return an independent window with the same samples."""
-        twin = _Window(first=self.first, last=self.y.size, n_inputs=self.u.shape[1])
-        twin.u[:], twin.y[:], twin.filled, twin.target = self.u, self.y, self.filled, self.target
-        return twin
 
     def take(self, u: Array, y: Array) -> tuple[int, bool]:
         """Take samples until the next fit, or up to and without one that is not finite.
@@ -510,32 +513,8 @@ def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
     return polynomial_fit(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
 
 
-def _model_of(who: Identity, full: Array) -> PolynomialModel:
-    """Return all coefficients as a model.
-
-    `full`: (n_theta,).
-    """
-    return PolynomialModel(outputs=(who.layout.polynomials(full),), dt=who.dt)
-
-
-def _offsets_of(model: PolynomialModel, state: State) -> Offsets:
-    """Turn the constant of A y = (B/F) u + constant into an operating point.
-
-    It is the output's, unless A sums to zero: an integrating plant has any level, and the constant stands for an offset
-    of its inputs.
-    """
-    centre, constant, p = state.levels.copy(), float(state.at[-1]), model.outputs[0]
-    level = float(p.A.sum())
-    gain = np.array([b.sum() / f.sum() if f.sum() else np.inf for b, f in zip(p.B, p.F, strict=True)])
-    if abs(level) > _INTEGRATES * float(np.abs(p.A).sum()):
-        centre[0] += constant / level
-    elif gain.size and np.all(np.isfinite(gain)) and np.any(gain):
-        centre[1:] -= constant * gain / float(gain @ gain)
-    return Offsets(u=centre[1:], y=centre[:1])
-
-
 def _warnings_of(
-    who: Identity, state: State | None, forgetting: Forgetting, *, open_loop: bool, doubtful: bool
+    who: Identity, state: State | None, memory: float, *, open_loop: bool, doubtful: bool
 ) -> tuple[str, ...]:
     """Return what a reader of the estimate has to know.
 
@@ -552,7 +531,6 @@ def _warnings_of(
             "Lower the orders, or begin with a fit that did"
         )
     x, least = who.layout, _FEW * (who.layout.free.size + 1)
-    memory = forgetting.memory
     if memory < least and (x.nc or x.nd or any(x.nf)):
         found.append(
             f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
@@ -585,36 +563,3 @@ def _warnings_of(
     if state.waits:
         found.append(f"{name}: nothing is learnt at present: the filters wait for history after the start or a gap")
     return tuple(found)
-
-
-def _fit_of(
-    who: Identity,
-    model: PolynomialModel,
-    state: State,
-    spread: Array,
-    *,
-    samples: int,
-    warnings: tuple[str, ...],
-) -> BlackBoxFit:
-    """Return the present estimate as a fit.
-
-    `spread`: (n_free, n_free), covariance of the free coefficients; `samples`: taken in so far.
-    """
-    covariance, free = np.zeros((model.theta.size,) * 2), who.layout.free
-    covariance[np.ix_(free, free)] = spread
-    return BlackBoxFit(
-        structure=who.structure,
-        orders=compact_orders(who.structure, who.layout),
-        model=model,
-        covariance=covariance,
-        n_estimated=free.size,
-        offsets=_offsets_of(model, state),
-        noise_covariance=np.array([[noise_variance_of(state)]]),
-        inputs=who.inputs,
-        outputs=who.outputs,
-        units=dict(who.units),
-        dt=who.dt,
-        record={"samples": samples, "rate_hz": 1.0 / who.dt},
-        warnings=warnings,
-        details={"recursive": True, **state.counts()},
-    )

@@ -19,7 +19,7 @@ Table = NDArray[np.int64]
 # of `meta`: sizes; where filters of inputs, residual, gradients and unknown states end; where the other tables begin
 _N, _NU, _LONGEST, _INPUT, _RESIDUAL, _GRADIENT, _STATES, _TERMS, _COLUMNS, _STABLE, _N_STABLE, _V, _E, _W = range(14)
 _POS, _FILL, _RINGING, _USED, _REJECTED, _WAITED, _PROJECTED, _HELD, _LEARNT, _HOLD = range(10)  # of `count`
-_FORGET, _FINAL, _GROWTH, _SQUARES, _WEIGHT, _NOISE, _LEVELS = range(7)  # of `real`
+_FORGET, _SQUARES, _WEIGHT, _NOISE, _LEVELS = range(5)  # of `real`
 _FIRST = 2  # free coefficient
 
 _RADIUS = 0.99999  # roots of C and F stay inside
@@ -140,9 +140,9 @@ def _learn(
         psi[j] = plan[k, 2] * s[plan[k, 0], t - plan[k, 1]]
         e -= psi[j] * (theta[j] - coef[_FIRST + j])
     forget = keep = real[_FORGET]
-    lost = 1.0 - min(forget, real[_FINAL])
+    lost = 1.0 - forget
     every = _EVERY if lost * _EVERY <= 0.5 else max(1, int(0.5 / lost))
-    if count[_LEARNT] % every == 0 and real[_FINAL] < 1.0:
+    if count[_LEARNT] % every == 0 and lost > 0.0:
         # not less than at the start: a signal that stands still has no noise, and its P would grow without end
         noise = max(real[_SQUARES] / real[_WEIGHT], real[_NOISE]) * (1.0 - lost) ** -every
         count[_HOLD] = 0
@@ -152,7 +152,6 @@ def _learn(
     if count[_HOLD]:
         forget = 1.0
         count[_HELD] += 1
-    real[_FORGET] = real[_FINAL] + real[_GROWTH] * (real[_FORGET] - real[_FINAL])
     for j in range(n):
         F[j, j] /= forget
     project(F, psi, f)
@@ -180,16 +179,6 @@ def _learn(
 
 
 @compiled
-def _begin_anew(s: Array, count: Table, longest: int) -> None:
-    """Reject a sample and forget all signals."""
-    count[_REJECTED] += 1
-    s[:] = 0.0
-    count[_POS] = longest
-    count[_FILL] = 0
-    count[_RINGING] = 0
-
-
-@compiled
 def run(
     u: Array,
     y: Array,
@@ -211,25 +200,24 @@ def run(
     longest, width = meta[_LONGEST], s.shape[1]
     for k in range(y.size):
         errors[k] = np.nan
-        x = y[k]
-        for i in range(u.shape[1]):
-            x += u[k, i] * 0.0
-        if not np.isfinite(x):
-            _begin_anew(s, count, longest)
-            continue
         t = count[_POS]
         if t == width:
             for row in range(s.shape[0]):
                 for j in range(longest):
                     s[row, j] = s[row, width - longest + j]
             t = longest
-        s[0, t], s[1, t] = y[k] - real[_LEVELS], 1.0
+        s[0, t], s[1, t], unknown = y[k] - real[_LEVELS], 1.0, 0.0
         for i in range(meta[_NU]):
             s[2 + i, t] = u[k, i] - real[_LEVELS + 1 + i]
+            unknown += u[k, i] * 0.0
         filter_column(plan, meta, 0, meta[_RESIDUAL], coef, s, t)
         e = s[meta[_E], t]
-        if not np.isfinite(e * e):  # too large to compute with
-            _begin_anew(s, count, longest)
+        if not np.isfinite(e * e + y[k] * 0.0 + unknown):  # or too large to compute with: all signals are forgotten
+            count[_REJECTED] += 1
+            count[_POS], count[_FILL], count[_RINGING] = longest, 0, 0
+            for row in range(s.shape[0]):
+                for j in range(width):
+                    s[row, j] = 0.0
             continue
         count[_POS] = t + 1
         count[_USED] += 1

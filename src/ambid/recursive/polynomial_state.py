@@ -57,20 +57,12 @@ class _Writer:
         return self.n_rows - 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Plan:
-    """Tables that the compiled recursion follows."""
+def plan_of(layout: Layout) -> tuple[Table, Table, int]:
+    """Write down the recursion of a structure: its table, where the parts of it begin, and how many signals it has.
 
-    # (n_filters + n_terms + n_columns + n_polynomials, 5), filters (destination, first coefficient and length of the
-    # denominator, first and last term), terms, columns of the gradient (row, lag, sign), polynomials that have to be
-    # stable (first coefficient, length)
-    rows: Table
-    meta: Table  # see `_kernels`
-    n_signals: int
-
-
-def plan_of(layout: Layout) -> Plan:
-    """Write down the recursion of a structure."""
+    Rows of the table (5,): filters (destination, first coefficient and length of the denominator, first and last term),
+    terms, columns of the gradient (row, lag, sign), polynomials that have to be stable (first coefficient, length).
+    """
     n_u, place, n = layout.n_inputs, _coefficients(layout), layout.free.size + 1
     A, C, D, none = place["A", None], place["C", None], place["D", None], (0, 0)
     B, F = [place["B", i] for i in range(n_u)], [place["F", i] for i in range(n_u)]
@@ -114,7 +106,7 @@ def plan_of(layout: Layout) -> Plan:
         for k, row in enumerate(part):
             rows[first + k, : len(row)] = row
     meta = np.array([n, n_u, _longest(layout), *ends, *starts[1:4], len(stable), v, e, first_w], dtype=np.int64)
-    return Plan(rows=rows, meta=meta, n_signals=out.n_rows)
+    return rows, meta, out.n_rows
 
 
 def _coefficients(layout: Layout) -> dict[tuple[str, int | None], tuple[int, int]]:
@@ -133,32 +125,6 @@ def _longest(layout: Layout) -> int:
     return int(reach + max([layout.nc, layout.nd, *layout.nf]))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Forgetting:
-    """How fast old samples lose their weight: lambda(t) = final + growth (lambda(t - 1) - final)."""
-
-    # weight of the last sample beside the present one in the long run; 1 forgets nothing. The memory is 1/(1 - final)
-    # samples.
-    final: float = 1.0
-    first: float | None = None  # the same at the beginning; None: `final`
-    growth: float = 0.99  # between 0 and 1: how slowly the one becomes the other
-
-    def __post_init__(self) -> None:
-        for name, value in (("final", self.final), ("first", self.first), ("growth", self.growth)):
-            if value is not None and not 0.0 < value <= 1.0:
-                raise EstimationError(f"forgetting: {name} = {value}; it must be above 0 and at most 1. Correct it")
-
-    @property
-    def memory(self) -> float:
-        """Samples of about the same weight, in the long run."""
-        return float("inf") if self.final == 1.0 else 1.0 / (1.0 - self.final)
-
-    @property
-    def forgets(self) -> bool:
-        """Whether any sample loses weight."""
-        return self.final < 1.0 or (self.first is not None and self.first < 1.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class State:
     """Arrays that the compiled recursion works on, in the order of its arguments."""
@@ -166,8 +132,8 @@ class State:
     plan: Table  # see `plan` and `_kernels`
     meta: Table
     count: Table
-    # (7 + n_inputs,), forgetting factors, squared errors and their weight, noise variance of the start, levels that
-    # are taken off
+    # (5 + n_inputs,), forgetting factor, squared errors and their weight, noise variance of the start, levels that are
+    # taken off
     real: Array
     theta: Array  # (n,), estimate: free coefficients, then the constant
     coef: Array  # (2 + n,), 1, -1, then the same, C and F kept stable: what the filters use
@@ -189,7 +155,7 @@ class State:
     @property
     def levels(self) -> Array:
         """What is taken off output and inputs, shape (1 + n_inputs,)."""
-        return self.real[6:]
+        return self.real[4:]
 
     def counts(self) -> dict[str, int]:
         """Return how many samples were used, rejected, waited, projected and held."""
@@ -209,20 +175,7 @@ class State:
     @property
     def worse(self) -> float:
         """Standard deviation of the innovations over that of the start."""
-        return float(np.sqrt(self.real[3] / self.real[4] / self.real[5]))
-
-    def go_on_counting(self, before: State | None, samples: int) -> None:
-        """Take over counters and the forgetting of the moment, as if the samples had been taken in one by one.
-
-        `before`: none: this is the first estimate; `samples`: taken in so far.
-        """
-        self.count[list(COUNTED)] = [samples, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
-        if before is not None:
-            self.real[0] = before.real[0]
-
-    def copy(self) -> State:
-        """Return a state that shares nothing with this one."""
-        return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+        return float(np.sqrt(self.real[1] / self.real[2] / self.real[3]))
 
 
 def new_state(
@@ -234,7 +187,7 @@ def new_state(
     noise_variance: float,
     weight: float,
     centre: Array,
-    forgetting: Forgetting,
+    forgetting: float,
 ) -> State:
     """Return a state with no past signals.
 
@@ -244,29 +197,26 @@ def new_state(
     """
     from ambid.recursive.polynomial_kernels import follow
 
-    plan = plan_of(layout)
-    longest = int(plan.meta[2])
-    first = forgetting.final if forgetting.first is None else forgetting.first
+    rows, meta, n_signals = plan_of(layout)
+    longest = int(meta[2])
     F = factors_of(P)
     count = np.zeros(16, dtype=np.int64)
     count[0] = longest
     sd = np.sqrt(np.diag(P))
     inverse = np.linalg.inv(root_of_factors(F) / sd[:, None]) / sd
     coef, work = np.concatenate([[1.0, -1.0], theta]), np.zeros((3, 2 + theta.size))
-    follow(plan.rows, plan.meta, theta, coef, work[2])
+    follow(rows, meta, theta, coef, work[2])
     return State(
-        plan=plan.rows,
-        meta=plan.meta,
+        plan=rows,
+        meta=meta,
         count=count,
-        real=np.concatenate(
-            [[first, forgetting.final, forgetting.growth, noise_variance * weight, weight, noise_variance], centre]
-        ),
+        real=np.concatenate([[forgetting, noise_variance * weight, weight, noise_variance], centre]),
         theta=theta.copy(),
         coef=coef,
         F=F,
-        S=np.asarray(inverse.T @ inverse) * noise_variance if forgetting.forgets else np.empty((0, 0)),
+        S=np.asarray(inverse.T @ inverse) * noise_variance if forgetting < 1.0 else np.empty((0, 0)),
         limit=limit.copy(),
-        signals=np.zeros((plan.n_signals, longest + _COLUMNS)),
+        signals=np.zeros((n_signals, longest + _COLUMNS)),
         work=work,
     )
 
@@ -289,7 +239,7 @@ def covariance_of_state(state: State, *, doubtful: bool = False) -> Array:
 
 def noise_variance_of(state: State) -> float:
     """Return the variance of the innovations."""
-    return float(state.real[3] / state.real[4])
+    return float(state.real[1] / state.real[2])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -339,7 +289,7 @@ def identity_of(fit: BlackBoxFit) -> Identity:
     )
 
 
-def state_from_fit(fit: BlackBoxFit, layout: Layout, forgetting: Forgetting, *, samples: int | None = None) -> State:
+def state_from_fit(fit: BlackBoxFit, layout: Layout, forgetting: float, *, samples: int | None = None) -> State:
     """Return a state whose prior information is what the fit knows."""
     noise = float(fit.noise_covariance[0, 0])
     if fit.covariance is None or not noise > 0.0:

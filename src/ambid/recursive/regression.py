@@ -38,9 +38,7 @@ _FLOAT = np.dtype(np.float64)
 
 
 class Recursion:
-    """State and interface of a recursion; its kernel is the only thing that differs."""
-
-    _kernel = "regress"
+    """State and interface of a recursion; its compiled loop is the only thing that differs."""
 
     def __init__(
         self, names: tuple[str, ...], width: int, size: int, start: ArrayLike | None, noise_sd: float | None
@@ -51,7 +49,7 @@ class Recursion:
         self._s[self._at.SIZE] = p
         self._known_noise = None if noise_sd is None else positive("noise_sd", noise_sd) ** 2
         self._s[self._at.HEAD :][:p] = numbers("start", 0.0 if start is None else start, p)
-        self._one = (np.zeros((1, width)), np.zeros(1), np.zeros(1))
+        self._one = (np.zeros((1, width)), np.zeros(1))
 
     @property
     def _at(self) -> Any:
@@ -103,18 +101,19 @@ class Recursion:
         Returns y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
         """
         if isinstance(y, float) and type(phi) is np.ndarray and phi.shape == self._shape and phi.dtype is _FLOAT:
-            row, value, error = self._one
+            row, value = self._one
             row[0] = phi
             value[0] = y
+            error = np.empty(1)
             self._run(row, value, error)
-            return np.array(error[0])
+            return error.reshape(())
         rows, values, shape = as_blocks("regression", phi, y, self._shape[0])
         out = np.empty(values.size)
         self._run(rows, values[:, 0], out)
         return out.reshape(shape)
 
     def _run(self, rows: Array, y: Array, out: Array) -> None:
-        getattr(kernels("regression"), self._kernel)(self._s, rows, y, out)
+        kernels("regression").regress(self._s, rows, y, out)
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state."""
@@ -478,8 +477,6 @@ class RecursiveInstrumentalVariables(Recursion):
         If a setting is out of its range.
     """
 
-    _kernel = "instrumental"
-
     def __init__(
         self,
         names: Sequence[str] | int,
@@ -524,6 +521,9 @@ class RecursiveInstrumentalVariables(Recursion):
         part["R"][:, :m] = np.diag(size)
         part["R"][:p, m:-1] = T
         part["R"][:p, -1] = T @ part["estimate"]
+
+    def _run(self, rows: Array, y: Array, out: Array) -> None:
+        kernels("regression").instrumental(self._s, rows, y, out)
 
     @property
     def _m(self) -> int:

@@ -40,14 +40,6 @@ def variance(F: Array, i: int) -> float:
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def solve(F: Array, a: Array) -> None:
-    """Replace a by U⁻¹ a."""
-    for j in range(a.size - 1, 0, -1):
-        for i in range(j):
-            a[i] -= a[j] * F[j, i]
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
 def shrink(F: Array, f: Array, r: float, k: Array) -> float:
     """Take in a measurement of noise variance r > 0 that sees f = Uᵀ h (Bierman 1977, sec. V.3).
 
