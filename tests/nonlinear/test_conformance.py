@@ -11,7 +11,7 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.fit_file import (
     MODEL_KINDS,
     model_from_json,
@@ -19,7 +19,6 @@ from ambid.nonlinear.fit_file import (
     nonlinear_fit_from_json,
     nonlinear_fit_text,
 )
-from ambid.nonlinear.model import NonlinearModel
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, NonlinearStructure, nonlinear_structure
 from tests.nonlinear.systems import SETTINGS, runaway, smooth
 

@@ -8,7 +8,7 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.nonlinear.fit import NonlinearFit as NonlinearFit
-    from ambid.nonlinear.model import NonlinearModel as NonlinearModel
+    from ambid.nonlinear.fit import NonlinearModel as NonlinearModel
     from ambid.nonlinear.selection import select_terms as select_terms
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -19,8 +19,7 @@ from ambid.estimation.documents import (
     read_as,
     read_whole,
 )
-from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.model import NonlinearModel
+from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
 
 SCHEMA = "ambid.fit/1"

@@ -23,7 +23,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.nonlinear.blocks import Block, Linear, Mask, Table
 from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.signals import finite, scaled, with_head
+from ambid.nonlinear.records import finite, scaled, with_head
 
 _FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
 
@@ -361,7 +361,7 @@ class LaggedModel:
     """A lagged function with its parameters, scaling and training cloud.
 
     The predictor takes innovations before its first prediction as zero. Implements
-    `ambid.nonlinear.model.NonlinearModel`.
+    `ambid.nonlinear.fit.NonlinearModel`.
     """
 
     dt: float  # s

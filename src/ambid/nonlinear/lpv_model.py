@@ -31,7 +31,7 @@ from ambid.blackbox.roots import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
 from ambid.estimation.documents import fields_json, read_as
 from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.signals import finite, scaled, with_head
+from ambid.nonlinear.records import finite, scaled, with_head
 
 Complex = NDArray[np.complex128]
 
@@ -416,7 +416,7 @@ class LpvModel:
     """A linear model of one output whose coefficients follow a scheduling signal.
 
     What was before a record the predictor estimates from the first `lag` samples, see `beginning`. Implements
-    `ambid.nonlinear.model.NonlinearModel`.
+    `ambid.nonlinear.fit.NonlinearModel`.
     """
 
     dt: float  # s

@@ -28,8 +28,7 @@ from ambid.nonlinear.blocks import UNITS, Block, Linear, Radial, unit_values
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import LaggedProblem, problem_at
-from ambid.nonlinear.records import Parts
-from ambid.nonlinear.signals import finite
+from ambid.nonlinear.records import Parts, finite
 
 _DEPENDENT = 1e-10  # squared length left of a candidate that the chosen ones hold already
 _BLOCK = 4096

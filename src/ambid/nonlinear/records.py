@@ -1,15 +1,17 @@
-"""Records of one bench in deviations from common levels, in common units: results do not depend on the user's units."""
+"""Records of one bench, and signals for a model, in scaled deviations from common levels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
+from ambid.nonlinear.fit import NonlinearModel
 
 Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
@@ -88,3 +90,47 @@ def _group(
     off = np.abs(mean) > _FAR * sd if levels == "auto" else np.full(mean.shape, levels == "mean")
     level, scale = np.where(off, mean, 0.0), np.where(off, sd, np.hypot(mean, sd))
     return [(x - level) / scale for x in values], level, scale
+
+
+class ScaledModel(NonlinearModel, Protocol):
+    """A nonlinear model that works on scaled deviations of the signals."""
+
+    @property
+    def u_level(self) -> Array: ...  # noqa: D102
+    @property
+    def u_scale(self) -> Array: ...  # noqa: D102
+    @property
+    def y_level(self) -> Array: ...  # noqa: D102
+    @property
+    def y_scale(self) -> Array: ...  # noqa: D102
+
+
+def scaled(model: ScaledModel, u: Array, y: Array) -> tuple[Array, Array]:
+    """Return outputs and inputs, given in SI, in a model's scaled units."""
+    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    n = y.shape[0] if y.ndim else 0
+    if (u.shape, y.shape) != ((n, model.n_inputs), (n, model.n_outputs)):
+        raise EstimationError(
+            f"inputs of shape {u.shape} and outputs of shape {y.shape} for a model of {model.n_inputs} and "
+            f"{model.n_outputs} channels; time is axis 0. Pass (n_samples, n_channels)"
+        )
+    return (y - model.y_level) / model.y_scale, (u - model.u_level) / model.u_scale
+
+
+def with_head(model: ScaledModel, u: Array, y: Array) -> tuple[Array, int]:
+    """Return outputs as long as the inputs, and how many rows of `y` were taken over: `lag`, the others are zero."""
+    u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    head = min(model.lag, u.shape[0])
+    if y.ndim != 2 or y.shape[0] < head:
+        raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
+    whole = np.zeros((u.shape[0], y.shape[1]))
+    whole[:head] = y[:head]
+    return whole, head
+
+
+def finite(value: Any, n: int, what: str) -> Array:
+    """Return `n` stored numbers, shape (n,); raises ValueError about `what` where they are not finite."""
+    out = np.array(value, dtype=np.float64).reshape(n)
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f"{what} is not finite")
+    return out

@@ -24,8 +24,7 @@ from ambid.estimation.documents import fields_json, read_as
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.search import search
 from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.records import Parts
-from ambid.nonlinear.signals import finite, scaled, with_head
+from ambid.nonlinear.records import Parts, finite, scaled, with_head
 
 Table = NDArray[np.int64]
 

@@ -27,8 +27,7 @@ class NonlinearStructure:
 
     name: str  # for lists
     summary: str
-    # settings by name, each with a line that says what it is and what is chosen without it; or their dataclass
-    options: Mapping[str, str] | str
+    options: str  # ``module:class`` of its settings
     home: str  # ``module:function`` of its estimator
     # what feedback does to it: nothing; bias; nothing as long as its noise model holds the true one
     feedback: Literal["consistent", "biased", "with noise model"]
@@ -42,9 +41,7 @@ class NonlinearStructure:
     @property
     def settings(self) -> Mapping[str, str]:
         """Settings by name, each with a line that says what it is and what is chosen without it."""
-        if isinstance(self.options, str):
-            return {name: rule.says for name, rule in rules(_load(self.options)).items()}
-        return self.options
+        return {name: rule.says for name, rule in rules(_load(self.options)).items()}
 
 
 def _load(home: str) -> Any:
@@ -109,10 +106,7 @@ NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _EN
 
 
 def nonlinear_structure(name: str) -> NonlinearStructure:
-    """Return a nonlinear structure by name.
-
-    `name`: such as ``"narmax"``. Returns from the register.
-    """
+    """Return a nonlinear structure of the register by name, such as ``"narmax"``."""
     if name not in NONLINEAR_STRUCTURES:
         known = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(

@@ -14,8 +14,7 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria, skipped
 from ambid.estimation.parts import Check
-from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.model import NonlinearModel
+from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.validate.residuals import (
     LEAST,
