@@ -12,10 +12,10 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json, fit_text
 from ambid.blackbox.model import response_covariance
+from ambid.blackbox.prediction import innovations_form
 from ambid.blackbox.structures import STRUCTURES, Structure
 from ambid.errors import EstimationError
-from ambid.validate.blackbox import judge
-from ambid.validate.blackbox_predictor import innovations_form
+from ambid.validate.fits import judge
 from tests.blackbox import systems
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 40, 12)

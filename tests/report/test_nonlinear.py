@@ -20,7 +20,7 @@ from ambid.report.fit_text import (
     term_lines,
 )
 from ambid.report.nonlinear_figures import bars_of, nonlinear_overview, traces_of
-from ambid.validate.nonlinear import judge
+from ambid.validate.fits import judge
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.polynomial import arma, armax, arx, oe
-from ambid.validate.blackbox import judge, residuals_of
-from ambid.validate.blackbox_predictor import errors, gradient
+from ambid.blackbox.prediction import errors, gradient
+from ambid.validate.fits import judge, linear_residuals
 from ambid.validate.residuals import correlations
 from tests.validate.blackbox.fits import io, polynomial, run
 
@@ -79,7 +79,7 @@ def test_false_alarms_are_as_rare_as_promised(name, test):
 
 def shown(fit, data, n_lags):
     found = errors(fit, data)
-    residuals = residuals_of(fit, data, found, gradient(fit, data, found))
+    residuals = linear_residuals(fit, data, found, gradient(fit, data, found))
     return correlations(residuals, data.inputs, data.outputs, n_lags=n_lags)
 
 

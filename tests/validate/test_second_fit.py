@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.nonlinear import judge, validation
-from ambid.validate.second_record import objections
+from ambid.validate.fits import judge, objections, validation
 from tests.nonlinear.systems import smooth
 
 

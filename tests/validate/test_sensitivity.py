@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.polynomial import fir, oe
+from ambid.blackbox.prediction import errors
 from ambid.errors import EstimationError
-from ambid.validate.blackbox_predictor import errors
 from ambid.validate.sensitivity import sensitivity_analysis
 from tests.validate.blackbox.fits import arx, io, polynomial, run
 

@@ -1,7 +1,7 @@
 """The register of black-box structures: what each is called, which orders it takes, whether feedback disturbs it.
 
 An estimator is a function ``estimator(data, orders, **options) -> BlackBoxFit`` that leaves `fit`, `criteria` and
-`checks` to `ambid.validate.blackbox`; it imports only when it is asked for.
+`checks` to `ambid.validate.fits`; it imports only when it is asked for.
 """
 
 from __future__ import annotations

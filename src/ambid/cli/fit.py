@@ -183,7 +183,7 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
 
 def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
     """Say why a fit does not hold on the second record, a line for each reason; empty where it was not judged there."""
-    from ambid.validate.second_record import objections
+    from ambid.validate.fits import objections
 
     validation: Any = found.validation
     against = () if validation is None else objections(found, validation)

@@ -144,14 +144,14 @@ def _estimate_linear(
     clock: Clock,
     say: Tick,
 ) -> BlackBoxFit:
-    from ambid.validate.blackbox import judge
+    from ambid.validate.fits import judge
 
     chosen: dict[str, object] = {}
     if orders is None:
         orders, chosen = _choose_orders(of, data, criterion, say)
         clock.lap("orders")
     say("fit", _ORDERS if chosen else None)
-    found = of.estimator(data, orders, **options)
+    found: BlackBoxFit = of.estimator(data, orders, **options)
     clock.lap("fit")
     say("check")
     found = judge(found, data, second=second)
@@ -167,7 +167,7 @@ def _estimate_nonlinear(
     clock: Clock,
     say: Tick,
 ) -> NonlinearFit:
-    from ambid.validate.nonlinear import judge
+    from ambid.validate.fits import judge
 
     found = nonlinear_structure(name).estimator(data, settings, seed=seed, tick=part_of(say, 0.0, _SEARCH))
     clock.lap("fit")

@@ -114,6 +114,7 @@ def judge(
     `known`: of that fit; `bench`: the record it came from, channels named by role.
     """
     from ambid.bearing.result import estimate_of
+    from ambid.estimation.prediction import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validate import physical
     from ambid.validate.residuals import fit_of
@@ -128,7 +129,7 @@ def judge(
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
     checks |= physical.assumption_checks(fit, known, delay_how)
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
-    y, error = problem.y[problem.skip :], physical.simulation_error(fit)
+    y, error = problem.y[problem.skip :], simulation_error(fit)
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
         means={role: float(bench[role].mean()) for role in (*problem.model.inputs, *problem.model.outputs)},

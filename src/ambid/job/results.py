@@ -19,9 +19,9 @@ from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 from ambid.physics.models import model
 from ambid.record.files import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
-from ambid.validate.blackbox import validation as linear_validation
-from ambid.validate.nonlinear import validation as nonlinear_validation
-from ambid.validate.second_record import objections, validation
+from ambid.validate.fits import objections
+from ambid.validate.fits import validation as fit_validation
+from ambid.validate.second_record import validation
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate
@@ -92,8 +92,7 @@ def validate(
         )
         data = channels.read(record, part)
         check_same_bench(known.units, known.dt, data)
-        judge: Any = linear_validation if isinstance(known, BlackBoxFit) else nonlinear_validation
-        found = judge(known, data)
+        found = fit_validation(known, data)
         against = objections(known, found)
         return {"samples": data.n_samples, "fit": found, "passed": not against, "objections": list(against)}
     bench = rig_of(known, path) if rig is None else rig

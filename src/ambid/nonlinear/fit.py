@@ -195,7 +195,7 @@ class NonlinearFit:
     criteria : Mapping[str, float]
         ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
     checks : Mapping[str, Check]
-        Made by `ambid.validate.nonlinear`.
+        Made by `ambid.validate.fits`.
     validation : Mapping[str, object] or None
         By output, on a second record.
     warnings : tuple of str

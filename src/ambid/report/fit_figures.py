@@ -12,6 +12,7 @@ from ambid.bearing.measured import Measured, ModelResponse, model_responses, wit
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import pole_covariance, zero_covariance
+from ambid.blackbox.prediction import innovations_form, plant_form
 from ambid.blackbox.response import one_step, simulation
 from ambid.blackbox.transfer_model import TransferModel
 from ambid.report.drawing import (
@@ -38,7 +39,6 @@ from ambid.report.drawing import (
 )
 from ambid.report.fit_text import pole_lines
 from ambid.report.numbers import sized
-from ambid.validate.blackbox_predictor import innovations_form, plant_form
 from ambid.validate.stabilisation import ModePole, Stabilisation
 
 if TYPE_CHECKING:

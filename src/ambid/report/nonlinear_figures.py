@@ -30,7 +30,7 @@ from ambid.report.drawing import (
 from ambid.report.fit_text import is_weight
 from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
-from ambid.validate.nonlinear import beyond, leaves_colour_open, model_of, residuals_of, run
+from ambid.validate.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
 from ambid.validate.residuals import Correlation, correlations
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def correlations_of(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correl
     found = [run(fit, x) for x in records]
     if not all(x.finite for x in found):
         return []
-    prepared = residuals_of(fit, records, found, coloured=leaves_colour_open(fit, records, found))
+    prepared = nonlinear_residuals(fit, records, found, coloured=leaves_colour_open(fit, records, found))
     return [] if prepared is None else correlations(prepared, records[0].inputs, records[0].outputs)[:_MOST]
 
 

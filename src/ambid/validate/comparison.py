@@ -13,7 +13,7 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.validate.blackbox import judge
+from ambid.validate.fits import judge
 from ambid.validate.orders import HELD_OUT, hold_out, select
 
 

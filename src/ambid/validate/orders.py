@@ -19,11 +19,11 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, UsedOrders, compact_order
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.prediction import errors, errors_elsewhere
 from ambid.blackbox.structures import Structure, structure
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.criteria import criteria, skipped
 from ambid.signals.delay import lagged_triangle
-from ambid.validate.blackbox_predictor import errors, errors_elsewhere
 from ambid.validate.residuals import autoregression
 
 Criterion = Literal["aic", "aicc", "bic", "mdl", "fpe", "holdout", "kfold"]

@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
-from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.likelihood import Fit, search, weight_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.parts import Check
+from ambid.estimation.prediction import expected_prediction_sd, prediction_error, simulation_error
 from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.models import model
-from ambid.validate.physical import expected_prediction_sd, innovation_tests, prediction_error, simulation_error
+from ambid.validate.physical import innovation_tests
 from ambid.validate.residuals import fit_of, residual_check
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _HORIZONS = (1, 10, 100)  # samples ahead
-
-_GROWN = 1.5
-"""Times the errors of identification, as for physical estimates."""
-_OUTSIDE = 0.1
-"""Part of the record outside the training data, as for the nonlinear magnet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -202,27 +193,3 @@ def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
             f"(within a factor {_RATIO:g})",
         ),
     }
-
-
-def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return why a fit does not hold on a second record.
-
-    `found`: by output, as `validate.blackbox.validation` or `validate.nonlinear.validation` give it. Returns one
-    line each; empty where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the
-    record lies outside the training data (which a linear fit does not know).
-    """
-    said = []
-    for name, sizes in found.items():
-        one, usual = sizes["one_step"], fit.fit[name].innovation_sd
-        if one is None or not math.isfinite(one["rmse"]):
-            said.append(f"no one-step prediction of {name} that stays finite")
-        elif one["rmse"] > _GROWN * usual:
-            said.append(
-                f"one-step errors of {name} are {one['rmse'] / usual:.3g} times as large as at identification"
-                if usual > 0
-                else f"one-step errors of {name} are not zero as they were at identification"
-            )
-    share = max((float(sizes.get("extrapolated", 0.0)) for sizes in found.values()), default=0.0)
-    if share > _OUTSIDE:
-        said.append(f"{100 * share:.2g} % of it lies outside the training data, where standard deviations say nothing")
-    return tuple(said)

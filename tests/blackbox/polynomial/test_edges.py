@@ -9,9 +9,9 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
+from ambid.blackbox.cancellation import cancellations
 from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
-from ambid.validate.blackbox import cancellations
 from tests.blackbox.polynomial.systems import SYSTEMS, A, B, System, record, unstable_loop
 
 BOTH = {"nb": 2, "nf": 2}

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria, skipped
-from ambid.validate.blackbox import judge
+from ambid.validate.fits import judge
 from tests.validate.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.nonlinear import judge, residuals_of, run
+from ambid.validate.fits import judge, nonlinear_residuals, run
 from ambid.validate.residuals import correlations
 from tests.validate.nonlinear.plants import io, levitated, output_error, squared
 
@@ -85,7 +85,7 @@ def test_bounds_hold_99_percent_of_the_correlations() -> None:
     for seed in range(15):
         data = [squared(400, 1000 + seed), squared(300, 2000 + seed)]
         fit = narmax(data, TRUE)
-        prepared = residuals_of(fit, data, [run(fit, x) for x in data], coloured=False)
+        prepared = nonlinear_residuals(fit, data, [run(fit, x) for x in data], coloured=False)
         assert prepared is not None
         shown = correlations(prepared, ["u"], ["y"])
         assert [c.title for c in shown] == [

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.estimation.likelihood import search
+from ambid.estimation.prediction import expected_prediction_sd, prediction_error, simulation_error
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations
-from ambid.validate.physical import expected_prediction_sd, prediction_error, simulation_error
 from ambid.validate.residuals import fit_of
 from tests.bearing.benches import problem_of, run
 from tests.estimation.reference import sampled
