@@ -29,6 +29,11 @@ def evidence(estimate, records):
     return bearing_evidence(estimate, [(r, 2.0) for r in records.values()])
 
 
+@pytest.fixture(scope="module")
+def drawn(evidence):
+    return figures(evidence)
+
+
 def test_the_text_holds_all_and_keeps_its_width(estimate):
     text = estimate_text(estimate)
     assert max(map(len, text.splitlines())) <= 80
@@ -67,8 +72,7 @@ def test_extrapolation_is_marked(estimate):
     assert not ell[1][1].endswith("*")  # a held rotor shows the coil there
 
 
-def test_every_record_is_drawn(evidence, estimate):
-    drawn = figures(evidence)
+def test_every_record_is_drawn(evidence, estimate, drawn):
     assert set(drawn) == {"curves", "map", "records"}
     titles = [a.get_title(loc="left") for a in drawn["records"].axes]
     assert [t for t in titles if t] == list(estimate.noise)
@@ -81,8 +85,8 @@ def test_every_record_is_drawn(evidence, estimate):
     assert page.get_size_inches()[1] > sum(1.0 for _ in estimate.noise)
 
 
-def test_the_line_of_balance_is_drawn_for_one_magnet(evidence):
-    where = figures(evidence)["map"].axes[0]
+def test_the_line_of_balance_is_drawn_for_one_magnet(drawn):
+    where = drawn["map"].axes[0]
     assert "carries the weight" in [t.get_text() for t in where.get_legend().get_texts()]
 
 

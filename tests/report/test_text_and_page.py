@@ -3,6 +3,8 @@
 import re
 from dataclasses import replace
 
+import pytest
+
 from ambid.estimation.parts import Check
 from ambid.report.estimate_text import estimate_text
 from ambid.report.page import report_html
@@ -64,20 +66,9 @@ def test_columns_and_checks_line_up():
     assert lines == ["✓ ab    fine", "✗ abcd  wrong"]
 
 
-def test_the_report_holds_everything_and_needs_nothing_else(unstable):
-    page = report_html(unstable, made="2001-01-01")
-    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
-    assert "http" not in page
-    assert page.count("data:image/png;base64,") == 4
-    for p in unstable.estimate.parameters:
-        assert f"<b>{p.name}</b>" in page
-    for name in unstable.estimate.checks:
-        assert name in page
-    for words in ("ambid 0.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
-        assert words in page
-
-
-def test_the_second_record_is_shown(unstable):
+@pytest.fixture(scope="module")
+def judged(unstable):
+    """The estimate with a second record, and a file name that holds markup."""
     fit = {"one_step": 0.9, "simulation": None, "innovation_rms": 1.0, "k_step": {"1": 0.9, "10": 0.8}}
     validation = {
         "fit": {"position": fit, "current": fit},
@@ -86,8 +77,28 @@ def test_the_second_record_is_shown(unstable):
         "samples": 100,
     }
     record = {**unstable.estimate.record, "file": "<script>alert(1)</script>.csv"}
-    e = replace(unstable.estimate, validation=validation, record=record)
-    page, text = report_html(replace(unstable, estimate=e)), estimate_text(e)
+    return replace(unstable, estimate=replace(unstable.estimate, validation=validation, record=record))
+
+
+@pytest.fixture(scope="module")
+def page(judged):
+    return report_html(judged, made="2001-01-01")
+
+
+def test_the_report_holds_everything_and_needs_nothing_else(page, judged):
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
+    assert "http" not in page
+    assert page.count("data:image/png;base64,") == 4
+    for p in judged.estimate.parameters:
+        assert f"<b>{p.name}</b>" in page
+    for name in judged.estimate.checks:
+        assert name in page
+    for words in ("ambid 0.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):
+        assert words in page
+
+
+def test_the_second_record_is_shown(page, judged):
+    text = estimate_text(judged.estimate)
     assert "<script>" not in page  # what comes from files is escaped
     assert "On the second record" in page
     assert "✗ residuals_white" in page

@@ -53,7 +53,7 @@ def single(height: float, draw: Draw) -> Figure:
     """Return one drawing as a figure."""
     from matplotlib.figure import Figure
 
-    page = Figure(figsize=(11.0, height), layout="constrained")
+    page = Figure(figsize=(11.0, height + 0.1), layout="constrained")
     draw(page)
     return page
 

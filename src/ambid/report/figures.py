@@ -140,7 +140,7 @@ def overview(evidence: Evidence | BearingEvidence) -> Figure:
 
 def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
     """Draw the figures one by one, as a report shows them."""
-    return {name: single(height + 0.1, draw) for name, (height, draw) in evidence.drawings().items()}
+    return {name: single(height, draw) for name, (height, draw) in evidence.drawings().items()}
 
 
 # --- a linear plant -------------------------------------------------------------------------------------------------
