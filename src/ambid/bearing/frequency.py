@@ -21,7 +21,7 @@ from ambid.errors import EstimationError, nearest
 from ambid.estimation import start as weak_form
 from ambid.estimation.estimate import Continuous
 from ambid.estimation.linear import directions, one_thread
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, parameter_named
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, Parametric
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
@@ -211,7 +211,7 @@ _NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrequencyEstimate:
+class FrequencyEstimate(Parametric, Judged):
     """Physical parameters from a frequency response."""
 
     status: Literal["converged", "stalled"]
@@ -228,20 +228,6 @@ class FrequencyEstimate:
     # singular values of the scaled information matrix and the weakest direction
     information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameter values, SI."""
-        return {p.name: p.value for p in self.parameters}
-
-    @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
-
-    def parameter(self, name: str) -> EstimatedParameter:
-        """Return one parameter by name."""
-        return parameter_named(self.parameters, name)
 
 
 def frequency_estimate(

@@ -20,7 +20,7 @@ from ambid.bearing.physical_target import Target, target_of
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
-from ambid.estimation.parts import Check, Delay, EstimatedParameter
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, Parametric
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -31,7 +31,7 @@ _GROSS = 25.0  # chi-square over degrees of freedom from which nothing of it is 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PhysicalFit:
+class PhysicalFit(Parametric):
     """Physical parameters that follow from a black-box model."""
 
     model: str  # name of the physical model
@@ -46,11 +46,6 @@ class PhysicalFit:
     # direction with the smallest singular value: share of each parameter, largest in magnitude 1
     weakest: Mapping[str, float]
     warnings: tuple[str, ...] = ()
-
-    @property
-    def values(self) -> Mapping[str, float]:
-        """Value of every parameter, SI."""
-        return {p.name: p.value for p in self.parameters}
 
     @property
     def passed(self) -> bool:

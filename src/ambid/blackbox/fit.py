@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,11 +14,11 @@ from ambid.blackbox.model import BlackBoxModel
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
-from ambid.estimation.parts import Check, OutputFit
+from ambid.estimation.parts import FittedModel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlackBoxFit:
+class BlackBoxFit(FittedModel):
     """An identified black-box model, file schema ``ambid.fit/1``.
 
     Attributes
@@ -56,36 +55,11 @@ class BlackBoxFit:
         Further results of the method as JSON-able values (singular values, condition numbers, chosen horizons).
     """
 
-    structure: str
     orders: UsedOrders
     model: BlackBoxModel
-    covariance: Array | None
-    n_estimated: int
     offsets: Offsets
-    noise_covariance: Array
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    dt: float
     record: Mapping[str, object]
     status: Literal["converged", "stalled"] = "converged"
-    fit: Mapping[str, OutputFit] = field(default_factory=lambda: MappingProxyType({}))
-    criteria: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
-    validation: Mapping[str, object] | None = None
-    warnings: tuple[str, ...] = ()
-    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def sd(self) -> Array | None:
-        """Standard deviation of ``model.theta``, shape (n_theta,), or None."""
-        return None if self.covariance is None else np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
-    @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
 
 
 def build_fit(

@@ -20,7 +20,7 @@ from ambid.estimation.documents import (
     read_as,
     read_whole,
 )
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit, parameter_named
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, OutputFit, Parametric
 from ambid.physics.models import model
 
 
@@ -48,7 +48,7 @@ class NoiseModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Estimate:
+class Estimate(Parametric, Judged):
     """Result of the main job.
 
     Attributes
@@ -106,34 +106,6 @@ class Estimate:
     information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     global_search: Mapping[str, object] | None = None
-
-    def parameter(self, name: str) -> EstimatedParameter:
-        """Return one parameter by name.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        EstimatedParameter
-
-        Raises
-        ------
-        EstimationError
-            If the model has none of that name.
-        """
-        return parameter_named(self.parameters, name)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameter values, SI."""
-        return {p.name: p.value for p in self.parameters}
-
-    @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.

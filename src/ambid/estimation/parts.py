@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
+import numpy as np
+
+from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 
 
@@ -54,12 +57,62 @@ class OutputFit:
     innovation_sd: float  # SI
 
 
-def parameter_named(parameters: Sequence[EstimatedParameter], name: str) -> EstimatedParameter:
-    """Return one of several parameters."""
-    for p in parameters:
-        if p.name == name:
-            return p
-    names = [p.name for p in parameters]
-    raise EstimationError(
-        f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
-    )
+class Judged:
+    """A result with a status and checks."""
+
+    __slots__ = ()
+    status: str
+    checks: Mapping[str, Check]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the search converged and every check passed."""
+        return self.status == "converged" and all(c.passed for c in self.checks.values())
+
+
+class Parametric:
+    """A result that has named parameters."""
+
+    __slots__ = ()
+    parameters: tuple[EstimatedParameter, ...]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameter values, SI."""
+        return {p.name: p.value for p in self.parameters}
+
+    def parameter(self, name: str) -> EstimatedParameter:
+        """Return one parameter by name; EstimationError where there is none of that name."""
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        names = [p.name for p in self.parameters]
+        raise EstimationError(
+            f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FittedModel(Judged):
+    """What the fits of all structures hold, linear or not; their own classes say what it means there."""
+
+    structure: str
+    covariance: Array | None
+    n_estimated: int
+    noise_covariance: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    dt: float
+    fit: Mapping[str, OutputFit] = field(default_factory=lambda: MappingProxyType({}))
+    criteria: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
+    validation: Mapping[str, object] | None = None
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def sd(self) -> Array | None:
+        """Standard deviation of ``model.theta``, shape (n_theta,), or None."""
+        return None if self.covariance is None else np.sqrt(np.maximum(np.diag(self.covariance), 0.0))

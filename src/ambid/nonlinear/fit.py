@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.parts import Check, OutputFit
+from ambid.estimation.parts import FittedModel
 
 Settings = Mapping[str, int | float | str | tuple[int, ...]]
 """What a structure is told: lags, degrees, neurons, ..., by name; what is left out the method chooses and reports."""
@@ -154,7 +153,7 @@ class LearningCurve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NonlinearFit:
+class NonlinearFit(FittedModel):
     """An identified nonlinear model, file schema ``ambid.fit/1``.
 
     Attributes
@@ -206,39 +205,14 @@ class NonlinearFit:
         Further results of the method as JSON-able values (terms with their error reduction ratios, chosen lags).
     """
 
-    structure: str
     settings: Mapping[str, object]
     model: NonlinearModel | None
-    covariance: Array | None
-    n_estimated: int
-    noise_covariance: Array
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    dt: float
     records: tuple[Mapping[str, object], ...]
     seed: int = 0
     covariance_from: str = ""
     status: Literal["converged", "stalled", "failed"] = "converged"
     reason: str = ""
     curves: tuple[LearningCurve, ...] = ()
-    fit: Mapping[str, OutputFit] = field(default_factory=lambda: MappingProxyType({}))
-    criteria: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
-    validation: Mapping[str, object] | None = None
-    warnings: tuple[str, ...] = ()
-    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
-
-    @property
-    def sd(self) -> Array | None:
-        """Standard deviation of ``model.theta``, shape (n_theta,), or None."""
-        return None if self.covariance is None else np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
-    @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
 
 
 NO_WEIGHTS = "no finite weights were found: the columns differ too much in size from sample to sample; check them"

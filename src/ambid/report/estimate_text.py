@@ -46,7 +46,7 @@ _UNITS = {"position": "m", "current": "A"}
 def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write an estimate, linear or of a nonlinear bearing, for people; colour does not change the layout."""
     curves = curve_lines(estimate, width=width) if isinstance(estimate, NonlinearBearingEstimate) else []
-    warnings = warning_lines(other_warnings(estimate), width=width, paint=paint)
+    warnings = warning_lines(other_warnings(estimate.checks, estimate.warnings), width=width, paint=paint)
     finished = estimate.status == "converged"
     validation = estimate.validation
     return joined(

@@ -78,7 +78,7 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
             criteria_lines(fit.criteria, fit.n_estimated, width),
             trainings,
             check_lines(fit.checks, width=width, paint=paint),
-            warning_lines(other_warnings(fit), width=width, paint=paint),
+            warning_lines(other_warnings(fit.checks, fit.warnings), width=width, paint=paint),
             timing_lines(fit.timing_s, width=width, paint=paint),
         ]
     )

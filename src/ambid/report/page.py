@@ -85,7 +85,7 @@ def _content(evidence: Evidence | BearingEvidence, made: str) -> dict[str, Any]:
     return {
         **about,
         "status": e.status,
-        "warnings": other_warnings(e),
+        "warnings": other_warnings(e.checks, e.warnings),
         "parameters": parameter_rows(e.parameters, finished=e.status == "converged"),
         "meaning": meaning,
         "method": e.covariance_method,

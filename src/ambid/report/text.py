@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.report.numbers import Quantity, quantity, sized
@@ -15,15 +15,6 @@ Style = Literal["good", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
 
 WIDTH = 80
-
-
-class Judged(Protocol):
-    """A result with checks and warnings."""
-
-    @property
-    def checks(self) -> Mapping[str, Check]: ...  # noqa: D102
-    @property
-    def warnings(self) -> tuple[str, ...]: ...  # noqa: D102
 
 
 def plain(text: str, style: Style) -> str:
@@ -209,10 +200,10 @@ def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint =
     return [line for x in warnings for line in hanging(f"{paint('warning:', 'bad')} ", x, width, 9)]
 
 
-def other_warnings(result: Judged) -> list[str]:
+def other_warnings(checks: Mapping[str, Check], warnings: Sequence[str]) -> list[str]:
     """Return the warnings that say more than the detail of a failed check, which stands with the checks."""
-    said = {c.detail for c in result.checks.values()}
-    return [warning for warning in result.warnings if warning not in said]
+    said = {c.detail for c in checks.values()}
+    return [warning for warning in warnings if warning not in said]
 
 
 def timing_lines(timing_s: Mapping[str, float], *, width: int = 10 * WIDTH, paint: Paint = plain) -> list[str]:

@@ -23,7 +23,7 @@ from ambid.estimation.documents import (
     read_whole,
 )
 from ambid.estimation.estimate import SCHEMA, Continuous
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit, parameter_named
+from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, OutputFit, Parametric
 from ambid.physics.coenergy_law import MagnetLaw
 
 
@@ -64,7 +64,7 @@ class Curves:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NonlinearBearingEstimate:
+class NonlinearBearingEstimate(Parametric, Judged):
     """Result of the nonlinear grey box.
 
     Attributes
@@ -137,34 +137,6 @@ class NonlinearBearingEstimate:
     def model(self) -> str:
         """Name of the linear model that it is at each operating point."""
         return "one-axis"
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All numbers by name, SI."""
-        return {p.name: p.value for p in self.parameters}
-
-    @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
-
-    def parameter(self, name: str) -> EstimatedParameter:
-        """Return one number by name.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        EstimatedParameter
-
-        Raises
-        ------
-        EstimationError
-            If there is none of that name.
-        """
-        return parameter_named(self.parameters, name)
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.
