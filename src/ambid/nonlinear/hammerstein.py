@@ -26,13 +26,11 @@ from ambid.nonlinear.lagged import LaggedFunction, Regressors, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     bias_caution,
-    cautions,
-    finish,
+    conclude,
     guarded,
     laplace,
     problem_at,
     refine,
-    sandwiched,
 )
 from ambid.nonlinear.records import Scaled, scaled_records
 from ambid.nonlinear.settings import choice, read_settings, whole
@@ -169,18 +167,18 @@ def hammerstein(
         raise EstimationError("hammerstein: a model has one output, and inputs. Choose one output, and an input")
     of = HammersteinFunction(m=data.u_level.size, ny=s.ny, nu=s.nu, nk=s.nk, degree=s.degree)
     draft = Draft(function=of, theta=of.start(data))
-    ticks, open_ = portions(tick, (1.0, 2.0 * (s.focus == "simulation"))), np.zeros(of.n_theta)
+    ticks = portions(tick, (1.0, 2.0 * (s.focus == "simulation")))
 
     def identify() -> None:
         began = perf_counter()
-        problem = problem_at(of, data.parts, draft.theta, open_)
+        problem = problem_at(of, data.parts, draft.theta)
         found = search(problem, draft.theta, stage="search", most=s.iterations, tick=ticks[0], keep=draft.keep)
         draft.keep(found.theta)
         draft.note(found, problem, "Levenberg-Marquardt, prediction errors")
         draft.status = "converged" if found.converged else "stalled"
         began = draft.timed("search", began)
         if s.focus == "simulation":
-            free = lambda theta: problem_at(of, data.parts, theta, open_, free=True)  # noqa: E731
+            free = lambda theta: problem_at(of, data.parts, theta, free=True)  # noqa: E731
             refine(draft, free, s.iterations, ticks[1], "terms")
             draft.timed("simulation errors", began)
 
@@ -188,15 +186,11 @@ def hammerstein(
         return failed_fit("hammerstein", records, asdict(s), seed, why, draft.timing_s)
 
     failed = guarded(identify, draft, fail)
-    problem = problem_at(of, data.parts, draft.theta, open_, free=draft.free)
+    problem = problem_at(of, data.parts, draft.theta, free=draft.free)
     if failed or not np.isfinite(problem.cost(draft.theta)):
         return failed or fail(NO_WEIGHTS)
-    found = laplace(problem, draft.theta)
-    covariance = sandwiched(problem, draft.theta) if draft.free else found.covariance
-    draft.warnings += [*bias_caution("hammerstein", records, draft), *cautions(draft, problem, found, "lags or powers")]
-    if covariance is None:
-        draft.warnings.append("no standard deviations: the data do not determine the numbers. Fewer lags or powers")
-    return finish(
-        "hammerstein", records, asdict(s), data, draft, problem, found, covariance=covariance,
-        origin="sandwich" if draft.free else "information", seed=seed,
+    draft.warnings += bias_caution("hammerstein", records, draft)
+    return conclude(
+        "hammerstein", records, asdict(s), data, draft, problem, laplace(problem, draft.theta), units="lags or powers",
+        seed=seed,
     )  # fmt: skip

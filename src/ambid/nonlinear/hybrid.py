@@ -37,7 +37,7 @@ from ambid.nonlinear.hybrid_choice import (
     transfer,
 )
 from ambid.nonlinear.lagged import LaggedModel
-from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, cautions, finish, guarded, laplace
+from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, conclude, guarded, laplace
 from ambid.nonlinear.narmax import narmax
 from ambid.nonlinear.polynomial import PolynomialFunction, is_noisy, lagged, term_name
 from ambid.nonlinear.records import Scaled, scaled_records
@@ -214,22 +214,17 @@ def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _
             "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: raise "
             "ne, or say --open-loop if there was no feedback"
         )
-    draft.warnings += [*cautions(draft, problem, found, "neurons or terms"), *_cautions(draft, found)]
-    covariance, spare = found.covariance, _spare_units(of, draft.theta, problem, found)
-    if covariance is None:
-        draft.warnings.append(
-            "no standard deviations: data and prior do not determine the numbers. Fewer terms or neurons"
-        )
-    elif spare:
-        covariance = None
-        draft.warnings.append(
-            f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and "
-            f"intervals beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
-        )
+    draft.warnings += _cautions(draft, found)
+    spare = _spare_units(of, draft.theta, problem, found)
     draft.details |= _details(records, data, draft, problem)
-    return finish(
-        "hybrid", records, used, data, draft, problem, found, covariance=covariance, origin="laplace", seed=seed
+    why_not = (
+        f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and intervals "
+        f"beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
     )
+    return conclude(
+        "hybrid", records, used, data, draft, problem, found, units="neurons or terms", how="laplace",
+        why_not=why_not if spare else "", seed=seed,
+    )  # fmt: skip
 
 
 def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found: Laplace) -> int:

@@ -180,36 +180,26 @@ def problem_at(
     function: LaggedFunction,
     parts: Parts,
     theta: Array,
-    precision: Array,
+    precision: Array | None = None,
     *,
+    weight: Array | None = None,
     mean: Array | None = None,
     live: Mask | None = None,
     free: bool = False,
     joint: bool = False,
     counted: tuple[Mask, ...] | None = None,
 ) -> LaggedProblem:
-    """Return the problem whose errors have unit variance at given parameters, of which the live ones are searched."""
-    one = plain_problem(function, parts, theta, precision, free=free)
-    mean = one.mean if mean is None else mean
-    return replace(one, mean=mean, joint=joint, counted=counted).at(theta, live)
+    """Return the problem around given parameters, of which the live ones are searched.
 
-
-def plain_problem(
-    function: LaggedFunction,
-    parts: Parts,
-    theta: Array,
-    precision: Array | None = None,
-    *,
-    free: bool = False,
-    weight: Array | None = None,
-) -> LaggedProblem:
-    """Return the problem in which errors count alike, or by a `weight`."""
+    Errors have unit variance there, or a `weight`.
+    """
     none = np.zeros(function.n_theta)
-    return LaggedProblem(
+    found = LaggedProblem(
         function=function, parts=parts, weight=np.eye(function.n_outputs) if weight is None else weight, base=theta,
-        live=np.ones(none.size, dtype=np.bool_), mean=none, precision=none if precision is None else precision,
-        free=free,
+        live=np.ones(none.size, dtype=np.bool_) if live is None else live, mean=none if mean is None else mean,
+        precision=none if precision is None else precision, free=free, joint=joint, counted=counted,
     )  # fmt: skip
+    return found.at(theta) if weight is None else found
 
 
 def whitening(noise: Array) -> Array:
@@ -246,7 +236,7 @@ def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
 
 def rms_error(function: LaggedFunction, theta: Array, parts: Parts, *, free: bool = False) -> float:
     """Return the root mean square error in deviations of the outputs; infinite where the model diverges."""
-    problem = plain_problem(function, parts, theta, free=free)
+    problem = problem_at(function, parts, theta, weight=np.eye(function.n_outputs), free=free)
     with np.errstate(over="ignore", invalid="ignore"):
         found = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
     return found if np.isfinite(found) else np.inf
@@ -454,3 +444,46 @@ def bias_caution(structure: str, records: Sequence[IOData], draft: Draft) -> lis
         f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are white, "
         "and nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
     ]
+
+
+def conclude(
+    structure: str,
+    records: Sequence[IOData],
+    used: Mapping[str, object],
+    data: Scaled,
+    draft: Draft,
+    problem: LaggedProblem,
+    found: Laplace,
+    *,
+    units: str,
+    how: str = "auto",
+    why_not: str = "",
+    sampled: Array | None = None,
+    seed: int,
+) -> NonlinearFit:
+    """Return the fit of a draft with the covariance that was asked for, and what a reader must be told.
+
+    `units` are what a model has too many of, `how` is the setting ``uncertainty``, `sampled` a covariance by bootstrap;
+    `why_not` says why there are no standard deviations.
+    """
+    draft.warnings += cautions(draft, problem, found, units)
+    robust = how == "sandwich" or (draft.free and how == "auto")
+    origin = "sandwich" if robust else "laplace" if np.any(problem.precision) else "information"
+    covariance = sandwiched(problem, draft.theta) if robust and not why_not else found.covariance
+    if sampled is not None:
+        covariance, origin = sampled, "bootstrap"
+    if how == "none":
+        why_not = "no covariance was asked for, and so there are no standard deviations"
+    elif draft.free and origin == "laplace" and not why_not:
+        why_not = (
+            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
+            "Say uncertainty = sandwich"
+        )
+    elif covariance is None and not why_not:
+        why_not = f"no standard deviations: data and prior do not determine the numbers. Fewer {units}"
+    if why_not:
+        covariance = None
+        draft.warnings.append(why_not)
+    return finish(
+        structure, records, used, data, draft, problem, found, covariance=covariance, origin=origin, seed=seed
+    )

@@ -33,7 +33,7 @@ from ambid.estimation.criteria import CRITERIA, information, penalty
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
-from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, plain_problem
+from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, problem_at
 from ambid.nonlinear.nn_magnitude import pole_grid
 from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term, lagged, products
 from ambid.nonlinear.records import Parts
@@ -156,7 +156,8 @@ class Choice:
 
     def problem(self, parts: Parts, *, free: bool = False, weight: Array | None = None) -> LaggedProblem:
         """Return the problem of its coefficients; errors count alike without a `weight`."""
-        return plain_problem(self.function, parts, self.theta, free=free, weight=weight)
+        weight = np.eye(self.function.n_outputs) if weight is None else weight
+        return problem_at(self.function, parts, self.theta, free=free, weight=weight)
 
     def cost(self, parts: Parts, *, free: bool = False, weight: Array | None = None) -> float:
         """Return the sum of squared weighted errors; infinite where it diverges."""

@@ -31,14 +31,12 @@ from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
     bias_caution,
-    cautions,
-    finish,
+    conclude,
     guarded,
     laplace,
     problem_at,
     refine,
     rms_error,
-    sandwiched,
     split,
 )
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
@@ -340,25 +338,9 @@ def _finish(
     problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
     if not np.isfinite(problem.cost(draft.theta)):
         return failed_fit("narx", records, used, seed, NO_WEIGHTS, draft.timing_s)
-    found = laplace(problem, draft.theta)
-    draft.warnings += [*bias_caution("narx", records, draft), *cautions(draft, problem, found, "neurons or lags")]
-    covariance, origin = found.covariance, "laplace"
-    if spread:
-        covariance, origin = spread[0], "bootstrap"
-    elif s.uncertainty == "none":
-        covariance = None
-        draft.warnings.append("no covariance was asked for, and so there are no standard deviations")
-    elif s.uncertainty == "sandwich" or (draft.free and s.uncertainty == "auto"):
-        covariance, origin = sandwiched(problem, draft.theta), "sandwich"
-    elif draft.free:
-        covariance = None
-        draft.warnings.append(
-            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
-            "Say uncertainty = sandwich or bootstrap"
-        )
-    if covariance is None and s.uncertainty != "none" and not (draft.free and s.uncertainty == "laplace"):
-        draft.warnings.append(
-            "no standard deviations: data and prior do not determine the weights. Fewer neurons or lags"
-        )
+    draft.warnings += bias_caution("narx", records, draft)
     draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
-    return finish("narx", records, used, data, draft, problem, found, covariance=covariance, origin=origin, seed=seed)
+    return conclude(
+        "narx", records, used, data, draft, problem, laplace(problem, draft.theta), units="neurons or lags",
+        how=s.uncertainty, sampled=spread[0] if spread else None, seed=seed,
+    )  # fmt: skip

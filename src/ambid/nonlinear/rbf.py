@@ -26,15 +26,12 @@ from ambid.nonlinear.lagged import LaggedFunction
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
-    Laplace,
     bias_caution,
-    cautions,
-    finish,
+    conclude,
     guarded,
     laplace,
     refine,
     rms_error,
-    sandwiched,
     split,
 )
 from ambid.nonlinear.rbf_network import (
@@ -447,10 +444,15 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
     if not np.isfinite(problem.cost(work.theta)):
         return failed_fit("rbf", records, used, seed, NO_WEIGHTS, work.timing_s)
     found = laplace(problem, work.theta)
-    covariance, origin = _covariance(work, problem, found, s.uncertainty)
-    if covariance is not None:
-        work.warnings += _open(problem, covariance)
-    work.warnings += [*bias_caution("rbf", records, work), *cautions(work, problem, found, "units or lags")]
+    why_not = ""
+    if of.neurons and not work.all_numbers:
+        why_not = (
+            "no standard deviations: what the choice of the units adds is not known, and without it intervals of 95 % "
+            "for the function hold in half to nine tenths of places. Say trained = all"
+        )
+    elif not work.at_optimum:
+        why_not = "no standard deviations: the training has not come to an optimum"
+    work.warnings += [*bias_caution("rbf", records, work), *_open(problem, None if why_not else found.covariance)]
     work.details = {
         "condition": found.condition,
         "prior_by_output": work.prior.tolist(),
@@ -458,39 +460,18 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
         "held_out_rms": work.held_out,
         **work.details,
     }
-    return finish("rbf", records, used, data, work, problem, found, covariance=covariance, origin=origin, seed=seed)
+    return conclude(
+        "rbf", records, used, data, work, problem, found, units="units or lags", how=s.uncertainty, why_not=why_not,
+        seed=seed,
+    )  # fmt: skip
 
 
-def _covariance(work: _Work, problem: LaggedProblem, found: Laplace, how: str) -> tuple[Array | None, str]:
-    """Return the covariance of what is trained, and where it is from; say why there is none."""
-    P, origin = found.covariance, "sandwich" if how == "sandwich" or work.free else "laplace"
-    if how == "none":
-        why = "no covariance was asked for, and so there are no standard deviations"
-    elif work.network.neurons and not work.all_numbers:
-        why = (
-            "no standard deviations: what the choice of the units adds is not known, and without it intervals of 95 % "
-            "for the function hold in half to nine tenths of places. Say trained = all"
-        )
-    elif not work.at_optimum:
-        why = "no standard deviations: the training has not come to an optimum"
-    elif how == "laplace" and work.free:
-        why = (
-            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
-            "Say uncertainty = sandwich"
-        )
-    else:
-        P = sandwiched(problem, work.theta) if origin == "sandwich" else P
-        if P is not None:
-            return P, origin
-        why = "no standard deviations: data and prior do not determine the weights. Fewer units or lags"
-    work.warnings.append(why)
-    return None, ""
-
-
-def _open(problem: LaggedProblem, covariance: Array) -> list[str]:
+def _open(problem: LaggedProblem, covariance: Array | None) -> list[str]:
     """Name the numbers of the linear part that only the prior holds, which is next to none."""
     of = problem.function
     assert isinstance(of, RbfFunction)
+    if covariance is None:
+        return []
     held = np.diag(covariance) * problem.precision[problem.live] ** 2
     names = [name for name, x in zip(of.names[: of.n_line], held, strict=False) if x > _HELD]
     if not names:
