@@ -39,32 +39,28 @@ _TRIAL_S = 2.0  # of each trial of an amplitude
 def command(
     port: opt.Port,
     rig: opt.RigOfDevice,
-    record: Annotated[Path, option("--output -o", "FILE", "Record to write: .h5, .csv or .csv.gz.")],
-    seconds: Annotated[float, option("--seconds", "S", "Length of the record in s.", True)] = 10.0,
+    record: Annotated[Path, option("--output -o FILE", "Record to write: .h5, .csv or .csv.gz.")],
+    seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 10.0,
     excitation: Annotated[
         str | None,
         option(
-            "--excitation",
-            "NAME",
-            "What the controller adds to its output: multisine, schroeder, prbs or steps.",
-            "none",
+            "--excitation NAME", "What the controller adds to its output: multisine, schroeder, prbs or steps.", "none"
         ),
     ] = None,
     amplitude: Annotated[
-        float | None, option("--amplitude", "V", "Peak of the excitation in V.", "found by trials, small first")
+        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, small first")
     ] = None,
     band: opt.BandHz = None,
     mode: Annotated[
         Literal["sample", "drive", "levitate"] | None,
         option(
             "--mode",
-            None,
             "Output off; excitation without feedback; position loop on the controller.",
             "levitate where the rig has a loop; sample a replay",
         ),
     ] = None,
     settle: Annotated[
-        float | None, option("--settle", "S", "Time after the start that is not recorded, in s.", "1 to levitate")
+        float | None, option("--settle S", "Time after the start that is not recorded, in s.", "1 to levitate")
     ] = None,
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
@@ -72,13 +68,12 @@ def command(
     track: Annotated[
         str | None,
         option(
-            "--track",
-            "ESTIMATE.json|auto",
+            "--track ESTIMATE.json|auto",
             "Follow the parameters meanwhile, from this estimate, or from one of the first seconds.",
         ),
     ] = None,
     json: Annotated[
-        str | None, option("--json", "FILE", "With --track: the track as lines of JSON; - for standard output.")
+        str | None, option("--json FILE", "With --track: the track as lines of JSON; - for standard output.")
     ] = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view of the track.")] = False,
     force: opt.Force = False,

@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 def command(
     port: opt.Port,
     rig: opt.RigOfDevice,
-    folder: Annotated[Path, option("--output -o", "FOLDER", "Where records, estimate and report go.")],
-    seconds: Annotated[float, option("--seconds", "S", "Length of the record in s.", True)] = 20.0,
+    folder: Annotated[Path, option("--output -o FOLDER", "Where records, estimate and report go.")],
+    seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 20.0,
     track_seconds: Annotated[
-        float, option("--track-seconds", "S", "Length of live tracking in the end, in s.", True)
+        float, option("--track-seconds S", "Length of live tracking in the end, in s.", True)
     ] = 5.0,
     amplitude: Annotated[
-        float | None, option("--amplitude", "V", "Peak of the excitation in V.", "found by trials, small first")
+        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, small first")
     ] = None,
     band: opt.BandHz = None,
     widest: Annotated[
-        float, option("--widest", "X", "Largest half width of a 95 % interval that is good enough.", True)
+        float, option("--widest X", "Largest half width of a 95 % interval that is good enough.", True)
     ] = 0.10,
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",

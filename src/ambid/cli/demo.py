@@ -43,7 +43,7 @@ _FILES = ("demo.csv.gz", "demo.toml")
 
 
 def command(
-    copy: Annotated[Path | None, option("--copy", "FOLDER", "Also put the record and its rig there.")] = None,
+    copy: Annotated[Path | None, option("--copy FOLDER", "Also put the record and its rig there.")] = None,
 ) -> None:
     """Identify the embedded record and print the estimate beside the truth.
 

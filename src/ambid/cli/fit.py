@@ -31,14 +31,13 @@ def command(
             "RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; nonlinear structures take several of one bench."
         ),
     ],
-    structure: Annotated[str, option("--structure", "NAME", "Structure; 'ambid models' lists them.")],
+    structure: Annotated[str, option("--structure NAME", "Structure; 'ambid models' lists them.")],
     inputs: opt.Inputs = None,
     output: opt.OutputColumns = None,
     orders: Annotated[
         str,
         option(
-            "--orders",
-            "na=2,nb=2,nk=1",
+            "--orders na=2,nb=2,nk=1",
             "Orders; nb=2/3 for two inputs that differ, nk=auto to find a delay, auto to choose all.",
             True,
         ),
@@ -46,16 +45,15 @@ def command(
     settings: Annotated[
         str | None,
         option(
-            "--settings",
-            "ny=2,nu=2,degree=3",
+            "--settings ny=2,nu=2,degree=3",
             "Settings of a nonlinear structure (--orders does the same); 'ambid models' lists them.",
         ),
     ] = None,
-    seed: Annotated[int | None, option("--seed", "N", "Of all that is random in a nonlinear structure.", "0")] = None,
+    seed: Annotated[int | None, option("--seed N", "Of all that is random in a nonlinear structure.", "0")] = None,
     criterion: Annotated[
         str, switch("--criterion", "What chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")
     ] = "bic",
-    fix: Annotated[list[str] | None, option("--fix", "NAME=NUMBER", "A coefficient that is known; repeat.")] = None,
+    fix: Annotated[list[str] | None, option("--fix NAME=NUMBER", "A coefficient that is known; repeat.")] = None,
     rig: opt.RigFile = None,
     reference: opt.References = None,
     open_loop: opt.OpenLoop = False,
@@ -72,17 +70,14 @@ def command(
     gaps: opt.Gaps = None,
     second: opt.SecondRecord = None,
     validate_from: Annotated[
-        float | None, option("--validate-from", "S", "Use the second record from here on, in s.")
+        float | None, option("--validate-from S", "Use the second record from here on, in s.")
     ] = None,
-    validate_to: Annotated[
-        float | None, option("--validate-to", "S", "Use the second record up to here, in s.")
-    ] = None,
+    validate_to: Annotated[float | None, option("--validate-to S", "Use the second record up to here, in s.")] = None,
     json: opt.JsonFile = None,
     plot: Annotated[
         Path | None,
         option(
-            "--plot",
-            "FILE.png",
+            "--plot FILE.png",
             "Draw signals, residuals, Bode and poles; of a nonlinear structure signals, errors, coefficients and"
             " learning curves.",
         ),
@@ -90,8 +85,7 @@ def command(
     stabilisation: Annotated[
         Path | None,
         option(
-            "--stabilisation",
-            "FILE.png",
+            "--stabilisation FILE.png",
             "Draw the poles of models of order 1 to 20 (n4sid, moesp or cva where --structure names them, else pbsid).",
         ),
     ] = None,

@@ -25,7 +25,7 @@ def command(
         Literal["auto", "periodic", "random", "local"],
         switch("--method", "How to measure: averages over periods, averaged spectra, local polynomials, or what fits."),
     ] = "auto",
-    band: Annotated[str | None, option("--band", "LO:HI", "Lines that are used, in Hz.", "all")] = None,
+    band: Annotated[str | None, option("--band LO:HI", "Lines that are used, in Hz.", "all")] = None,
     hold: Annotated[
         Literal["zoh", "band-limited"],
         switch("--hold", "What the input does between samples: held, or without power above half the rate."),
@@ -33,26 +33,23 @@ def command(
     orders: Annotated[
         str | None,
         option(
-            "--orders",
-            "nf=2,nb=1",
+            "--orders nf=2,nb=1",
             "Fit transfer functions by maximum likelihood: degree of the denominator, numerator coefficients.",
         ),
     ] = None,
     state_space: Annotated[
-        str | None, option("--state-space", "n=3|auto", "Fit a state space by subspace with the Laguerre operator.")
+        str | None, option("--state-space n=3|auto", "Fit a state space by subspace with the Laguerre operator.")
     ] = None,
     feedthrough: Annotated[
         bool, switch("--feedthrough", "With --state-space: a direct path from input to output (D).")
     ] = False,
     domain: Annotated[
         Literal["s", "z"] | None,
-        option(
-            "--domain", None, "Of that model: continuous or discrete time.", "z for --orders of a held input, else s"
-        ),
+        option("--domain", "Of that model: continuous or discrete time.", "z for --orders of a held input, else s"),
     ] = None,
     delay: Annotated[
         str | None,
-        option("--delay", "S|auto", "Delay of the inputs in s, for the models.", "0; with --rig as the rig says"),
+        option("--delay S|auto", "Delay of the inputs in s, for the models.", "0; with --rig as the rig says"),
     ] = None,
     rig: opt.RigFile = None,
     from_s: opt.From = None,
@@ -60,7 +57,7 @@ def command(
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
     json: opt.JsonFile = None,
-    plot: Annotated[Path | None, option("--plot", "FILE.png", "Draw response, levels and models.")] = None,
+    plot: Annotated[Path | None, option("--plot FILE.png", "Draw response, levels and models.")] = None,
     strict: opt.Strict = False,
 ) -> None:
     """Measure a frequency response with its noise and distortion, and fit models to it.

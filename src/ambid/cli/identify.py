@@ -31,13 +31,12 @@ def command(
     ] = False,
     held: Annotated[
         list[Path] | None,
-        option("--held", "RECORD", "Nonlinear: a record with the rotor held at rest, which shows the coil; repeat."),
+        option("--held RECORD", "Nonlinear: a record with the rotor held at rest, which shows the coil; repeat."),
     ] = None,
     magnet: Annotated[
         Literal["auto", "single", "pair"] | None,
         option(
             "--magnet",
-            None,
             "Nonlinear: one magnet, or two that oppose each other; auto looks at the sign of the current.",
             "as the rig says, or auto",
         ),
@@ -49,13 +48,12 @@ def command(
     off_below: Annotated[
         float | None,
         option(
-            "--off-below",
-            "V",
+            "--off-below V",
             "Nonlinear: at or below this voltage the power stage is off, and the coil's voltage not known.",
             "as the rig says",
         ),
     ] = None,
-    second: Annotated[Path | None, option("--validate", "RECORD2", "Judge the estimate on this second record.")] = None,
+    second: Annotated[Path | None, option("--validate RECORD2", "Judge the estimate on this second record.")] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
     rate: opt.Rate = None,
@@ -64,12 +62,11 @@ def command(
     plot: Annotated[
         Path | None,
         option(
-            "--plot",
-            "FILE.png",
+            "--plot FILE.png",
             "Draw signals, residuals, Bode and poles; with --nonlinear curves with bands, and every record.",
         ),
     ] = None,
-    report: Annotated[Path | None, option("--report", "FILE.html", "Write a report, all in one file.")] = None,
+    report: Annotated[Path | None, option("--report FILE.html", "Write a report, all in one file.")] = None,
     strict: opt.Strict = False,
 ) -> None:
     """Identify the physical parameters of a bench from a record of voltage, current and position.

@@ -20,9 +20,11 @@ LARGEST = 1e9
 """What a time in s or an amplitude may be at most: beyond it is a slip, and numbers of samples would overflow."""
 
 
-def option(names: str, metavar: str | None, about: str, shown: str | bool = False, **more: Any) -> Any:
-    """Declare an option: names with a space between, what stands for its value, its help, how its default reads."""
-    return typer.Option(*names.split(), metavar=metavar, help=about, show_default=shown, **more)
+def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> Any:
+    """Declare an option: its usage, such as ``--band LO:HI``; its help; how its default reads."""
+    names = [word for word in usage.split() if word.startswith("-")]
+    metavar = usage.removeprefix(" ".join(names)).strip() or None
+    return typer.Option(*names, metavar=metavar, help=about, show_default=shown, **more)
 
 
 def switch(names: str, about: str) -> Any:
@@ -36,42 +38,40 @@ def argument(metavar: str, about: str) -> Any:
 
 
 RecordFile = Annotated[Path, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")]
-RigFile = Annotated[Path | None, option("--rig", "RIG", "Rig file (TOML), which says what is known of the bench.")]
-From = Annotated[float | None, option("--from", "S", "Use the record from this time on, in s.")]
-To = Annotated[float | None, option("--to", "S", "Use the record up to this time, in s.")]
-Rate = Annotated[float | None, option("--rate", "HZ", "Sampling rate in Hz, for a record without time.")]
+RigFile = Annotated[Path | None, option("--rig RIG", "Rig file (TOML), which says what is known of the bench.")]
+From = Annotated[float | None, option("--from S", "Use the record from this time on, in s.")]
+To = Annotated[float | None, option("--to S", "Use the record up to this time, in s.")]
+Rate = Annotated[float | None, option("--rate HZ", "Sampling rate in Hz, for a record without time.")]
 Gaps = Annotated[
     Literal["error", "interpolate", "cut"] | None,
     option(
         "--gaps",
-        None,
         "What to do about missing values: refuse them, interpolate, or cut the longest part without any out.",
         "error, or as the rig says",
     ),
 ]
-JsonFile = Annotated[str | None, option("--json", "FILE", "Write the result as JSON; - for standard output.")]
+JsonFile = Annotated[str | None, option("--json FILE", "Write the result as JSON; - for standard output.")]
 TrackFile = Annotated[
-    str | None, option("--json", "FILE", "Write the track as lines of JSON while it comes; - for standard output.")
+    str | None, option("--json FILE", "Write the track as lines of JSON while it comes; - for standard output.")
 ]
 Strict = Annotated[bool, switch("--strict", "End with exit code 3 if the search did not converge or a check failed.")]
-Inputs = Annotated[list[str] | None, option("--input", "COL", "Input column; repeat for several.")]
-OutputColumns = Annotated[list[str] | None, option("--output", "COL", "Output column; repeat for several.")]
+Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeat for several.")]
+OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeat for several.")]
 References = Annotated[
     list[str] | None,
-    option("--reference", "COL", "Column of the loop's outer excitation, for methods that use it; repeat for several."),
+    option("--reference COL", "Column of the loop's outer excitation, for methods that use it; repeat for several."),
 ]
 OpenLoop = Annotated[bool, switch("--open-loop", "Say that no feedback was at work in this record.")]
 Force = Annotated[bool, switch("--force", "Write over a record that exists.")]
-SecondRecord = Annotated[Path | None, option("--validate", "RECORD2", "Judge on this record too, all of it.")]
+SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Judge on this record too, all of it.")]
 
 
-Port = Annotated[str, option("--port", "PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
-RigOfDevice = Annotated[Path, option("--rig", "RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
+Port = Annotated[str, option("--port PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
+RigOfDevice = Annotated[Path, option("--rig RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
 BandHz = Annotated[
     str | None,
     option(
-        "--band",
-        "LO:HI",
+        "--band LO:HI",
         "Band of the excitation in Hz.",
         "of a multisine to levitate, where the rotor moves; else what the controller can play",
     ),
@@ -79,8 +79,7 @@ BandHz = Annotated[
 BenchName = Annotated[
     str | None,
     option(
-        "--bench",
-        "PRESET|RIG",
+        "--bench PRESET|RIG",
         "Plant behind an emulated or simulated controller.",
         "daq.bench of the rig, or its own values",
     ),
@@ -89,7 +88,7 @@ Pace = Annotated[
     Literal["fastest", "real-time"],
     switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
 ]
-Seed = Annotated[int, option("--seed", "N", "Seed of excitation and simulated noise.", True, min=0)]
+Seed = Annotated[int, option("--seed N", "Seed of excitation and simulated noise.", True, min=0)]
 
 
 def check_positive(given: Mapping[str, float | None]) -> None:

@@ -29,48 +29,47 @@ _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 def command(
     rig: Annotated[str, argument("RIG|PRESET", "Rig file, or a bench that 'ambid models' lists.")],
-    record: Annotated[Path, option("--output -o", "FILE", "Record to write: .csv, .csv.gz or .h5.")],
-    duration: Annotated[float | None, option("--duration", "S", "Length in s.", "1, or the scenario's")] = None,
-    rate: Annotated[float | None, option("--rate", "HZ", "Sampling rate in Hz.", "the preset's, or the rig's")] = None,
+    record: Annotated[Path, option("--output -o FILE", "Record to write: .csv, .csv.gz or .h5.")],
+    duration: Annotated[float | None, option("--duration S", "Length in s.", "1, or the scenario's")] = None,
+    rate: Annotated[float | None, option("--rate HZ", "Sampling rate in Hz.", "the preset's, or the rig's")] = None,
     scenario: Annotated[
         str | None,
         option(
-            "--scenario",
-            "NAME",
+            "--scenario NAME",
             "A course of known truth, as 'ambid models' lists them: the record has columns true_... beside it.",
             "nothing changes",
         ),
     ] = None,
-    at: Annotated[float | None, option("--at", "S", "When the scenario begins, in s.", "the scenario's")] = None,
+    at: Annotated[float | None, option("--at S", "When the scenario begins, in s.", "the scenario's")] = None,
     size: Annotated[
-        float | None, option("--size", "X", "How much the scenario changes, e.g. -0.15.", "the scenario's")
+        float | None, option("--size X", "How much the scenario changes, e.g. -0.15.", "the scenario's")
     ] = None,
     excitation: Annotated[
-        str | None, option("--excitation", "NAME", "Excitation, as 'ambid models' lists them.", "multisine")
+        str | None, option("--excitation NAME", "Excitation, as 'ambid models' lists them.", "multisine")
     ] = None,
     amplitude: Annotated[
-        float | None, option("--amplitude", "A", "Peak in V (rms for gaussian).", "what half of the limits allows")
+        float | None, option("--amplitude A", "Peak in V (rms for gaussian).", "what half of the limits allows")
     ] = None,
     band: Annotated[
-        str | None, option("--band", "LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
+        str | None, option("--band LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
     ] = None,
     periods: Annotated[
-        int, option("--periods", "N", "How often the excitation repeats, for 'ambid frf'.", True, min=1)
+        int, option("--periods N", "How often the excitation repeats, for 'ambid frf'.", True, min=1)
     ] = 1,
     log_excitation: Annotated[
         bool, switch("--log-excitation", "A column 'excitation' too: the reference that 'ambid frf' wants.")
     ] = False,
-    seed: Annotated[int, option("--seed", "N", "Seed of excitation and noise.", True, min=0)] = 0,
+    seed: Annotated[int, option("--seed N", "Seed of excitation and noise.", True, min=0)] = 0,
     loop: Annotated[
         Literal["open", "closed"] | None,
-        option("--loop", None, "With or without the controller.", "as the bench usually works"),
+        option("--loop", "With or without the controller.", "as the bench usually works"),
     ] = None,
     nonlinear: Annotated[
         bool, switch("--nonlinear", "The nonlinear magnet, of a rig its [magnet], instead of its linearisation.")
     ] = False,
     position: Annotated[
         float | None,
-        option("--position", "M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
+        option("--position M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
     ] = None,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records.

@@ -31,8 +31,7 @@ def command(
     method: Annotated[
         str,
         option(
-            "--method",
-            "NAME",
+            "--method NAME",
             "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to"
             " --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
             True,
@@ -40,30 +39,26 @@ def command(
     ] = "rpem",
     inputs: opt.Inputs = None,
     output: opt.OutputColumns = None,
-    orders: Annotated[str | None, option("--orders", "na=2,nb=2,nk=1", "Orders of coefficients.")] = None,
+    orders: Annotated[str | None, option("--orders na=2,nb=2,nk=1", "Orders of coefficients.")] = None,
     reference: opt.References = None,
     open_loop: opt.OpenLoop = False,
-    step: Annotated[float | None, option("--step", "X", "Step of lms and nlms, for signals of size one.")] = None,
+    step: Annotated[float | None, option("--step X", "Step of lms and nlms, for signals of size one.")] = None,
     start: Annotated[
         Path | None,
         option(
-            "--start",
-            "ESTIMATE.json",
+            "--start ESTIMATE.json",
             "Begin with this estimate; by default one is identified from the beginning of the record.",
         ),
     ] = None,
     start_seconds: Annotated[
-        float | None, option("--start-seconds", "S", "Identify the start from that much of the record.")
+        float | None, option("--start-seconds S", "Identify the start from that much of the record.")
     ] = None,
-    every: Annotated[float, option("--every", "S", "Reporting interval, s of record.", True)] = 0.01,
-    limit: Annotated[float, option("--limit", "X", "Acceptable model error; 1 is that at identification.", True)] = 1.5,
+    every: Annotated[float, option("--every S", "Reporting interval, s of record.", True)] = 0.01,
+    limit: Annotated[float, option("--limit X", "Acceptable model error; 1 is that at identification.", True)] = 1.5,
     memory: Annotated[
         str,
         option(
-            "--memory",
-            "auto|all|S",
-            "How long data count: found from the data, for ever, or a time constant in s.",
-            True,
+            "--memory auto|all|S", "How long data count: found from the data, for ever, or a time constant in s.", True
         ),
     ] = "auto",
     pace: Annotated[
@@ -71,7 +66,7 @@ def command(
     ] = "fastest",
     flag: Annotated[
         list[str] | None,
-        option("--flag", "T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeat."),
+        option("--flag T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeat."),
     ] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
@@ -79,7 +74,7 @@ def command(
     json: opt.TrackFile = None,
     plot: Annotated[
         Path | None,
-        option("--plot", "FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
+        option("--plot FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
     ] = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view, also on a terminal.")] = False,
     strict: Annotated[

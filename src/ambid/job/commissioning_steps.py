@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -18,23 +18,14 @@ from ambid.acquire.device import Device
 from ambid.acquire.recording import Acquired
 from ambid.acquire.session import Course
 from ambid.arrays import Array
+from ambid.estimation.documents import fields_json
 from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
 from ambid.report.numbers import quantity, sized
 
 StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"]
 
-STEPS: tuple[StepName, ...] = (
-    "self-test",
-    "rest",
-    "levitate",
-    "excite",
-    "record",
-    "identify",
-    "validate",
-    "report",
-    "track",
-)
+STEPS: tuple[StepName, ...] = get_args(StepName)
 """In their order."""
 
 EXCITATION = "multisine"
@@ -70,18 +61,8 @@ class Step:
         return not self.reasons
 
     def as_json(self) -> dict[str, object]:
-        """Return it as a JSON object.
-
-        Returns ``name``, ``passed``, ``findings``, ``reasons``, ``cautions``, ``numbers``; what is not known is None.
-        """
-        return {
-            "name": self.name,
-            "passed": self.passed,
-            "findings": list(self.findings),
-            "reasons": list(self.reasons),
-            "cautions": list(self.cautions),
-            "numbers": {name: x if math.isfinite(x) else None for name, x in self.numbers.items()},
-        }
+        """Return its fields and whether it ``passed``; what is not known is None."""
+        return {**fields_json(self), "passed": self.passed}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,15 +108,9 @@ def self_test(device: Device) -> Step:
     """
     found = device.self_test()
     who = ", ".join(f"{k} {v}" for k, v in device.info.identity.items() if k in ("protocol", "major", "minor", "board"))
-    return Step(
-        name="self-test",
-        findings=(
-            f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else ""),
-            _measured(found.numbers),
-        ),
-        reasons=found.failed,
-        numbers=found.numbers,
-    )
+    where = f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else "")
+    findings = (where, _measured(found.numbers))
+    return Step(name="self-test", findings=findings, reasons=found.failed, numbers=found.numbers)
 
 
 def rest(look: Look, room: Room, wishes: Wishes) -> Step:
