@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from ambid.physics.presets import Preset
     from ambid.simulate import Simulation
 
-    Respond = Callable[[Array], Simulation]
-
+_ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
@@ -79,7 +78,8 @@ def command(
     from ambid.record import Channel, write_record
     from ambid.signals import excitation as make_excitation
 
-    preset, closed = preset_of(rig), None if loop is None else loop == "closed"
+    preset = preset_of(rig)
+    closed, source = None if loop is None else loop == "closed", None if preset else Path(rig)
     if scenario is not None:
         _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
                                "--position": position, "--periods": None if periods == 1 else periods})  # fmt: skip
@@ -91,13 +91,10 @@ def command(
     if not nonlinear:
         _refuse("a simulation without --nonlinear", {"--position": position})
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
-    with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"))
-        respond, by_role, rate_hz, limits, point = (
-            _of_preset(preset, rate, seed, closed, nonlinear, position)
-            if preset
-            else _of_rig(Path(rig), rate, seed, closed, nonlinear, position)
-        )
+    with Outputs(source) as outputs, progress("simulate"):
+        outputs.claim(record, "-o", _ENDINGS)
+        respond, by_role, limits, point = _bench(preset, source, rate, seed, closed, nonlinear, position)
+        rate_hz = respond.keywords["rate_hz"]
         n = _samples(duration, rate_hz)
         shape = _repeated(
             lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
@@ -123,48 +120,41 @@ def _refuse(of: str, given: Mapping[str, object]) -> None:
             raise AmbidError(f"{of} has no {name}. Leave {name} out")
 
 
-def _of_preset(
-    preset: Preset, rate: float | None, seed: int, closed: bool | None, nonlinear: bool, position: float | None
-) -> tuple[Any, ...]:
-    from ambid.simulate import simulate_preset
-
-    rate_hz = preset.rate_hz if rate is None else rate
-    if position is not None and preset.plant is not None:
-        preset = replace(preset, operating_point=preset.plant.equilibrium(position))
-
-    def respond(u: Array) -> Simulation:
-        return simulate_preset(preset, u, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
-
-    return respond, respond, rate_hz, preset.limits, preset.operating_point
-
-
-def _of_rig(
-    path: Path, rate: float | None, seed: int, closed: bool | None, nonlinear: bool, position: float | None
-) -> tuple[Any, ...]:
+def _bench(
+    preset: Preset | None,
+    path: Path | None,
+    rate: float | None,
+    seed: int,
+    closed: bool | None,
+    nonlinear: bool,
+    position: float | None,
+) -> tuple[partial[Simulation], partial[Simulation], Limits | None, OperatingPoint | None]:
+    """Return what answers to an excitation, in columns and by role, with its limits and where it stands."""
     from ambid.rig import load_rig
-    from ambid.simulate import simulate_rig
+    from ambid.simulate import simulate_preset, simulate_rig
     from ambid.simulate.rig_bench import parts_of_rig
 
+    if preset is not None:
+        if position is not None and preset.plant is not None:
+            preset = replace(preset, operating_point=preset.plant.equilibrium(position))
+        rate_hz = preset.rate_hz if rate is None else rate
+        respond = partial(simulate_preset, preset, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
+        return respond, respond, preset.limits, preset.operating_point
+    assert path is not None
     rig = load_rig(path)
     if position is not None:
         rig = replace(rig, operating_point={**rig.operating_point, "position": position})
-    rate_hz = rig.record.rate_hz if rate is None else rate
-    if rate_hz is None:
+    known = rig.record.rate_hz if rate is None else rate
+    if known is None:
         raise AmbidError(f"rig {path} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
-
-    def respond(u: Array, columns: bool = True) -> Simulation:
-        return simulate_rig(rig, u, rate_hz=rate_hz, seed=seed, closed=closed, nonlinear=nonlinear, columns=columns)
-
-    return (
-        respond,
-        partial(respond, columns=False),
-        rate_hz,
-        rig.limits,
-        parts_of_rig(rig, closed, nonlinear=nonlinear)[2],
-    )
+    respond = partial(simulate_rig, rig, rate_hz=known, seed=seed, closed=closed, nonlinear=nonlinear)
+    point = parts_of_rig(rig, closed, nonlinear=nonlinear)[2]
+    return respond, partial(respond, columns=False), rig.limits, point
 
 
-def _largest(respond: Respond, shape: Array, limits: Limits | None, point: OperatingPoint | None) -> float:
+def _largest(
+    respond: Callable[[Array], Simulation], shape: Array, limits: Limits | None, point: OperatingPoint | None
+) -> float:
     from ambid.simulate import largest_amplitude
 
     if limits is None:
@@ -209,7 +199,7 @@ def _run_scenario(
 
     what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", (".csv", ".csv.gz") if what.dropped else (".csv", ".csv.gz", ".h5", ".hdf5"))
+        outputs.claim(record, "-o", _ENDINGS[:2] if what.dropped else _ENDINGS)
         done = simulate_scenario(what, preset or load_rig(Path(rig)), seed=seed, **words)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")

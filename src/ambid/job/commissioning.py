@@ -16,14 +16,13 @@ from typing import Unpack
 
 from ambid.acquire.amplitude import Room, looking
 from ambid.acquire.device import Device
-from ambid.acquire.program import program
 from ambid.acquire.recording import Acquired, Listeners, acquire
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.progress import Tick, silent
 from ambid.job import commissioning_steps as judge
-from ambid.job.commissioning_steps import EXCITATION, STEPS, Step, StepName, Wishes
+from ambid.job.commissioning_steps import STEPS, Step, StepName, Wishes
 from ambid.job.data import load
 from ambid.job.identification import evidence_of, identify, report_of
 from ambid.job.track_live import track_live
@@ -224,11 +223,7 @@ class _Guide:
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
         wishes, rate_hz = self.wishes, self._device.info.rate_hz
-        wave = program(
-            EXCITATION, amplitude_v=amplitude_v, band=wishes.band(rate_hz), rate_hz=rate_hz, seconds=seconds,
-            seed=wishes.seed + seed,
-        )  # fmt: skip
-        return Course(mode="levitate", seconds=seconds, settle_s=wishes.settle_s, program=wave)
+        return wishes.trial(rate_hz, seconds, seed).course(amplitude_v, rate_hz)
 
     def _validate(self) -> Step:
         assert self.estimate is not None

@@ -28,9 +28,7 @@ StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identif
 STEPS: tuple[StepName, ...] = get_args(StepName)
 """In their order."""
 
-EXCITATION = "multisine"
-"""What is played."""
-
+_EXCITATION = "multisine"
 _PERIODS = 4.0  # of the lowest line in a trial
 
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
@@ -99,6 +97,13 @@ class Wishes:
         """
         low = self.band(rate_hz)[0]
         return max(self.trial_s, _PERIODS / low * (1 + 1e-9)) if low > 0.0 else self.trial_s
+
+    def trial(self, rate_hz: float, seconds: float, seed: int = 0) -> Trial:
+        """Return what is played for so long; each `seed` gives another excitation."""
+        return Trial(
+            name=_EXCITATION, band=self.band(rate_hz), mode="levitate", settle_s=self.settle_s, seconds=seconds,
+            seed=self.seed + seed,
+        )  # fmt: skip
 
 
 def self_test(device: Device) -> Step:
@@ -193,10 +198,7 @@ def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) 
     `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """
     resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
-    trial = Trial(
-        name=EXCITATION, band=wishes.band(rate_hz), mode="levitate", settle_s=wishes.settle_s,
-        seconds=wishes.longest_trial_s(rate_hz), seed=wishes.seed,
-    )  # fmt: skip
+    trial = wishes.trial(rate_hz, wishes.longest_trial_s(rate_hz))
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
     return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers)

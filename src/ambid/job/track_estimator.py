@@ -7,8 +7,9 @@ coefficients from named inputs to an output, the joint filters physical paramete
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,8 +91,7 @@ def track_estimator(
         data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
             raise EstimationError(f"{method} follows one output; {data.y.shape[1]} are named. Name one with --output")
-        make = _regression if method in REGRESSIONS else _polynomial
-        made = make(method, data, orders, how.memory, settings.get("step"), used.start_s)
+        made = _coefficients(method, data, orders, how.memory, settings.get("step"), used.start_s)
     label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
     return _follow(made, label, how)
 
@@ -103,11 +103,49 @@ def _refuse(method: str, given: Mapping[str, object]) -> None:
         raise EstimationError(f"--method {method} takes no {' and no '.join(wrong)}. Leave it out")
 
 
-def _regression(
+def _coefficients(
     method: str, data: IOData, orders: Orders | None, memory: Memory, step: float | None, t0: float
 ) -> _Run:
-    """An ARX model: the signals are brought to size one and mean zero by the first of them, a constant is estimated."""
-    na, nb, nk = _arx_orders(method, data, orders)
+    """Coefficients of a model of named columns: regressions of scaled signals, or any polynomial structure."""
+    samples = None if isinstance(memory, str) else memory / data.dt
+    u, y, sizes = data.u, data.y, (np.ones(data.u.shape[1]), np.ones(1))
+    estimator: Any
+    if method in REGRESSIONS:
+        na, nb, nk = _arx_orders(method, data, orders)
+        u, y, sizes = _scaled(method, data)
+        estimator = _arx(method, (na, nb, nk), data, samples, step)
+        label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
+    else:
+        if step is not None or orders is None:
+            raise EstimationError(f"--method {method} wants --orders as numbers, and takes no --step. Correct that")
+        if samples is not None and samples <= 1.0:
+            raise EstimationError(f"--memory {memory:g} s is no longer than a sample. Give a longer one")
+        estimator = RecursivePolynomial(  # stores the first samples and fits them off-line
+            method, orders, dt=data.dt, n_inputs=data.u.shape[1], open_loop=data.open_loop,
+            forgetting=1.0 if samples is None else 1.0 - 1.0 / samples,
+        )  # fmt: skip
+        label = f"{method} {' '.join(f'{k}={v}' for k, v in orders.items())}"
+    out, scale, units = data.units[data.outputs[0]], list[float](), dict[str, str]()
+    for name in estimator.names:  # those of B lead from an input to the output, a constant has the output's unit
+        if name[0] == "b":
+            j = int(name.partition(".")[2] or 0)  # b1 or b1.0
+            scale.append(float(sizes[1][0] / sizes[0][j]))
+            units[name] = f"{out}/{data.units[data.inputs[j]]}"
+        else:
+            scale.append(float(sizes[1][0]) if name == "offset" else 1.0)
+            units[name] = out if name == "offset" else ""
+    return _Run(
+        estimator=estimator, inputs=u, outputs=y, rate_hz=1 / data.dt, t0=t0, scale=np.array(scale), model=label,
+        units=units, origin={name: data.record[name] for name in ("file", "sha256", "samples")}, start={},
+        warnings=_bias(method, data, estimator),
+    )  # fmt: skip
+
+
+def _scaled(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Return inputs, with instruments behind them, and output brought to mean zero and size one, and those sizes.
+
+    Both are taken from the first samples, as they come on-line.
+    """
     first = slice(0, max(_FIRST_SAMPLES, round(_FIRST_S / data.dt)))
     external = data.reference if method == "iv" and data.references else np.empty((data.y.shape[0], 0))
     u, y = np.hstack([data.u, external]), data.y
@@ -117,15 +155,7 @@ def _regression(
             f"{method}: a signal stands still over the first {first.stop * data.dt:.3g} s; its size is taken from"
             " there. Begin where the signals move, with --from"
         )
-    estimator = _arx(method, (na, nb, nk), data, None if isinstance(memory, str) else memory / data.dt, step)
-    unit = {"a": 1.0, "o": float(sizes[1][0])}
-    scale = [float(sizes[1][0] / sizes[0][_input_of(name)]) if name[0] == "b" else unit[name[0]]
-             for name in estimator.names]  # fmt: skip
-    return _Run(
-        estimator=estimator, inputs=(u - means[0]) / sizes[0], outputs=(y - means[1]) / sizes[1], rate_hz=1 / data.dt,
-        t0=t0, scale=np.array(scale), model=f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}",
-        units=_units(estimator.names, data), origin=_origin(data), start={}, warnings=_bias(method, data, estimator),
-    )  # fmt: skip
+    return (u - means[0]) / sizes[0], (y - means[1]) / sizes[1], sizes
 
 
 def _arx_orders(method: str, data: IOData, orders: Orders | None) -> tuple[int, tuple[int, ...], tuple[int, ...]]:
@@ -167,33 +197,12 @@ def _arx(
             na, nb[0], nk[0], instruments=instruments, offset=True, open_loop=data.open_loop, memory=memory
         )
     size = _STEP.get(method, 0.0) if step is None else step
-
-    def make(names: tuple[str, ...]) -> RecursiveEstimator:
-        if method == "lms":
-            return Lms(names, step=size)
-        return Nlms(names, step=size, small=_SMALL) if method == "nlms" else RecursiveLeastSquares(names, memory=memory)
-
-    return RecursiveArx(na, nb, nk, offset=True, estimator=make)
-
-
-def _polynomial(
-    method: str, data: IOData, orders: Orders | None, memory: Memory, step: float | None, t0: float
-) -> _Run:
-    """Any polynomial structure; the first samples are stored and fitted off-line."""
-    if step is not None or orders is None:
-        raise EstimationError(f"--method {method} wants --orders as numbers, and takes no --step. Correct that")
-    samples = None if isinstance(memory, str) else memory / data.dt
-    if samples is not None and samples <= 1.0:
-        raise EstimationError(f"--memory {memory:g} s is no longer than a sample. Give a longer one")
-    estimator = RecursivePolynomial(
-        method, orders, dt=data.dt, n_inputs=data.u.shape[1], open_loop=data.open_loop,
-        forgetting=1.0 if samples is None else 1.0 - 1.0 / samples,
-    )  # fmt: skip
-    return _Run(
-        estimator=estimator, inputs=data.u, outputs=data.y, rate_hz=1 / data.dt, t0=t0,
-        scale=np.ones(len(estimator.names)), model=f"{method} {' '.join(f'{k}={v}' for k, v in orders.items())}",
-        units=_units(estimator.names, data), origin=_origin(data), start={}, warnings=_bias(method, data, estimator),
-    )  # fmt: skip
+    make: dict[str, Callable[[tuple[str, ...]], RecursiveEstimator]] = {
+        "lms": partial(Lms, step=size),
+        "nlms": partial(Nlms, step=size, small=_SMALL),
+        "rls": partial(RecursiveLeastSquares, memory=memory),
+    }
+    return RecursiveArx(na, nb, nk, offset=True, estimator=make[method])
 
 
 def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
@@ -288,24 +297,3 @@ def _error(estimator: RecursiveEstimator, errors: Array) -> float:
     inner: Any = getattr(estimator, "_estimator", estimator)
     noise, squares = float(inner.noise_variance), errors[np.isfinite(errors)] ** 2
     return float(np.sqrt(squares.mean() / noise)) if squares.size and noise > 0.0 else float("nan")
-
-
-def _input_of(name: str) -> int:
-    """Return the input that a coefficient ``b1`` or ``b1.0`` belongs to."""
-    return int(name.partition(".")[2] or 0)
-
-
-def _units(names: Sequence[str], data: IOData) -> dict[str, str]:
-    """Return the units of coefficients: those of B lead from an input to the output, a constant has the output's."""
-    out = data.units[data.outputs[0]]
-    units = {}
-    for name in names:
-        if name[0] == "b":
-            units[name] = f"{out}/{data.units[data.inputs[_input_of(name)]]}"
-        else:
-            units[name] = out if name == "offset" else ""
-    return units
-
-
-def _origin(data: IOData) -> dict[str, object]:
-    return {name: data.record[name] for name in ("file", "sha256", "samples")}
