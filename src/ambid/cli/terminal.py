@@ -84,6 +84,15 @@ def progress(title: str) -> Iterator[Tick]:
         display.stop()
 
 
+def _bar(width: int, text: str) -> Bar:
+    """Make a bar on standard error between what is done and a text; it is taken away at the end."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=width), TextColumn(text))
+    return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
 class _Display:
     """A line of progress, drawn by a thread of its own so that it also lives while loops are compiled."""
 
@@ -111,15 +120,7 @@ class _Display:
     def _show(self) -> None:
         if self._done.wait(_QUIET_S):
             return
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        shown = [
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[elapsed]:.0f} s{task.fields[left]}"),
-        ]
-        with Progress(*shown, console=Console(stderr=True), transient=True) as bar:
+        with _bar(40, "{task.fields[elapsed]:.0f} s{task.fields[left]}") as bar:
             task = bar.add_task(self._stage, total=None, elapsed=0.0, left="")
             while not self._done.wait(0.1):
                 now = time.monotonic()
@@ -239,11 +240,7 @@ class Watch:
         if not sys.stderr.isatty():
             return
         if self._bar is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn
-
-            columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[text]}"))
-            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar = _bar(20, "{task.fields[text]}")
             self._bar.start()
             self._task = self._bar.add_task(title, total=1.0, text=text)
         assert self._task is not None

@@ -49,27 +49,16 @@ def judge_bearing(
     changed = tuple(w for t in taken for w in t.warnings)
     return NonlinearBearingEstimate(
         status="converged" if fit.status == "converged" else "stalled",
-        law=problem.law,
-        eddy=problem.eddy,
-        drift=problem.drift,
-        records=tuple(t.remembered for t in taken),
-        parameters=parameters,
-        covariance_names=known.names,
-        covariance=known.covariance(robust=robust),
-        covariance_method="robust" if robust else "information",
-        delay=_delays(fit, known, given=delay_given),
-        noise=noise,
-        fit=_fits(fit, tests, names),
-        range=_between(moving.min(axis=0), moving.max(axis=0)),
+        law=problem.law, eddy=problem.eddy, drift=problem.drift, records=tuple(t.remembered for t in taken),
+        parameters=parameters, covariance_names=known.names, covariance=known.covariance(robust=robust),
+        covariance_method="robust" if robust else "information", delay=_delays(fit, known, given=delay_given),
+        noise=noise, fit=_fits(fit, tests, names), range=_between(moving.min(axis=0), moving.max(axis=0)),
         usual=_between(*np.quantile(moving, (0.025, 0.975), axis=0)),
         operating_point=dict(zip(_ROLES, moving.mean(axis=0).tolist(), strict=True)),
-        hull=_hull(moving),
-        coil_hull=_hull(points),
-        criterion=fit.criterion,
-        bic=fit.criterion + problem.size * float(np.log(problem.n_used)),
-        checks=checks,
+        hull=_hull(moving), coil_hull=_hull(points), criterion=fit.criterion,
+        bic=fit.criterion + problem.size * float(np.log(problem.n_used)), checks=checks,
         warnings=_warnings(fit, checks, robust=robust) + changed,
-    )
+    )  # fmt: skip
 
 
 def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
@@ -147,18 +136,11 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
         if prior and n.estimated:
             share = float(np.clip(1.0 - known.information[j, j] / n.prior_sd**2, 0.0, 1.0))
         role: Literal["free", "fixed", "prior"] = "fixed" if not n.estimated else "prior" if prior else "free"
-        found.append(
-            EstimatedParameter(
-                name=n.name,
-                unit=UNITS[n.name],
-                value=value,
-                sd=sd,
-                ci95=(value - 1.96 * sd, value + 1.96 * sd),
-                role=role,
-                identifiable=not n.estimated or sd < WEAK * abs(size),
-                data_share=share,
-            )
-        )
+        identifiable = not n.estimated or sd < WEAK * abs(size)
+        found.append(EstimatedParameter(
+            name=n.name, unit=UNITS[n.name], value=value, sd=sd, ci95=(value - 1.96 * sd, value + 1.96 * sd),
+            role=role, identifiable=identifiable, data_share=share,
+        ))  # fmt: skip
     return tuple(found)
 
 

@@ -74,12 +74,9 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> 
     kept = [p for p in before.parameters if p.name not in given]
     new = [p for p in parameters if p.name not in _LINEAR]
     known = replace(
-        before,
-        eddy=before.eddy or words.get("eddy", False),
-        drift=before.drift or words.get("drift", False),
-        off_below=before.off_below if off_below is None else off_below,
-        parameters=(),
-    )
+        before, eddy=before.eddy or words.get("eddy", False), drift=before.drift or words.get("drift", False),
+        off_below=before.off_below if off_below is None else off_below, parameters=(),
+    )  # fmt: skip
     if isinstance(magnet, MagnetLaw):
         kind: Literal["single", "pair"] = "pair" if magnet.pair else "single"
         known = replace(
@@ -147,15 +144,9 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
                 f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
             )
     y = np.column_stack([bench["position"], bench["current"]])
-    taken = BearingRecord(
-        name=name,
-        rate_hz=bench.rate_hz,
-        u=u,
-        loose=np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0),
-        y=y,
-        valid=np.ones(y.shape, dtype=np.bool_),
-        held=held,
-    )
+    loose = np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0)
+    valid = np.ones(y.shape, dtype=np.bool_)
+    taken = BearingRecord(name=name, rate_hz=bench.rate_hz, u=u, loose=loose, y=y, valid=valid, held=held)
     _check_moves(taken)
     if rig.limits is not None:
         taken = touching(taken, rig.limits.position)

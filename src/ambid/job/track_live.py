@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil
 from pathlib import Path
 from threading import Event as Signal
@@ -92,7 +93,8 @@ def track_live(
         rate_hz=view.rate_hz, channels=tuple(view.units), slots=slots, block_samples=_BLOCK_SAMPLES
     ) as ring:
         ring_tap = RingTap(ring, view, waits=device.info.kind != "serial")
-        runner = LiveRun(device, course, ring_tap, taps, on_event, on_run, on_trouble, stopped, ring)
+        job = partial(run, device, course, taps=(*taps, ring_tap), on_event=on_event)  # who records is never behind
+        runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
             begin = start_of(lead.source, rig, given=start, start_s=lead_s, rig_speaks=True)
@@ -104,17 +106,16 @@ class _Lead:
     """The beginning of the stream: read before tracking begins, and tracked with the rest."""
 
     def __init__(self, ring: BlockRing, runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
-        self._ring, self._read = ring, list[Block]()
+        self._blocks, read = _blocks(ring), list[Block]()
         wanted = round(wanted_s * view.rate_hz) + 1
-        while not self._read or self._end() < wanted:
-            frame = ring.read(LOOK_S)
-            if frame is not None:
-                self._read.append(frame.block)
-            elif ring.ended and not ring.filled:
-                self._too_short(runner, wanted_s, view.rate_hz)
-        values = np.concatenate([b.values for b in self._read])
-        numbers = np.concatenate([b.first + np.arange(len(b.values)) for b in self._read])
-        stamps = np.concatenate([b.time_s + np.arange(len(b.values)) / view.rate_hz for b in self._read])
+        while not read or read[-1].first + len(read[-1].values) < wanted:
+            block = next(self._blocks, None)
+            if block is None:
+                raise _too_short(runner, wanted_s, view.rate_hz)
+            read.append(block)
+        values = np.concatenate([b.values for b in read])
+        numbers = np.concatenate([b.first + np.arange(len(b.values)) for b in read])
+        stamps = np.concatenate([b.time_s + np.arange(len(b.values)) / view.rate_hz for b in read])
         channels = tuple(
             Channel(name=role, unit=unit, values=values[:, k]) for k, (role, unit) in enumerate(view.units.items())
         )
@@ -124,33 +125,36 @@ class _Lead:
             replay=Replay(
                 values=values, numbers=numbers, time_s=stamps, rate_hz=view.rate_hz, block_samples=_BLOCK_SAMPLES
             ),
-            forcing=None,
-            t0=0.0,
-        )
+            forcing=None, t0=0.0,
+        )  # fmt: skip
 
     def blocks(self, first: int) -> Iterator[Block]:
         """Yield what was read, from a number on, and then what comes."""
         yield from self.source.replay.since(first)
-        while True:
-            frame = self._ring.read(LOOK_S)
-            if frame is not None:
-                yield frame.block
-            elif self._ring.ended and not self._ring.filled:
-                return
+        yield from self._blocks
 
-    def _end(self) -> int:
-        return self._read[-1].first + len(self._read[-1].values)
 
-    def _too_short(self, runner: LiveRun, wanted_s: float, rate_hz: float) -> None:
-        runner.__exit__(None, None, None)
-        report = runner.report()
-        if report.interrupted:
-            raise DeviceError(f"the run was interrupted after {report.samples / rate_hz:.3g} s, before tracking began")
-        why = "" if report.fault is None else f" ({fault_words(report.fault)})"
-        raise DeviceError(
-            f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin"
-            " with. Run longer, or see to what ended it"
-        )
+def _blocks(ring: BlockRing) -> Iterator[Block]:
+    """Yield the blocks of a ring until it has ended and is empty."""
+    while True:
+        frame = ring.read(LOOK_S)
+        if frame is not None:
+            yield frame.block
+        elif ring.ended and not ring.filled:
+            return
+
+
+def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
+    """End a run that gave too little to begin with, and say why it did."""
+    runner.__exit__(None, None, None)
+    report = runner.report()
+    if report.interrupted:
+        return DeviceError(f"the run was interrupted after {report.samples / rate_hz:.3g} s, before tracking began")
+    why = "" if report.fault is None else f" ({fault_words(report.fault)})"
+    return DeviceError(
+        f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin with."
+        " Run longer, or see to what ended it"
+    )
 
 
 class RingTap:
@@ -198,27 +202,24 @@ class RingTap:
 class LiveRun:
     """The run of the device, in a thread of its own; leaving the context ends it.
 
-    `device`, `course`, `on_event`, `stopped`: as `ambid.acquire.session.run`; `ring_tap`: hears last of all: who
-    records is never behind the tracker; `taps`: the others; `on_run`: given what came of the run; `ring`: ended with
-    the run.
+    `job`: the run, but for what stops it; `ring`: ended with the run; `recorded`: others listen: where tracking fails,
+    the run goes on for them; `on_run`: given what came of the run.
     """
 
     def __init__(
         self,
-        device: Device,
-        course: Course,
+        job: Callable[..., RunReport],
         ring_tap: RingTap,
-        taps: Sequence[Tap],
-        on_event: Callable[[DeviceEvent], object] | None,
+        ring: BlockRing,
+        stopped: Callable[[], bool],
+        *,
+        recorded: bool,
         on_run: Callable[[RunReport], object] | None,
         on_trouble: Callable[[AmbidError], object] | None,
-        stopped: Callable[[], bool],
-        ring: BlockRing,
     ) -> None:
-        self._job = (device, course, (*taps, ring_tap), on_event)
-        self._ring_tap = ring_tap
-        self._on_run, self._on_trouble, self._stopped = on_run, on_trouble, stopped
-        self._ring, self._stop = ring, Signal()
+        self._job, self._ring_tap, self._ring, self._recorded = job, ring_tap, ring, recorded
+        self._on_run, self._on_trouble = on_run, on_trouble
+        self._stopped, self._stop = stopped, Signal()
         self._report: RunReport | None = None
         self._failure: BaseException | None = None
         self._thread = Thread(target=self._run, name="acquisition", daemon=True)
@@ -228,10 +229,9 @@ class LiveRun:
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
-        _, _, taps, _ = self._job
         self._ring_tap.over.set()
         try:
-            if isinstance(error, AmbidError) and len(taps) > 1 and self._thread.is_alive():
+            if isinstance(error, AmbidError) and self._recorded and self._thread.is_alive():
                 if self._on_trouble is not None:
                     self._on_trouble(error)
                 while self._thread.is_alive():  # a wait that Ctrl-C can end
@@ -251,11 +251,8 @@ class LiveRun:
         return self._report
 
     def _run(self) -> None:
-        device, course, taps, on_event = self._job
         try:
-            self._report = run(
-                device, course, taps=taps, on_event=on_event, stopped=lambda: self._stop.is_set() or self._stopped()
-            )
+            self._report = self._job(stopped=lambda: self._stop.is_set() or self._stopped())
         except BaseException as failure:
             self._failure = failure
         finally:
