@@ -179,7 +179,7 @@ def io_data(u: Array, y: Array, dt: float = 1.0, *, open_loop: bool = True) -> I
 def _ambid(structure: str, orders: Mapping[str, int], u: Array, y: Array, open_loop: bool, at_rest: bool) -> Answer:
     data = io_data(u, y, open_loop=open_loop)
     estimator = registered(structure).estimator
-    options: dict[str, Any] = {k: orders["horizon"] for k in ("horizon", "past") if "horizon" in orders}
+    options: dict[str, Any] = {"horizon": orders["horizon"]} if "horizon" in orders else {}
     options |= {"feedthrough": True} if "feedthrough" in orders else {}
     options |= {"at_rest": True} if at_rest else {}
     orders = {k: v for k, v in orders.items() if k not in ("horizon", "feedthrough")}

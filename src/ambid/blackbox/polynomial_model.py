@@ -63,6 +63,22 @@ class Polynomials:
         """All coefficients in the order of `parts`, shape (n_theta,)."""
         return np.concatenate([c for _, _, c in self.parts()])
 
+    def with_theta(self, theta: Array) -> Polynomials:
+        """Return polynomials of the same degrees with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        Polynomials
+        """
+        parts, n = np.split(theta, np.cumsum([c.size for _, _, c in self.parts()])[:-1]), len(self.B)
+        return Polynomials(
+            A=parts[0], B=tuple(parts[1 : n + 1]), C=parts[n + 1], D=parts[n + 2], F=tuple(parts[n + 3 :])
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PolynomialModel(BlackBoxModel):
@@ -130,15 +146,9 @@ class PolynomialModel(BlackBoxModel):
         -------
         PolynomialModel
         """
-        found: list[dict[str, list[Array]]] = [{x: [] for x in "ABCDF"} for _ in self.outputs]
-        for o, letter, _, place in self.blocks():
-            found[o][letter].append(theta[place])
-        return PolynomialModel(
-            outputs=tuple(
-                Polynomials(A=p["A"][0], B=tuple(p["B"]), C=p["C"][0], D=p["D"][0], F=tuple(p["F"])) for p in found
-            ),
-            dt=self.dt,
-        )
+        ends = np.cumsum([p.theta.size for p in self.outputs])
+        split = zip(self.outputs, np.split(theta, ends[:-1]), strict=True)
+        return PolynomialModel(outputs=tuple(p.with_theta(part) for p, part in split), dt=self.dt)
 
     def frequency_response(self, omega: Array) -> Complex:
         """Return G = B/(A F).

@@ -28,7 +28,7 @@ from ambid.blackbox.polynomial_predictor import (
 )
 from ambid.blackbox.polynomial_search import BLIND, LARGEST_DELAY, SMOOTH, Minimum, search, starts
 from ambid.blackbox.response import Offsets
-from ambid.blackbox.roots import root_derivative, roots_at, roots_of
+from ambid.blackbox.roots import roots_at
 from ambid.estimation.linear import directions
 
 _LEAST_SEEN = 1e-14  # singular value, of scaled columns, that stands for a direction not seen at all
@@ -199,16 +199,13 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
         theta = fit.theta[armax.places["A", None]]
         if not n or not np.all(np.isfinite(theta)):
             continue
-        roots = roots_of(theta)
-        k = int(np.argmax(np.abs(roots)))
-        row = np.zeros(armax.n_theta, dtype=np.complex128)
-        row[armax.places["A", None]] = root_derivative(theta, roots[k : k + 1])[0]
-        slope = np.real(row * np.conj(roots[k]))[armax.free] / abs(roots[k])
         variance = fit.cost / max(fit.n_rows - fit.nuisance.size - armax.free.size, 1)
-        sd = np.sqrt(variance) * np.linalg.norm(slope @ fit.directions.root())
-        if abs(roots[k]) > 1.0 + _SDS * sd:
+        covariance = np.zeros((armax.n_theta,) * 2)
+        covariance[np.ix_(armax.free, armax.free)] = variance * fit.directions.inverse()
+        size, sd = _outermost(fit.theta, armax.places["A", None], covariance)
+        if size > 1.0 + _SDS * sd:
             found.append(
-                f"output {o}: the plant looks unstable (armax finds a pole of magnitude {abs(roots[k]):.4g}, "
+                f"output {o}: the plant looks unstable (armax finds a pole of magnitude {size:.4g}, "
                 f"sd {sd:.1g}), which this structure cannot hold: its "
                 "predictor would be unstable too. Use armax, arx or ararmax"
             )
@@ -240,18 +237,23 @@ def _at_border(model: PolynomialModel, o: int, covariance: Array, fit: Minimum) 
     for output, letter, i, place in model.blocks():
         if output != o or letter not in "CF" or place.stop - place.start < 2:
             continue
-        values, rows = roots_at(theta, place)
-        k = int(np.argmax(np.abs(values)))
-        r = values[k]
-        slope = np.real(rows[k] * np.conj(r)) / max(abs(r), 1e-300)
-        sd = np.sqrt(max(float(slope @ covariance @ slope), 0.0)) if np.all(np.isfinite(slope)) else 0.0
-        if (abs(r) > _OUTER and abs(r) + _SDS * sd >= 1.0) or (fit.at_border and abs(r) > 0.999):
+        size, sd = _outermost(theta, place, covariance)
+        if (size > _OUTER and size + _SDS * sd >= 1.0) or (fit.at_border and size > 0.999):
             name = f"F.{i}" if letter == "F" and several else letter
             yield (
-                f"a root of {name} of magnitude {abs(r):.6g} (sd {sd:.1g}) is at the border of stability: its standard "
+                f"a root of {name} of magnitude {size:.6g} (sd {sd:.1g}) is at the border of stability: its standard "
                 "deviation is not to be trusted. "
                 + ("Lower nc" if letter == "C" else "If the plant integrates or is unstable, use armax or arx")
             )
+
+
+def _outermost(theta: Array, place: slice, covariance: Array) -> tuple[float, float]:
+    """Magnitude of the root that is farthest out, and its standard deviation, 0 at a multiple root."""
+    values, rows = roots_at(theta, place)
+    k = int(np.argmax(np.abs(values)))
+    slope = np.real(rows[k] * np.conj(values[k])) / max(abs(values[k]), 1e-300)
+    variance = float(slope @ covariance @ slope) if np.all(np.isfinite(slope)) else 0.0
+    return float(abs(values[k])), float(np.sqrt(max(variance, 0.0)))
 
 
 _LEVEL = 1e-3  # of records at rest, and of fits that found their minimum, so many are flagged

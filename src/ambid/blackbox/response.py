@@ -9,6 +9,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.model import StateSpaceModel
+from ambid.estimation.sensitivity import run
 
 Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
 
@@ -51,12 +52,7 @@ def simulation(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> 
 
 def run_states(F: Array, G: Array, z: Array, x0: Array | None = None) -> Array:
     """Run x+ = F x + G z, from rest if no first state is given, and return the states before each sample."""
-    from ambid.estimation.kernels import state_scan
-
-    n = F.shape[0]
-    work = np.hstack([np.zeros((z.shape[0], n)), z])
-    state_scan(np.ascontiguousarray(np.hstack([F, G])), work, np.zeros(n) if x0 is None else x0.copy())
-    return work[:, :n]
+    return run(np.ascontiguousarray(np.hstack([F, G])), z, np.zeros(F.shape[0]) if x0 is None else x0)[:-1]
 
 
 def stable(model: StateSpaceModel) -> bool:

@@ -63,8 +63,7 @@ Tick = Callable[[], None] | None
 class Asked:
     """What was asked for beside the order."""
 
-    horizon: int | None = None  # samples of future and past; chosen if missing
-    past: int | None = None
+    horizon: int | None = None  # samples of future and of past; chosen if missing
     feedthrough: bool | None = None  # whether to estimate D
     tick: Tick = None  # called between steps
 
@@ -92,13 +91,12 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
 
     `n_max`: largest order to try.
     """
-    horizon, past, feedthrough = asked.horizon, asked.past, asked.feedthrough
+    horizon, feedthrough = asked.horizon, asked.feedthrough
     n, nk = _read_orders(method, data, orders)
-    _check_finite(data)
     given = channels(data, tuple(k - 1 for k in nk))
     largest = n or n_max or _AUTO_MAX
-    longest = _longest(method, data, given.n_samples, largest, horizon, past)
-    length = _window(method, longest, horizon, past)
+    longest = _longest(method, data, given.n_samples, largest, horizon)
+    length = longest + 1 if method == "pbsid" else 2 * longest
     factors = compress(given, length, _GROUPS)
     if asked.tick is not None:
         asked.tick()
@@ -109,24 +107,21 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
     least = _shortest(data, largest, bool(n or n_max))
     if method == "pbsid":  # the prior makes a long past cheap, and a short one is what leaves bias
         least, wanted = max(least, 20), wanted + wanted // 2
-    chosen = past or min(max(wanted, least), longest)
-    future = horizon or (min(chosen, longest) if method != "pbsid" else chosen)
-    if method == "pbsid" and future > chosen:
-        raise EstimationError(f"{method}: horizon {future} is longer than the past {chosen}. Lower it, or raise past")
-    largest = min(largest, (future - 1) * data.n_outputs, chosen * (data.n_inputs + data.n_outputs))
+    chosen = horizon or min(max(wanted, least), longest)
+    largest = min(largest, (chosen - 1) * data.n_outputs, chosen * (data.n_inputs + data.n_outputs))
     return Plan(
         method=method,
         n=n,
         n_max=largest,
         nk=nk,
         past=chosen,
-        future=future,
+        future=chosen,
         feedthrough=_feedthrough(data, factors, total, chosen) if feedthrough is None else feedthrough,
         channels=given,
         factors=factors,
         total=total,
         autoregression=max(20, wanted_lags + wanted_lags // 2),
-        past_limited=past is None and wanted_lags >= length - 1,
+        past_limited=horizon is None and wanted_lags >= length - 1,
     )
 
 
@@ -138,49 +133,32 @@ def _read_orders(method: str, data: IOData, orders: Orders) -> tuple[int | None,
     return n, order_per_input(method, {"nk": least, **orders}, "nk", least, data.n_inputs, remedy=remedy)
 
 
-def _check_finite(data: IOData) -> None:
-    """Refuse samples that are not numbers."""
-    for values, names in ((data.u, data.inputs), (data.y, data.outputs)):
-        bad = ~np.isfinite(values)
-        if bad.any():
-            row, column = np.argwhere(bad)[0]
-            raise EstimationError(f"sample {row} of {names[column]!r} is not a finite number. Mend or cut it")
-
-
-def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int | None, past: int | None) -> int:
+def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int | None) -> int:
     """Return the longest past to try: what the record carries at two rows for a column, within the method's bounds."""
     n_z = data.n_inputs + data.n_outputs
     spans = 1 if method == "pbsid" else 2
     carried = int(n_samples / (2.5 * spans * n_z + spans)) - 1
-    needed = _shortest(data, n, strict=False)
-    for what, value in (("horizon", horizon), ("past", past)):
-        if value is not None and value < 2:
-            raise EstimationError(f"{method}: {what} = {value} samples; it must be at least 2. Raise it")
+    if horizon is not None and horizon < 2:
+        raise EstimationError(f"{method}: horizon = {horizon} samples; it must be at least 2. Raise it")
     if horizon is not None and (horizon - 1) * data.n_outputs < n:
         raise EstimationError(
             f"{method}: a horizon of {horizon} samples shows at most {(horizon - 1) * data.n_outputs} states of "
             f"{data.n_outputs} output(s), not {n}. Raise it, or lower n"
         )
-    asked = max(x for x in (horizon, past, needed) if x is not None)
+    needed = _shortest(data, n, strict=False)
+    asked = max(horizon or 0, needed)
     if carried < asked:
         raise EstimationError(
             f"{method}: {n_samples} samples carry horizons of {max(carried, 0)}; order {n} needs {asked}. "
             "Lower the order, or take a longer record"
         )
-    bound = min(_LONGEST[method], _WIDEST[method] // n_z)
-    return min(carried, max(bound, asked, needed + 5))
+    return horizon or min(carried, max(min(_LONGEST[method], _WIDEST[method] // n_z), needed + 5))
 
 
 def _shortest(data: IOData, n: int, strict: bool = True) -> int:
     """Return the shortest horizon that shows n states; with some room where the order is settled and that is cheap."""
     least = max(-(-n // data.n_outputs) + 1, 2)
     return max(least, min(n + 5, 10)) if strict else least
-
-
-def _window(method: Method, longest: int, horizon: int | None, past: int | None) -> int:
-    if method == "pbsid":
-        return (past or max(longest, horizon or 0)) + 1
-    return (past or longest) + (horizon or longest)
 
 
 def _feedthrough(data: IOData, factors: Factors, total: Array, past: int) -> bool:
@@ -341,7 +319,7 @@ def first_model(method: Method, data: IOData, orders: Orders, asked: Asked) -> F
     criterion = None if plan.n else order_criterion(plan)
     n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
     if method != "pbsid" and asked.horizon is None:
-        plan = _choose_horizons(plan, n, keep_past=asked.past is not None)
+        plan = _choose_horizons(plan, n)
     check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
     given, found = decomposition(plan)
     return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
@@ -357,7 +335,7 @@ def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
     return given, _decompose(plan, total, given)
 
 
-def _choose_horizons(plan: Plan, n: int, *, keep_past: bool) -> Plan:
+def _choose_horizons(plan: Plan, n: int) -> Plan:
     """Return the plan with the horizon whose model leaves the least innovations, freedom taken into account.
 
     A long horizon averages noise out of slow states and brings it into fast ones; no rule knows which a plant has.
@@ -365,7 +343,7 @@ def _choose_horizons(plan: Plan, n: int, *, keep_past: bool) -> Plan:
     f, n_y = plan.factors, plan.factors.n_outputs
     best, best_cost = plan, np.inf
     for future in sorted({*_HORIZONS, plan.future}):
-        past = plan.past if keep_past else max(plan.past, future)
+        past = max(plan.past, future)
         if (future - 1) * n_y < n or past + future > f.length:
             continue
         tried = replace(plan, past=past, future=future)
@@ -549,8 +527,8 @@ data : IOData
 orders : Mapping
     ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
     or one for each, at least 1 (default); larger ones become states of their own.
-horizon, past : int, optional
-    Samples of future and past{bound}; chosen by an autoregression if missing.
+horizon : int, optional
+    Samples of future and of past; chosen by an autoregression if missing.
 feedthrough : bool, optional
     Whether to estimate D. Missing: only where the record is said to be open loop and shows one, because a
     controller that acts within the sample cannot be told from a feedthrough.
@@ -569,7 +547,7 @@ EstimationError
 """
 
 
-def _estimator(method: Method, summary: str, bound: str = "") -> Callable[..., BlackBoxFit]:
+def _estimator(method: Method, summary: str) -> Callable[..., BlackBoxFit]:
     """Return the public function of one method."""
 
     def fit(
@@ -577,14 +555,13 @@ def _estimator(method: Method, summary: str, bound: str = "") -> Callable[..., B
         orders: Orders,
         *,
         horizon: int | None = None,
-        past: int | None = None,
         feedthrough: bool | None = None,
         tick: Tick = None,
     ) -> BlackBoxFit:
-        return estimate(method, data, orders, Asked(horizon=horizon, past=past, feedthrough=feedthrough, tick=tick))
+        return estimate(method, data, orders, Asked(horizon=horizon, feedthrough=feedthrough, tick=tick))
 
     fit.__name__ = fit.__qualname__ = method
-    fit.__doc__ = _CONTRACT.format(summary=summary, bound=bound)
+    fit.__doc__ = _CONTRACT.format(summary=summary)
     return fit
 
 
@@ -606,5 +583,4 @@ pbsid = _estimator(
 
 The controller has to hold a delay of a sample; where it does not, D stays zero (the default) and the estimate
 stays consistent, but D itself cannot be identified""",
-    ", horizon <= past",
 )

@@ -213,7 +213,7 @@ def test_all_orders_from_one_factorisation(name):
         ({"n": 2, "nk": 0}, {}, "say feedthrough"),
         ({"n": 2, "nk": (1, 1)}, {}, "nk has 2 numbers for 1 input"),
         ({"n": 9}, {"horizon": 5}, "shows at most 4 states"),
-        ({"n": 2}, {"past": 1}, "past = 1 samples"),
+        ({"n": 2}, {"horizon": 1}, "horizon = 1 samples"),
         ({"n": 2}, {"horizon": 300}, "longer record"),
         ({"n": 200}, {}, "Lower the order"),
     ],
@@ -242,7 +242,7 @@ def test_million_samples_need_little_memory():
     y = lfilter([0, 1, 0.5], [1, -1.5, 0.7], u) + lfilter([1], [1, -0.9], 0.3 * rng.standard_normal(n))
     data = IOData(u=u[:, None], y=y[:, None], dt=DT, inputs=("u",), outputs=("y",), units={}, open_loop=True)
     tracemalloc.start()
-    fit = n4sid(data, {"n": 3}, horizon=8, past=8)
+    fit = n4sid(data, {"n": 3}, horizon=8)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100e6  # a matrix of windows would take 272 MB for these 8 + 8 samples
