@@ -1,7 +1,7 @@
 """What every subspace method starts from: a record compressed to triangular factors, projections, realisations.
 
 H is the window matrix, whose row t is [1, z(t), ..., z(t+L-1)] with z = [u, y]. It is never held: blocks of rows are
-folded into a running triangular factor (LAPACK tpqrt), one for each group of time. R'R = H'H holds to rounding.
+folded into a running triangular factor, one for each group of time. R'R = H'H holds to rounding.
 
 N4SID, MOESP and CVA solve Y_f = Gamma x + H U_f + noise with x in the span of the past: one singular value
 decomposition, whose weights are the whole difference between them (Van Overschee and De Moor 1996, ch. 4, table 4.1);
@@ -18,19 +18,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_discrete_are, solve_triangular
-from scipy.linalg.lapack import dtpqrt
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError
-
-_BLOCK_ROWS = 2048  # rows of the window matrix at once: some hundred columns of it stay in the cache
-_PANEL = 32  # columns that LAPACK eliminates together
+from ambid.signals.delay import lagged_triangle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,27 +102,18 @@ def compress(given: Channels, length: int, n_groups: int) -> Factors:
 
     `length`: samples in a window; `n_groups`: groups of time.
     """
-    mean = np.concatenate([given.mean_u, given.mean_y])
-    scale = np.concatenate([given.scale_u, given.scale_y])
-    n_z = mean.size
     n_rows = given.n_samples - length + 1
-    n_columns = 1 + length * n_z
     edges = np.linspace(0, n_rows, n_groups + 1).astype(int)
-    groups = np.zeros((n_groups, n_columns, n_columns))
-    for g in range(n_groups):
-        factor = np.zeros((n_columns, n_columns), order="F")
-        for first in range(edges[g], edges[g + 1], _BLOCK_ROWS):
-            last = min(first + _BLOCK_ROWS, int(edges[g + 1]))
-            part = slice(first, last + length - 1)
-            z = np.asfortranarray((np.hstack([given.u[part], given.y[part]]) - mean) / scale)
-            block = np.empty((last - first, n_columns), order="F")
-            block[:, 0] = 1.0
-            for k in range(length):
-                block[:, 1 + k * n_z : 1 + (k + 1) * n_z] = z[k : k + last - first]
-            panel = min(_PANEL, n_columns)
-            factor, _, _, _ = dtpqrt(0, panel, factor, block, overwrite_a=1, overwrite_b=1)
-        groups[g] = np.triu(factor)
-    return Factors(groups=groups, length=length, n_rows=n_rows, n_inputs=given.mean_u.size, n_outputs=given.mean_y.size)
+    groups = []
+    for first, last in pairwise(edges):
+        part = slice(first, last + length - 1)
+        u = (given.u[part] - given.mean_u) / given.scale_u
+        z = [*u.T, *((given.y[part] - given.mean_y) / given.scale_y).T]
+        window = [(x, lag) for lag in range(length - 1, -1, -1) for x in z]
+        groups.append(lagged_triangle([(np.ones(z[0].size), 0), *window], length - 1))
+    return Factors(
+        groups=np.array(groups), length=length, n_rows=n_rows, n_inputs=given.mean_u.size, n_outputs=given.mean_y.size
+    )
 
 
 def triangular_factor(rows: Array) -> Array:

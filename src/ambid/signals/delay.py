@@ -15,7 +15,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 
-_ROWS = 8192  # of a block that fits the processor's cache
+_ROWS = 2048  # at once: some hundred columns of them stay in the cache
+_PANEL = 32  # columns that LAPACK eliminates together
 
 
 def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
@@ -25,17 +26,17 @@ def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
     row, at least the largest lag. Returns (n_columns, n_columns), rows of zeros at the end where there are fewer rows
     than columns.
     """
+    from scipy.linalg.lapack import dtpqrt
+
     n, width = columns[0][0].size, len(columns)
-    R = np.zeros((0, width))
-    rows = max(_ROWS, 4 * width)
-    for start in range(first, n, rows):
-        stop = min(start + rows, n)
-        block = np.empty((R.shape[0] + stop - start, width), order="F")
-        block[: R.shape[0]] = R
+    R = np.zeros((width, width), order="F")
+    for start in range(first, n, _ROWS):
+        stop = min(start + _ROWS, n)
+        block = np.empty((stop - start, width), order="F")
         for k, (x, lag) in enumerate(columns):
-            block[R.shape[0] :, k] = x[start - lag : stop - lag]
-        R = np.asarray(np.linalg.qr(block, mode="r"))
-    return np.vstack([R, np.zeros((width - R.shape[0], width))])
+            block[:, k] = x[start - lag : stop - lag]
+        R, _, _, _ = dtpqrt(0, min(_PANEL, width), R, block, overwrite_a=1, overwrite_b=1)
+    return np.triu(R)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
