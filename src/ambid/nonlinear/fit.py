@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -248,3 +249,35 @@ def failed_fit(
         timing_s=dict(timing_s),
         **provenance(records),
     )
+
+
+@dataclass(slots=True, kw_only=True)
+class Attempt:
+    """What a fit has come to, so that an interruption loses nothing."""
+
+    status: Literal["converged", "stalled"] = "converged"
+    curves: list[LearningCurve] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    timing_s: dict[str, float] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+
+    def timed(self, stage: str, began: float) -> float:
+        """Add what a stage took since `began`, and return when the next one begins."""
+        now = perf_counter()
+        self.timing_s[stage] = self.timing_s.get(stage, 0.0) + now - began
+        return now
+
+    def interrupt(self) -> None:
+        """Say that the search was interrupted."""
+        self.status = "stalled"
+        self.warnings.insert(0, "interrupted: the best model so far")
+
+    def result(
+        self, structure: str, records: Sequence[IOData], settings: Mapping[str, object], seed: int, **found: Any
+    ) -> NonlinearFit:
+        """Return the fit of a model; `found` are the other fields of `NonlinearFit`."""
+        return NonlinearFit(
+            structure=structure, settings=dict(settings), seed=seed, status=self.status, curves=tuple(self.curves),
+            warnings=tuple(self.warnings), timing_s=dict(self.timing_s), details=dict(self.details),
+            **provenance(records), **found,
+        )  # fmt: skip

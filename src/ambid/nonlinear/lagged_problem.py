@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Literal, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.blocks import Mask
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import LearningCurve, NonlinearFit, provenance
+from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Rows
 from ambid.nonlinear.records import Parts, Scaled
 
@@ -293,19 +293,14 @@ def sandwich_at(problem: SampledProblem, v: Array) -> Array | None:
 
 
 @dataclass(slots=True, kw_only=True)
-class Draft:
-    """What a fit has come to, so that an interruption loses nothing."""
+class Draft(Attempt):
+    """What the fit of a lagged function has come to."""
 
     function: LaggedFunction
     theta: Array  # (n_theta,), scaled
     free: bool = False  # whether `theta` is that of simulation errors
-    status: Literal["converged", "stalled"] = "converged"
     stopped_early: bool = False
     held_out: float = float("nan")  # error on held-out data; NaN without
-    curves: list[LearningCurve] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    timing_s: dict[str, float] = field(default_factory=dict)
-    details: dict[str, object] = field(default_factory=dict)
 
     def keep(self, theta: Array) -> None:
         """Take over other parameters."""
@@ -323,21 +318,14 @@ class Draft:
         )
         self.curves.append(curve)
 
-    def timed(self, stage: str, began: float) -> float:
-        """Add what a stage took since `began`, and return when the next one begins."""
-        now = perf_counter()
-        self.timing_s[stage] = self.timing_s.get(stage, 0.0) + now - began
-        return now
 
-
-def guarded(identify: Callable[[], None], draft: Draft, failed: Callable[[str], NonlinearFit]) -> NonlinearFit | None:
+def guarded(identify: Callable[[], None], draft: Attempt, failed: Callable[[str], NonlinearFit]) -> NonlinearFit | None:
     """Run the stages of a fit; an interruption leaves the best draft, a breakdown gives a failed fit."""
     began = perf_counter()
     try:
         identify()
     except KeyboardInterrupt:
-        draft.status = "stalled"
-        draft.warnings.insert(0, "interrupted: the best model so far")
+        draft.interrupt()
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         draft.timing_s["all"] = perf_counter() - began
         return failed(f"the training broke down: {error}")
@@ -397,22 +385,13 @@ def finish(
     )  # fmt: skip
     draft.timed("result", began)
     draft.timing_s["all"] = sum(draft.timing_s.values())
-    return NonlinearFit(
-        structure=structure,
-        settings=used,
-        model=model,
-        covariance=whole,
-        covariance_from="" if whole is None else origin,
+    if np.any(problem.precision):
+        draft.details = {"effective_parameters": found.effective, **draft.details}
+    return draft.result(
+        structure, records, used, seed, model=model, covariance=whole, covariance_from="" if whole is None else origin,
         n_estimated=int(np.count_nonzero(problem.live)),
         noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
-        seed=seed,
-        status=draft.status,
-        curves=tuple(draft.curves),
-        warnings=tuple(draft.warnings),
-        timing_s=dict(draft.timing_s),
-        details={**({"effective_parameters": found.effective} if np.any(problem.precision) else {}), **draft.details},
-        **provenance(records),
-    )
+    )  # fmt: skip
 
 
 def cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -> list[str]:

@@ -19,7 +19,8 @@ from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, portions
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit, provenance
+from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
+from ambid.nonlinear.lagged_problem import guarded
 from ambid.nonlinear.lpv_choice import (
     DEGREES,
     Candidate,
@@ -139,26 +140,21 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     if not records:
         raise EstimationError("lpv: no record is given. Pass one at least")
     s, schedule, columns = lpv_settings(settings, records[0])
-    began = perf_counter()
-    fitting = _begin(s, records, schedule, columns)
-    reason = ""
-    try:
-        reason = _identify(s, fitting, tick)
-    except KeyboardInterrupt:
-        fitting.status = "stalled"
-        fitting.warnings.insert(0, "interrupted: the best model so far")
-    except np.linalg.LinAlgError as error:
-        reason = f"the search broke down: {error}"
-    else:
+    fitting, began = _begin(s, records, schedule, columns), perf_counter()
+
+    def fail(why: str) -> NonlinearFit:
+        return failed_fit("lpv", records, _used(s, fitting), seed, why, fitting.timing_s)
+
+    def identify() -> None:
+        _identify(s, fitting, tick)
         if fitting.status == "stalled":
             fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
-    fitting.timing_s["all"] = perf_counter() - began
-    used = _used(s, fitting)
-    if not reason and not np.isfinite(fitting.problem(fitting.shape).cost(fitting.theta)):
-        reason = DIVERGED
-    if reason:
-        return failed_fit("lpv", records, used, seed, reason, fitting.timing_s)
-    return _finish(records, used, fitting, seed=seed)
+
+    failed = guarded(identify, fitting, fail)
+    fitting.timed("all", began)
+    if failed or fitting.reason or not np.isfinite(fitting.problem(fitting.shape).cost(fitting.theta)):
+        return failed or fail(fitting.reason or DIVERGED)
+    return _finish(records, _used(s, fitting), fitting, seed=seed)
 
 
 def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, columns: tuple[int, ...]) -> Fitting:
@@ -204,8 +200,8 @@ def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
     return {**asdict(s), **found}
 
 
-def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
-    """Choose and fit; returns why there is no model, or nothing."""
+def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> None:
+    """Choose and fit, or say why there is no model."""
     ticks = portions(tick, (1.0, 4.0, 10.0, 0.0 if s.degree is not None else 6.0, 10.0))
     order = s.error_order or 0
     began = perf_counter()
@@ -214,22 +210,22 @@ def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> str:
     if s.time_constant is None:
         fitting.schedule = choose_level(fitting, order, s.degree, ticks[0])
         fitting.theta = fitting.by_equations(fitting.shape)
-    fitting.timing_s["set point"], began = perf_counter() - began, perf_counter()
+    began = fitting.timed("set point", began)
     degrees = DEGREES if s.degree is None else (s.degree,)
     best = by_degree(fitting, degrees, replace(fitting.shape, ar=order), _CRITERION, ticks[1])
-    fitting.timing_s["degree"], began = perf_counter() - began, perf_counter()
+    began = fitting.timed("degree", began)
     best = by_form(fitting, wanted_shapes(best.shape, s.form, s.orders), best, ticks[2])
     if s.degree is None and np.isfinite(best.cost):  # a wrong form or error model may have decided on the degree
         others = [d for d in DEGREES if d != best.shape.degree]
         best = by_degree(fitting, others, best, _CRITERION, ticks[3])
-    fitting.timing_s["form"], began = perf_counter() - began, perf_counter()
+    began = fitting.timed("form", began)
     if not np.isfinite(best.cost):
-        return UNSTABLE if s.form == "output" else DIVERGED
+        fitting.reason = UNSTABLE if s.form == "output" else DIVERGED
+        return
     fitting.shape, fitting.theta = best.shape, best.theta
     start = fitting.refine_level(best, None) if fitting.limits[1] and best.shape.degree else best.theta
     fitting.search(best.shape, [start], ticks[4], "prediction errors", last=True)
-    fitting.timing_s["search"] = perf_counter() - began
-    return ""
+    fitting.timed("search", began)
 
 
 # --- the fit ----------------------------------------------------------------------------------------------------------
@@ -263,33 +259,20 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
             (noise * inverse[: theta.size, : theta.size] + _disagreement(fitting)) * model.unit[:, None] * model.unit
         )
     column = records[0].outputs[0] if of.column < 0 else of.name
-    return NonlinearFit(
-        structure="lpv",
-        settings=used,
-        model=model,
-        covariance=covariance,
-        covariance_from="" if covariance is None else "information",
-        n_estimated=int(theta.size),
-        noise_covariance=np.array([[noise * float(d.y_scale[0]) ** 2]]),
-        seed=seed,
-        status=fitting.status,
-        curves=tuple(fitting.curves),
-        warnings=tuple(warnings),
-        timing_s=dict(fitting.timing_s),
-        details={
-            "schedule": {
-                "signal": of.name,
-                "low": of.low,
-                "high": of.high,
-                "time_constant_s": of.time_constant,
-                "unit": records[0].units[column],
-            },
-            "condition": condition,
-            "frozen": _frozen_table(model, covariance, records[0].inputs),
-            "tried": [x.summary() for x in fitting.tried],
+    fitting.warnings = warnings
+    fitting.details = {
+        "schedule": {
+            "signal": of.name, "low": of.low, "high": of.high, "time_constant_s": of.time_constant,
+            "unit": records[0].units[column],
         },
-        **provenance(records),
-    )
+        "condition": condition, "frozen": _frozen_table(model, covariance, records[0].inputs),
+        "tried": [x.summary() for x in fitting.tried],
+    }  # fmt: skip
+    return fitting.result(
+        "lpv", records, used, seed, model=model, covariance=covariance,
+        covariance_from="" if covariance is None else "information", n_estimated=int(theta.size),
+        noise_covariance=np.array([[noise * float(d.y_scale[0]) ** 2]]),
+    )  # fmt: skip
 
 
 def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.fit import LearningCurve
+from ambid.nonlinear.fit import Attempt, LearningCurve
 from ambid.nonlinear.lpv_model import LpvShape, Part, Schedule, basis_values, errors, looks_back, part_of
 from ambid.nonlinear.records import Scaled
 
@@ -240,8 +239,8 @@ def information(criterion: str, cost: float, n: int, k: int, starts: int = 0) ->
 
 
 @dataclass(slots=True, kw_only=True)
-class Fitting:
-    """What a fit has come to, so that an interruption loses nothing."""
+class Fitting(Attempt):
+    """What a fit has come to."""
 
     data: Scaled
     records: Sequence[IOData]
@@ -251,11 +250,8 @@ class Fitting:
     first: int  # errors count from this sample on
     most: int  # iterations of a search
     limits: tuple[float, float] = (0.0, 0.0)  # of the set point's time constant, s, where it is estimated
-    status: Literal["converged", "stalled"] = "converged"
-    curves: list[LearningCurve] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
     tried: list[Candidate] = field(default_factory=list)
-    timing_s: dict[str, float] = field(default_factory=dict)
+    reason: str = ""  # why there is no model
 
     def parts(self, shape: LpvShape, schedule: Schedule | None = None) -> tuple[Part, ...]:
         """Return the records, ready for a shape, with the schedule of the fit or another."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -44,6 +45,7 @@ from ambid.nonlinear.state_training import (
     is_white,
     misfit,
     train,
+    train_each,
 )  # fmt: skip
 
 _SIGNED: Mapping[str, object] = {"neurons": 0, "prior": 3.0, "starts": 3, "evaluations": 2000}
@@ -121,8 +123,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     except KeyboardInterrupt as stop:
         if isinstance(stop, Interrupted):
             fitting.state = stop.state
-        fitting.status = "stalled"
-        fitting.warnings.insert(0, "interrupted: the best model so far")
+        fitting.interrupt()
         reason = reason or "interrupted before there was a network"
     except np.linalg.LinAlgError as error:
         reason = f"the training broke down: {error}"
@@ -164,10 +165,9 @@ def _start(s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting
     fitting.delay = int(s["delay"]) if "delay" in s else guess_delay(whole)
     fitting.data = shift_inputs(whole, fitting.delay)
     reason = _find_first(s, record, fitting)
-    fitting.timing_s["start"] = perf_counter() - began
+    began = fitting.timed("start", began)
     if "delay" in s or fitting.state is None:
         return reason
-    began = perf_counter()
     begun: State | str = fitting.state
     if s["form"] == "free" and "states" not in s:  # more than are needed: fewer would pass for a delay
         begun = start_free(fitting.data, record.dt, fitting.data.y_level.size + _MORE)
@@ -178,7 +178,7 @@ def _start(s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting
     if fitting.delay != before:
         fitting.state = None
         reason = _find_first(s, record, fitting)
-    fitting.timing_s["delay"] = perf_counter() - began
+    fitting.timed("delay", began)
     return reason
 
 
@@ -230,21 +230,19 @@ def _train_all(s: Mapping[str, Any], fitting: Fitting, seed: int, tick: Tick | N
     if s["descent"]:
         curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
         fitting.curves.extend(curves)
-        fitting.timing_s["one-step training"] = perf_counter() - began
-        began = perf_counter()
+        began = fitting.timed("one-step training", began)
     if s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
         bare = first.widen(gain=False)
         fitting.take(train(bare, data, stage="simulation errors", iterations=most, tick=physics), even_worse=True)
     if s["neurons"]:
         base = fitting.state
-        for k in range(starts):
-            begun = add_units(base, int(s["neurons"]), float(s["prior"]), [seed, k])
-            share = part_of(hidden, k / starts, (k + 1) / starts)
-            found = train(begun, data, stage="hidden layer", iterations=most, tick=share)
+        begun = [add_units(base, int(s["neurons"]), float(s["prior"]), [seed, k]) for k in range(starts)]
+        run = partial(train, data=data, stage="hidden layer", iterations=most)
+        for found in train_each(begun, lambda start, own: run(start, tick=own), hidden):
             fitting.take(found)
-            fitting.rivals += [found.state] if found else []
+            fitting.rivals.append(found.state)
     _train_gain(s, fitting, first, gain)
-    fitting.timing_s["training"] = perf_counter() - began
+    fitting.timed("training", began)
 
 
 def _train_gain(s: Mapping[str, Any], fitting: Fitting, first: State, tick: Tick | None) -> None:
@@ -327,7 +325,7 @@ def _rescue(
         after = stop.state if isinstance(stop, Interrupted) else second.state
         fitting.state = after if _is_better(after, before) else before
         raise KeyboardInterrupt from stop
-    fitting.timing_s["global search"] = perf_counter() - began
+    fitting.timed("global search", began)
     after = second.state
     better = _is_better(after, before)
     fitting.details["global_search"] = {

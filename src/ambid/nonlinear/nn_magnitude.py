@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -18,13 +19,13 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.progress import Tick, part_of, portions
+from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
 from ambid.nonlinear.state_network import Layout, free_entries
 from ambid.nonlinear.state_start import NO_START
-from ambid.nonlinear.state_training import Fitting, State, Training, add_units, finish, train
+from ambid.nonlinear.state_training import Fitting, State, Training, add_units, best_of, finish, train, train_each
 
 MOST_STATES = 4
 _DEFAULTS: Mapping[str, object] = {"output": "magnitude", "prior": 1.0, "starts": 20, "iterations": 50}
@@ -68,8 +69,7 @@ def nn_of_magnitude(
     try:
         _train_all(s, records[0].dt, fitting, seed, tick)
     except KeyboardInterrupt:
-        fitting.status = "stalled"
-        fitting.warnings.insert(0, "interrupted: the best model so far")
+        fitting.interrupt()
         reason = "interrupted before there was a first model"
     size = float(np.std(np.concatenate([y for y, _ in data.parts])))
     fitting.curves = [replace(c, training=c.training / max(size, 1e-300)) for c in fitting.curves]
@@ -106,20 +106,18 @@ def _train_all(s: Mapping[str, Any], dt: float, fitting: Fitting, seed: int, tic
         tick, (4.0, len(_FOLDS) * sum(units) * starts * (len(units) > 1), units[-1] * starts)
     )  # fmt: skip
     _choose_states(tried, s, dt, fitting, linear)
-    fitting.timing_s["linear"] = perf_counter() - began
+    began = fitting.timed("linear", began)
     base = fitting.state
     if base is None:
         return
-    began = perf_counter()
     neurons = _choose_units(s, fitting, base, seed, choice) if len(units) > 1 else units[0]
-    fitting.timing_s["choice of units"] = perf_counter() - began
-    began = perf_counter()
+    began = fitting.timed("choice of units", began)
     if neurons:
         best = _train_units(base, fitting.data, neurons, s, seed, last)
         if best is not None:  # the best start to the very end
             longer = {**s, "iterations": _LAST * int(s["iterations"])}
-            fitting.take(_train(best.state, fitting.data, longer, None) or best)
-    fitting.timing_s["training"] = perf_counter() - began
+            fitting.take(_train(fitting.data, longer, best.state, None) or best)
+    fitting.timed("training", began)
 
 
 # --- linear part -----------------------------------------------------------------------------------------------------
@@ -129,13 +127,9 @@ def _choose_states(tried: Sequence[int], s: Mapping[str, Any], dt: float, fittin
     """The best linear network of each size; Bayes' criterion chooses among sizes."""
     data, least, values = fitting.data, np.inf, []
     best: Training | None = None
-    for k, n in enumerate(tried):
-        of_size: Training | None = None
-        for layout, theta in grid_starts(data.parts, n, _REFINED, dt):
-            own = part_of(tick, k / len(tried), (k + 1) / len(tried))
-            found = _train(State.of(layout, theta, data), data, s, own)
-            if found is not None and (of_size is None or found.state.score < of_size.state.score):
-                of_size = found
+    for n, own in zip(tried, portions(tick, [1.0] * len(tried)), strict=True):
+        begun = [State.of(layout, theta, data) for layout, theta in grid_starts(data.parts, n, _REFINED, dt)]
+        of_size = best_of(train_each(begun, partial(_train, data, s), own))
         if of_size is None:
             continue
         at = of_size.state
@@ -214,7 +208,7 @@ def _choose_units(s: Mapping[str, Any], fitting: Fitting, linear: State, seed: i
         cut = [round(share * y.shape[0]) for y, _ in data.parts]
         fewer = replace(data, parts=tuple((y[:k], u[:k]) for (y, u), k in zip(data.parts, cut, strict=True)))
         n_rows = sum(cut)
-        found = _train(replace(linear, n_rows=n_rows), fewer, s, None)
+        found = _train(fewer, s, replace(linear, n_rows=n_rows), None)
         base = replace(linear, n_rows=n_rows) if found is None else found.state
         squares[0] += _error_ahead(base, data, cut) ** 2
         for neurons in range(1, _MOST_UNITS + 1):
@@ -242,17 +236,11 @@ def _train_units(
     base: State, data: Scaled, neurons: int, s: Mapping[str, Any], seed: int, tick: Tick | None
 ) -> Training | None:
     """The best of several random starts of a hidden layer; units have no effect at first."""
-    best: Training | None = None
-    starts = int(s["starts"])
-    for k in range(starts):
-        begun = add_units(base, neurons, float(s["prior"]), [seed, neurons, k])
-        found = _train(begun, data, s, part_of(tick, k / starts, (k + 1) / starts))
-        if found is not None and (best is None or found.state.score <= best.state.score):
-            best = found
-    return best
+    begun = [add_units(base, neurons, float(s["prior"]), [seed, neurons, k]) for k in range(int(s["starts"]))]
+    return best_of(train_each(begun, partial(_train, data, s), tick))
 
 
-def _train(start: State, data: Scaled, s: Mapping[str, Any], tick: Tick | None) -> Training | None:
+def _train(data: Scaled, s: Mapping[str, Any], start: State, tick: Tick | None) -> Training | None:
     """Train; units that put out nothing yet are begun against the errors of the linear part, their prior being strong.
 
     As long as they put out nothing the data say nothing of what they see, and the prior would take it away: what they

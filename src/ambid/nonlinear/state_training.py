@@ -6,10 +6,10 @@ anchored, without value and slope at the operating point, so that A and B are th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ambid.estimation.progress import Tick, part_of
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import LearningCurve, NonlinearFit, failed_fit, provenance
+from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit, failed_fit
 from ambid.nonlinear.lagged_problem import sandwich_at
 from ambid.nonlinear.records import Scaled
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
@@ -33,6 +33,7 @@ _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
 _FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
 _SUSPECT = 0.005  # .. and from which it is worth a warning, if it is more than chance
 _CHANCE = 1e-3
+_ALIKE = 2.0  # variance of what networks of one size miss over that by which they disagree: they miss much alike
 _AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
 
 
@@ -172,6 +173,21 @@ def train(
         method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds[1:]), training=np.array(errors)
     )
     return Training(state=at, curve=curve, converged=converged)
+
+
+def train_each(
+    starts: Sequence[State], run: Callable[[State, Tick | None], Training | None], tick: Tick | None
+) -> Iterator[Training]:
+    """Train from several starts, one after the other; those that diverge are left out."""
+    for k, start in enumerate(starts):
+        found = run(start, part_of(tick, k / len(starts), (k + 1) / len(starts)))
+        if found is not None:
+            yield found
+
+
+def best_of(trained: Iterator[Training]) -> Training | None:
+    """Return the training with the least errors."""
+    return min(trained, key=lambda found: found.state.score, default=None)
 
 
 def add_gain(state: State, data: Scaled, K: Array) -> State | None:
@@ -321,6 +337,7 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
     apart = np.array([(r.theta[:k] - state.theta[:k]) * unit for r in close])
     extra[:k, :k] = apart.T @ apart / (len(close) - 1.0)
     ratio = np.sqrt(np.diag(extra)[:k] / np.maximum(np.diag(covariance)[:k], 1e-300))
+    extra *= _ALIKE
     if not np.max(ratio) > 1.0:
         return extra, ()
     worst = int(np.argmax(ratio))
@@ -334,19 +351,14 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
 # --- the fit ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class Fitting:
-    """What a fit has come to, so that an interruption loses nothing."""
+@dataclass(slots=True, kw_only=True)
+class Fitting(Attempt):
+    """What a fit has come to."""
 
     data: Scaled  # each output beside the input that acts at its time
     delay: int = 0
     state: State | None = None  # the best network so far; None before the first
-    status: Literal["converged", "stalled"] = "converged"
     rivals: list[State] = field(default_factory=list)  # what every start of a hidden layer came to
-    curves: list[LearningCurve] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    timing_s: dict[str, float] = field(default_factory=dict)
-    details: dict[str, Any] = field(default_factory=dict)
 
     def take(self, found: Training | None, *, even_worse: bool = False) -> None:
         """Take over a network if it is better, or of another size, and its learning curve."""
@@ -387,26 +399,16 @@ def finish(
         return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
     began = perf_counter()
     spread = estimate_spread(state, data, how, seed, tick, fitting.rivals)
-    fitting.timing_s["standard deviations"] = perf_counter() - began
+    fitting.timed("standard deviations", began)
     fitting.timing_s["all"] = sum(fitting.timing_s.values())
     freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
     noise = state.noise * state.n_rows / freedom
-    return NonlinearFit(
-        structure="nn",
-        settings=used,
-        model=model,
-        covariance=spread.covariance,
-        covariance_from=spread.origin,
-        n_estimated=int(state.theta.size),
-        noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
-        seed=seed,
-        status=fitting.status,
-        curves=tuple(fitting.curves),
-        warnings=(*fitting.warnings, *_caution(records, state), *spread.warnings),
-        timing_s=dict(fitting.timing_s),
-        details={**fitting.details, **_details(state, model), "condition": spread.condition},
-        **provenance(records),
-    )
+    fitting.warnings += [*_caution(records, state), *spread.warnings]
+    fitting.details |= {**_details(state, model), "condition": spread.condition}
+    return fitting.result(
+        "nn", records, used, seed, model=model, covariance=spread.covariance, covariance_from=spread.origin,
+        n_estimated=int(state.theta.size), noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
+    )  # fmt: skip
 
 
 def _make_model(records: Sequence[IOData], data: Scaled, state: State, delay: int) -> StateNetwork | None:
