@@ -1,4 +1,4 @@
-"""The engine delivers everything, from this process, a thread and another process, and ends cleanly however it ends."""
+"""The engine delivers everything, from this process and another, and ends cleanly however it ends."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ from tests.track.damage import signal as noise
 
 ROOT = Path(__file__).parents[3]
 X = noise(3000)
-EVERYWHERE = ["none", "thread", "process"]
+EVERYWHERE = ["none", "process"]
 
 
 def replay(values=X, size=100):
@@ -102,17 +102,16 @@ def test_damage_is_reported_whichever_way_it_comes(producer):
     np.testing.assert_array_equal(sink.values(), np.delete(X, np.r_[700:800, 900:1000, 2000:2100], axis=0))
 
 
-@pytest.mark.parametrize("producer", ["none", "thread"])
-def test_real_time_takes_its_time(producer):
+def test_real_time_takes_its_time():
     sink = Sink()
-    report = engine(replay(), sink, producer=producer, pace="real-time")
+    report = engine(replay(), sink, pace="real-time")
     assert report.seconds >= 3000 / RATE
     assert report.given == 3000
 
 
 def test_a_slow_consumer_costs_blocks_never_the_order():
     sink = Sink(at=0, do=lambda: time.sleep(0.2))
-    report = engine(replay(), sink, producer="thread", pace="real-time", ring_blocks=4)
+    report = engine(replay(), sink, producer="process", pace="real-time", ring_blocks=4)
     assert report.latency.overruns > 0
     assert report.latency.largest > 0.1
     assert report.latency.late > 0
@@ -129,11 +128,10 @@ def test_an_exception_of_the_consumer_is_raised_and_nothing_is_left(producer):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize("producer", ["none", "thread"])
-def test_an_exception_of_the_source_is_raised_as_it_is(producer):
+def test_an_exception_of_the_source_is_raised_as_it_is():
     sink = Sink()
     with pytest.raises(RecordError, match="the disk is gone"):
-        engine(failing(5), sink, producer=producer)
+        engine(failing(5), sink)
     assert len(sink.stretches) == 5
 
 

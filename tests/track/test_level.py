@@ -23,7 +23,6 @@ def test_the_level_is_one_as_at_identification_and_counts_parameter_error():
     assert fed(level, 1.0, 300)[-1] == pytest.approx(1.0, abs=0.02)
     off = np.linalg.solve(J, np.full(5, math.sqrt(200 * 3 / 5)))  # adds three times the noise's power
     assert fed(level, 1.0, 100, truth=off)[-1] == pytest.approx(2.0, abs=0.03)
-    assert fed(ErrorLevel(1.5, 1.2, 100, usual=2.0), 2.0, 100)[-1] == pytest.approx(1.0, abs=0.02)
 
 
 def test_hysteresis_and_the_smallest_number_of_blocks():

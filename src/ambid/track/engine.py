@@ -1,6 +1,6 @@
 """The engine around a tracker: blocks go source -> ring -> guard -> consumer, timed, until they end or are interrupted.
 
-In process, the blocks come straight from the source. With a producer of its own (a thread or another process), they
+In process, the blocks come straight from the source. With a producer of its own, another process, they
 come through the ring, so that the source is never kept waiting by the consumer. Every wait is one that can be ended.
 """
 
@@ -18,7 +18,7 @@ from math import ceil, log10
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from types import FrameType, MappingProxyType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
@@ -94,24 +94,13 @@ _LOOK_S = 0.1  # how often a wait looks whether it should end
 _PATIENCE_S = 5.0  # for a producer that was asked to stop
 
 
-class Producer(Protocol):
-    """Whoever fills the ring."""
-
-    def alive(self) -> bool:
-        """Return whether something may still come."""
-        ...
-
-
 @contextmanager
-def produced_in(
-    where: Literal["thread", "process"], source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace
-) -> Iterator[Producer]:
-    """Run a source beside the caller while the context lasts.
+def produced_beside(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> Iterator[_Producer]:
+    """Run a source, which can be pickled, in another process while the context lasts.
 
-    `source`: for a process, one that can be pickled. Returns on leaving, it is told to stop; an exception of the source
-    is raised then, unless another is on its way.
+    On leaving, it is told to stop; an exception of the source is raised then, unless another is on its way.
     """
-    maker = _Thread(source, ring, rate_hz, pace) if where == "thread" else _Process(source, ring, rate_hz, pace)
+    maker = _Producer(source, ring, rate_hz, pace)
     try:
         yield maker
     except BaseException:
@@ -153,29 +142,7 @@ def fill(
         ring.end()
 
 
-class _Thread:
-    """The source in a thread of this process."""
-
-    def __init__(self, source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=(source, ring, rate_hz, pace), daemon=True)
-        self._thread.start()
-
-    def _run(self, source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
-        try:
-            fill(source, ring, rate_hz, pace)
-        except BaseException as failure:  # raised again where the blocks are consumed
-            self._failure = failure
-
-    def alive(self) -> bool:
-        return self._thread.is_alive()
-
-    def end(self) -> BaseException | None:
-        self._thread.join(_PATIENCE_S)
-        return self._failure
-
-
-class _Process:
+class _Producer:
     """The source in a fresh process; a forked one could inherit locks that nobody will open."""
 
     def __init__(self, source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
@@ -183,7 +150,7 @@ class _Process:
             packed = pickle.dumps(source)
         except (pickle.PicklingError, TypeError, AttributeError) as failure:
             raise EstimationError(
-                f"the source of blocks cannot be sent to another process ({failure}). Use a Replay, or a thread"
+                f"the source of blocks cannot be sent to another process ({failure}). Use a Replay"
             ) from None
         context = get_context("spawn")
         self._ours, theirs = context.Pipe(duplex=False)
@@ -193,6 +160,7 @@ class _Process:
         theirs.close()
 
     def alive(self) -> bool:
+        """Return whether something may still come."""
         return self._process.is_alive()
 
     def end(self) -> BaseException | None:
@@ -243,9 +211,6 @@ def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connectio
             tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Mend the source"))
 
 
-_LOOK_S = 0.1  # how often a wait looks whether it should end
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamReport:
     """What went through an engine."""
@@ -274,7 +239,7 @@ def run(
     *,
     guard: StreamGuard,
     pace: Pace = "fastest",
-    producer: Literal["none", "thread", "process"] = "none",
+    producer: Literal["none", "process"] = "none",
     ring_blocks: int = 64,
     block_samples: int = 200,
     stopped: Callable[[], bool] = lambda: False,
@@ -306,7 +271,7 @@ def run(
                 BlockRing.create(
                     rate_hz=guard.rate_hz, channels=names, slots=ring_blocks, block_samples=block_samples
                 ) as ring,
-                produced_in(producer, source, ring, guard.rate_hz, pace) as maker,
+                produced_beside(source, ring, guard.rate_hz, pace) as maker,
             ):
                 pump.drain(ring, ending, maker)
         pump.finish()
@@ -364,7 +329,7 @@ class _Pump:
                 return
             self.take(frame)
 
-    def drain(self, ring: BlockRing, ending: Callable[[], bool], maker: Producer | None) -> None:
+    def drain(self, ring: BlockRing, ending: Callable[[], bool], maker: _Producer | None) -> None:
         """Take all frames of a ring; when it should end, those that it holds by then."""
         left: int | None = None
         while left is None or left > 0:

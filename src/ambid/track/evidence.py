@@ -7,7 +7,6 @@ unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length o
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 
@@ -376,10 +375,3 @@ class EvidenceStream:
         self._counts[2] = 0
         self.latest = found
         return found
-
-    def copy(self) -> EvidenceStream:
-        """Return an independent stream in the same state."""
-        other = copy.copy(self)
-        for name in ("_history", "_x", "_s", "_rows", "_triangle", "_counts", "_scale"):
-            setattr(other, name, getattr(self, name).copy())
-        return other

@@ -26,26 +26,26 @@ class ErrorLevel:
     """Root mean square of the normalised innovations over recent blocks, and whether it is too large.
 
     `limit`, `release`: too large from `limit` on, until it has come down to `release`; `window_blocks`: blocks in the
-    mean; nothing is judged before that many; `usual`: level at identification, by which the error is divided.
+    mean; nothing is judged before that many.
 
     `above`: whether the error is too large; `n_blocks`: blocks used.
     """
 
-    def __init__(self, limit: float, release: float, window_blocks: int, *, usual: float = 1.0) -> None:
-        if not (0 < release <= limit and window_blocks >= 1 and usual > 0):
+    def __init__(self, limit: float, release: float, window_blocks: int) -> None:
+        if not (0 < release <= limit and window_blocks >= 1):
             raise EstimationError(
-                f"error level: 0 < release <= limit, a window of a block or more, usual > 0; got release "
-                f"{release:g}, limit {limit:g}, {window_blocks} blocks, usual {usual:g}. Mend them"
+                f"error level: 0 < release <= limit, a window of a block or more; got release "
+                f"{release:g}, limit {limit:g}, {window_blocks} blocks. Mend them"
             )
         self.limit, self.release = limit, release
         self.above, self.n_blocks = False, 0
-        self._squares, self._weights, self._usual = [0.0] * window_blocks, [0.0] * window_blocks, usual * usual
+        self._squares, self._weights = [0.0] * window_blocks, [0.0] * window_blocks
         self._square = self._weight = 0.0
 
     @property
     def error(self) -> float:
         """Present level, 1 as at identification; NaN before the first block."""
-        return math.sqrt(max(self._square, 0.0) / (self._weight * self._usual)) if self._weight else math.nan
+        return math.sqrt(max(self._square, 0.0) / self._weight) if self._weight else math.nan
 
     def update(self, evidence: Evidence, estimate: Array) -> float:
         """Take in a block.

@@ -56,13 +56,6 @@ class DecisionLog:
         with self._lock:
             return MappingProxyType(dict(self._counts))
 
-    def since(self, t: float) -> tuple[Event, ...]:
-        """Return the kept events at or after a time.
-
-        `t`: s of record.
-        """
-        return tuple(event for event in self.events if event.t >= t)
-
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Order = Literal["accept", "revert"]

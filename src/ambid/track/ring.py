@@ -5,7 +5,7 @@ full is dropped and counted. Dropping the newest rather than overwriting the old
 consumer alone, so that nothing is torn under its hands and one gap, seen in the sample numbers, is all that is lost.
 
     header     "AMBIDRNG", version, slots, samples and channels of a block, rate, names
-    producer   blocks written, blocks dropped, samples dropped, ended, process
+    producer   blocks written, blocks dropped, ended, process
     consumer   blocks read, stop wanted, process
     slots      sequence number, check value, first sample, time, arrival, rows, columns, bytes, type; values
 """
@@ -166,11 +166,11 @@ def _values(data: bytes, rows: int, columns: int, kind: bytes) -> Any:
     return flat if columns < 0 else flat.reshape(rows, columns)
 
 
-VERSION = 1
+VERSION = 2
 _MAGIC = b"AMBIDRNG"
 _HEADER = struct.Struct("=8sQQQQdQQ")  # magic, version, slots, samples, channels, rate, bytes of names, check value
 _LINE = 64  # bytes: what two processes write lies on different cache lines
-_WRITTEN, _DROPPED, _DROPPED_SAMPLES, _ENDED, _PRODUCER = range(5)  # of the producer's line
+_WRITTEN, _DROPPED, _ENDED, _PRODUCER = range(4)  # of the producer's line
 _READ, _STOP, _CONSUMER = range(3)  # of the consumer's line
 _RETRIES = 100  # of a frame whose check fails: its last bytes may be on their way
 
@@ -270,11 +270,6 @@ class BlockRing:
         return int(self._produced[_DROPPED])
 
     @property
-    def overrun_samples(self) -> int:
-        """Samples of the dropped blocks."""
-        return int(self._produced[_DROPPED_SAMPLES])
-
-    @property
     def ended(self) -> bool:
         """Whether the producer said that it is done and everything was read."""
         return bool(self._produced[_ENDED]) and self.filled == 0
@@ -317,7 +312,6 @@ class BlockRing:
         written = self._produced[_WRITTEN]
         if written - self._consumed[_READ] >= self.slots:
             self._produced[_DROPPED] += 1
-            self._produced[_DROPPED_SAMPLES] += len(block.values) if np.ndim(block.values) else 0
             return False
         at = self._first_slot + (written % self.slots) * self._slot_size
         write_frame(self._bytes, at, written, block, arrived, self._capacity)

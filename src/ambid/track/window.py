@@ -7,9 +7,7 @@ uses it to find a parameter anew after a jump, where the recursion's first-order
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,15 +16,14 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.track.evidence import Evidence, EvidenceStream, Linearisation, RecentSamples, Samples, checked, linearise
-from ambid.track.numbers import TrackedNumbers, tracked_numbers
-from ambid.track.rpem import ParameterFilter
+from ambid.track.numbers import TrackedNumbers
+from ambid.track.rpem import ParameterFilter, PhysicalEstimator
 
 _WHOLE = 1 << 40  # samples: a stretch is one block
 _ITERATIONS = 6
 _SETTLED = 0.05  # in standard deviations: the search has converged where the next step is shorter
 _HALVINGS = 4
 _WIDER = 30.0  # how much wider than the start's the standard deviations are that a window begins with
-_ENDLESS = 1 << 40  # samples of one evidence: the stretch is one block
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,7 +104,7 @@ def evidence_of(numbers: TrackedNumbers, at: Linearisation, samples: Samples, *,
     return stream.close(1)
 
 
-class MovingWindow:
+class MovingWindow(PhysicalEstimator):
     """Estimator of the physical parameters from the last samples alone.
 
     Parameters
@@ -132,39 +129,20 @@ class MovingWindow:
     """
 
     def __init__(self, start: Estimate | TrackedNumbers, *, window: int, every: int | None = None) -> None:
-        numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
-        at = linearise(numbers, numbers.start)
-        if at is None:
-            raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
-        fewest = EvidenceStream(numbers, at, 1).settling_samples + 10 * numbers.start.size
+        super().__init__(start)
+        numbers = self.numbers
+        fewest = self.stream.settling_samples + 10 * numbers.start.size
         if window < fewest:
             raise EstimationError(f"the window has {window} samples; it needs at least {fewest}. Give a longer window")
-        self.numbers, self.window = numbers, window
+        self.window = window
         self.every = max(1, window // 10) if every is None else every
         wide = numbers.covariance.copy()
         own = numbers.places("parameter", "noise")
         wide[np.ix_(own, own)] *= _WIDER**2
         self._begin = ParameterFilter(numbers.start, wide, numbers.positive)
         self._begin.active[numbers.places("gain")] = False
-        self._now = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
-        self._stream = EvidenceStream(numbers, at, _ENDLESS)
-        self._recent, self._since = RecentSamples(window), 0
-        self.n_used = self.n_rejected = self.n_failed = 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the physical parameters."""
-        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
-
-    @property
-    def estimate(self) -> Array:
-        """Physical parameters, SI, shape (n_parameters,)."""
-        return self.numbers.physical(self._now.q)
-
-    @property
-    def covariance(self) -> Array:
-        """Their covariance, SI, shape (n_parameters, n_parameters)."""
-        return self.numbers.physical_covariance(self._now.covariance)
+        self.stream = EvidenceStream(numbers, self.stream.at, _WHOLE)
+        self._recent, self._since, self.n_failed = RecentSamples(window), 0, 0
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -189,9 +167,9 @@ class MovingWindow:
         n, k = samples.y.shape[0], 0
         while k < n:
             stop = min(n, k + self.every - self._since)
-            used, found, _ = self._stream.feed(samples.part(k, stop))
+            used, found, _ = self.stream.feed(samples.part(k, stop))
             errors[k : k + used] = found
-            self._recent.add(samples.part(k, k + used), self._stream.sample)
+            self._recent.add(samples.part(k, k + used), self.stream.sample)
             k, self._since, self.n_used = k + used, self._since + used, self.n_used + used
             if self._since >= self.every:
                 self._since = 0
@@ -200,39 +178,27 @@ class MovingWindow:
                 self.n_rejected += 1
                 k += 1
                 self._recent.clear()
-                self._stream.restart(self._stream.sample + 1)
+                self.stream.restart(self.stream.sample + 1)
         errors *= self.numbers.problem.scales.output
         return errors.reshape(np.shape(outputs))
 
     def _solve(self) -> None:
-        first = self._stream.sample - self.window
+        first = self.stream.sample - self.window
         samples = self._recent.since(first)
         if samples is None:
             return
         begin = self._begin.copy()
-        begin.q = self._now.q.copy()  # a warm start; what is known of it is as wide as at the beginning
+        begin.q = self.filter.q.copy()  # a warm start; what is known of it is as wide as at the beginning
         found = refine(
             self.numbers,
             begin,
             samples,
             first=first,
-            block=_ENDLESS,
+            block=_WHOLE,
             noise=self.numbers.overdispersion,
-            gain=self._stream.at.gain,
+            gain=self.stream.at.gain,
         )
         if found is None or not found.converged:
             self.n_failed += 1
             return
-        self._now, self._stream = found.filter, found.stream
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state.
-
-        Returns
-        -------
-        MovingWindow
-        """
-        other = copy.copy(self)
-        other._begin, other._now, other._stream = self._begin.copy(), self._now.copy(), self._stream.copy()
-        other._recent = copy.deepcopy(self._recent)
-        return other
+        self.filter, self.stream = found.filter, found.stream
