@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,74 +58,10 @@ class Block(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Linear:
-    """L x + c over some of the regressors, shape by output: L (p, d), then c (p,) if there is a constant."""
-
-    n_outputs: int
-    at: slice
-    constant: bool
-
-    @property
-    def width(self) -> int:
-        """Regressors that it looks at."""
-        return int(self.at.stop - self.at.start)
-
-    @property
-    def n_theta(self) -> int:
-        """Number of parameters."""
-        return self.n_outputs * (self.width + self.constant)
-
-    def parts(self, theta: Array) -> tuple[Array, Array]:
-        """Return L and c."""
-        n = self.n_outputs * self.width
-        return theta[:n].reshape(self.n_outputs, self.width), theta[n:] if self.constant else np.zeros(self.n_outputs)
-
-    def uses(self, at: Table) -> bool:
-        """As `Block.uses`."""
-        return bool(np.any((at >= self.at.start) & (at < self.at.stop)))
-
-    def bends(self, at: Table) -> bool:
-        """As `Block.bends`."""
-        del at
-        return False
-
-    def prepare(self, x: Array) -> tuple[Array, ...]:
-        """As `Block.prepare`."""
-        return (x[:, self.at],)
-
-    def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
-        """As `Block.values`."""
-        L, c = self.parts(theta)
-        return np.asarray(rows[0] @ L.T + c)
-
-    def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
-        """As `Block.derivatives`."""
-        x, p, d = rows[0], self.n_outputs, self.width
-        out = np.zeros((x.shape[0], p, self.n_theta))
-        for o in range(p):
-            out[:, o, o * d : (o + 1) * d] = x
-            if self.constant:
-                out[:, o, p * d + o] = 1.0
-        by_x = np.zeros((1, p, at.size))
-        inside = (at >= self.at.start) & (at < self.at.stop)
-        by_x[0][:, inside] = self.parts(theta)[0][:, at[inside] - self.at.start]
-        return out if np.all(live) else out[:, :, live], by_x
-
-    def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
-        """As `Block.fill`."""
-        L, c = self.parts(theta)
-        if numbers["L"].shape[1] < self.at.stop:
-            more = self.at.stop - numbers["L"].shape[1]
-            numbers["L"] = np.hstack([numbers["L"], np.zeros((self.n_outputs, more))])
-        numbers["L"][:, self.at] += L
-        numbers["c"] += c
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Terms:
     """Sums of coefficient times product of regressors: numerators, over 1 + denominators where there are any.
 
-    Terms stand output by output, numerator before denominator.
+    Where there are, it is the only block of its kind.
     """
 
     n_outputs: int
@@ -138,15 +74,10 @@ class Terms:
         return int(self.place.shape[0])
 
     @cached_property
-    def _slices(self) -> tuple[tuple[slice, slice], ...]:
-        """Numerator and denominator of each output in theta."""
-        out, first = [], 0
-        for o in range(self.n_outputs):
-            own = self.place[self.place[:, 0] == o, 1]
-            middle, last = first + int(np.count_nonzero(own == 0)), first + own.size
-            out.append((slice(first, middle), slice(middle, last)))
-            first = last
-        return tuple(out)
+    def _owned(self) -> tuple[tuple[slice | Table, slice | Table], ...]:
+        """Where numerator and denominator of each output stand in theta."""
+        found = [[np.flatnonzero(np.all(self.place == (o, b), axis=1)) for b in (0, 1)] for o in range(self.n_outputs)]
+        return tuple((_as_slice(up), _as_slice(down)) for up, down in found)
 
     @cached_property
     def _rational(self) -> bool:
@@ -187,15 +118,15 @@ class Terms:
         return np.ascontiguousarray(out.T), x
 
     def _numerators(self, theta: Array, T: Array) -> Array:
-        out = np.empty((T.shape[0], self.n_outputs))
-        for o, (up, _) in enumerate(self._slices):
+        out = np.empty((T.shape[0], self.n_outputs), dtype=theta.dtype)
+        for o, (up, _) in enumerate(self._owned):
             out[:, o] = T[:, up] @ theta[up]
         return out
 
     def denominators(self, theta: Array, rows: tuple[Array, ...]) -> Array:
         """Return the denominators' values, ones without, shape (n, n_outputs)."""
         T, out = rows[0], np.ones((rows[0].shape[0], self.n_outputs))
-        for o, (_, down) in enumerate(self._slices):
+        for o, (_, down) in enumerate(self._owned):
             out[:, o] += T[:, down] @ theta[down]
         return out
 
@@ -213,7 +144,7 @@ class Terms:
             num, den = self._numerators(theta, T), self.denominators(theta, rows)
             by_value = np.stack([1.0 / den, -num / den**2], axis=2)
         out = np.zeros((n, p, self.n_theta if np.any(live) else 0))
-        for o, both in enumerate(self._slices if np.any(live) else ()):
+        for o, both in enumerate(self._owned if np.any(live) else ()):
             for below, own in enumerate(both):
                 out[:, o, own] = T[:, own] * by_value[:, o, below, None]
         by_x = np.zeros((n if self._varies(at) else 1, p, at.size))
@@ -228,7 +159,40 @@ class Terms:
 
     def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
         """As `Block.fill`."""
-        numbers.update(terms=self.terms, place=self.place, theta=theta)
+        width = max(numbers["terms"].shape[1], self.terms.shape[1])
+        tables = [
+            np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1) for x in (numbers["terms"], self.terms)
+        ]
+        numbers.update(terms=np.concatenate(tables), place=np.concatenate([numbers["place"], self.place]))
+        numbers["theta"] = np.concatenate([numbers["theta"], theta])
+
+
+def _as_slice(at: Table) -> slice | Table:
+    """Places as a slice, which copies nothing, if they have no gaps."""
+    whole = slice(int(at[0]), int(at[-1]) + 1) if at.size else slice(0, 0)
+    return whole if whole.stop - whole.start == at.size else at
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linear(Terms):
+    """L x + c over some of the regressors as terms: L (p, width) by output, then c (p,) if there is a constant."""
+
+    width: int
+
+    @classmethod
+    def over(cls, n_outputs: int, at: slice, *, constant: bool) -> Self:
+        """Return L x + c over the regressors `at`."""
+        each = [*range(at.start, at.stop)]
+        terms = each * n_outputs + [-1] * (n_outputs * constant)
+        outputs = [o for o in range(n_outputs) for _ in each] + [*range(n_outputs)] * constant
+        place = np.array([(o, 0) for o in outputs], dtype=np.int64).reshape(-1, 2)
+        table = np.array(terms, dtype=np.int64).reshape(-1, 1)
+        return cls(n_outputs=n_outputs, terms=table, place=place, width=len(each))
+
+    def parts(self, theta: Array) -> tuple[Array, Array]:
+        """Return L and c."""
+        n = self.n_outputs * self.width
+        return theta[:n].reshape(self.n_outputs, self.width), theta[n:]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -167,7 +167,7 @@ class HybridFunction(LaggedFunction):
         last = d + self.p * self.ne
         return (
             block_of(self.regressors, self.owned),
-            Linear(n_outputs=self.p, at=slice(d, last), constant=False),
+            Linear.over(self.p, slice(d, last), constant=False),
             Tanh(n_outputs=self.p, width=last if self.deep else d, neurons=self.neurons),
         )
 

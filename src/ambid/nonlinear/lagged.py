@@ -21,7 +21,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.nonlinear.blocks import Block, Linear, Mask, Table
+from ambid.nonlinear.blocks import Block, Mask, Table
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.records import finite, scaled, with_head
 
@@ -270,8 +270,7 @@ class LaggedFunction(ABC):
         at, out = self.regressors.noisy, np.zeros((1, self.n_outputs, self.regressors.noisy.size))
         for block, own, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True):
             if block.uses(at):
-                few = tuple(a[:0] for a in r) if isinstance(block, Linear) else r  # whose slopes are the same in all
-                out = out - block.derivatives(own, few, np.zeros(block.n_theta, dtype=np.bool_), at)[1]
+                out = out - block.derivatives(own, r, np.zeros(block.n_theta, dtype=np.bool_), at)[1]
         return np.ascontiguousarray(out)
 
     def free_run(self, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
@@ -294,7 +293,7 @@ class LaggedFunction(ABC):
 
         p, none = self.n_outputs, np.zeros((0, 0))
         numbers: dict[str, Any] = {
-            "L": np.zeros((p, 0)), "c": np.zeros(p), "terms": np.zeros((0, 0), dtype=np.int64),
+            "terms": np.zeros((0, 0), dtype=np.int64),
             "place": np.zeros((0, 2), dtype=np.int64), "theta": np.zeros(0), "W2": none, "W1": none, "b1": np.zeros(0),
             "W": none, "M": none, "C": none, "s": np.zeros(0), "unit": 0,
         }  # fmt: skip

@@ -60,7 +60,7 @@ def radial_units(x: Array, C: Array, s: Array, unit: int, phi: Array, by_q: Arra
 @compiled(error_model="numpy")
 def run(
     z: Array, column: Table, back: Table, shape: Table, out: Array,
-    L: Array, c: Array, terms: Table, place: Table, theta: Array, W2: Array, W1: Array, b1: Array,
+    terms: Table, place: Table, theta: Array, W2: Array, W1: Array, b1: Array,
     W: Array, M: Array, C: Array, s: Array, unit: int,
 ) -> None:  # fmt: skip
     """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on.
@@ -83,25 +83,20 @@ def run(
     for t in range(lag, n):
         for d in range(D):
             x[d] = z[t - back[d], column[d]]
+        num[:] = 0.0
+        den[:] = 1.0
+        for k in range(place.shape[0]):
+            v = theta[k]
+            for j in range(terms.shape[1]):
+                if terms[k, j] < 0:
+                    break
+                v *= x[terms[k, j]]
+            if place[k, 1] == 1:
+                den[place[k, 0]] += v
+            else:
+                num[place[k, 0]] += v
         for o in range(p):
-            f[o] = c[o]
-            for d in range(L.shape[1]):
-                f[o] += L[o, d] * x[d]
-        if place.shape[0] > 0:
-            num[:] = 0.0
-            den[:] = 1.0
-            for k in range(place.shape[0]):
-                v = theta[k]
-                for j in range(terms.shape[1]):
-                    if terms[k, j] < 0:
-                        break
-                    v *= x[terms[k, j]]
-                if place[k, 1] == 1:
-                    den[place[k, 0]] += v
-                else:
-                    num[place[k, 0]] += v
-            for o in range(p):
-                f[o] += num[o] / den[o]
+            f[o] = num[o] / den[o]
         for i in range(h):
             v = b1[i]
             for d in range(W1.shape[1]):

@@ -99,7 +99,7 @@ class NarxFunction(LaggedFunction):
     def blocks(self) -> tuple[Block, ...]:
         """What it is the sum of."""
         d = self.regressors.column.size
-        linear = Linear(n_outputs=self.p, at=slice(0, d), constant=True)
+        linear = Linear.over(self.p, slice(0, d), constant=True)
         return linear, Tanh(n_outputs=self.p, width=d, neurons=self.neurons)
 
     @property

@@ -63,7 +63,7 @@ class RbfFunction(LaggedFunction):
     def line(self) -> Linear:
         """The linear part."""
         width = self.regressors.column.size if self.linear else 0
-        return Linear(n_outputs=self.p, at=slice(0, width), constant=True)
+        return Linear.over(self.p, slice(0, width), constant=True)
 
     @cached_property
     def units(self) -> Radial:
@@ -105,7 +105,7 @@ class RbfFunction(LaggedFunction):
 
     def features(self, theta: Array, x: Array) -> Array:
         """Return what weights multiply: regressors, if there is a linear part, one, and activations."""
-        return np.hstack([x[:, self.line.at], np.ones((x.shape[0], 1)), self.activations(theta, x)])
+        return np.hstack([x[:, : self.line.width], np.ones((x.shape[0], 1)), self.activations(theta, x)])
 
     def matrix(self, theta: Array) -> Array:
         """Return the weights, (n_outputs, n_features)."""
