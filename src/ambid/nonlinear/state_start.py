@@ -142,7 +142,7 @@ def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Arr
     past = min(past, max(y.shape[0] // (3 * (y.shape[1] + u.shape[1])) - 2, 2))
     try:
         io = IOData(u=u, y=y, dt=1.0, inputs=names[0], outputs=names[1], units=dict.fromkeys(names[0] + names[1], "1"))
-        model = pbsid(io, {"n": n}, past=past, horizon=past, feedthrough=False).model
+        model = pbsid(io, {"n": n}, horizon=past, feedthrough=False).model
     except (EstimationError, np.linalg.LinAlgError) as error:
         return f"no first model: {error}"
     found = tuple(np.asarray(getattr(model, k), dtype=np.float64) for k in "ABCK")
