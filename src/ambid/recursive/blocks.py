@@ -28,7 +28,7 @@ from ambid.recursive.estimator import check_channels
 from ambid.recursive.streaming import ScalarKalman, StreamingFilter
 
 _WARM_UP = 4000  # samples, from which scales, means and the start are found
-_BATCH = 256  # samples, at least
+_BATCH = 256  # samples
 _CORNER = 3.0  # of the default filter, over the pole of the coil
 _FORGOTTEN = 4.0  # time constants after which a filter has forgotten how it began
 _DOUBT = 1e-3  # probability under which a start is not of first order
@@ -83,8 +83,6 @@ class OnlineThreeBlocks:
         An estimate from off-line.
     warm_up : int
         Samples, at least 200.
-    batch_s : float, optional
-        Length of a batch, s: after it the noise has forgotten itself. At least 256 samples.
 
     Attributes
     ----------
@@ -108,7 +106,6 @@ class OnlineThreeBlocks:
         instruments: bool = True,
         start: ThreeBlocks | None = None,
         warm_up: int = _WARM_UP,
-        batch_s: float | None = None,
     ) -> None:
         check_channels("three blocks", rate_hz, 1)
         if memory_s is not None and not memory_s * rate_hz >= 4 * _BATCH:
@@ -118,12 +115,9 @@ class OnlineThreeBlocks:
             )
         if isinstance(warm_up, bool) or not isinstance(warm_up, int) or warm_up < 200:
             raise EstimationError(f"three blocks: a warm-up of {warm_up!r} samples; give a whole number from 200 up")
-        if batch_s is not None and not 0 < batch_s * rate_hz < 1e6:
-            raise EstimationError(f"three blocks: a batch of {batch_s} s; give a positive time under 1e6 samples")
         self._dt, self._memory_s, self._prefilter = 1.0 / rate_hz, memory_s, prefilter
         self._with_reference, self._instruments = with_reference, instruments
         self._safe, self._given = open_loop or with_reference, start
-        self._batch = max(_BATCH, 0 if batch_s is None else ceil(batch_s * rate_hz))
         self._waiting = np.empty((warm_up, 4 if with_reference else 3))
         self._n_waiting = 0
         self._why = "still warming up"
@@ -259,7 +253,7 @@ class OnlineThreeBlocks:
         self._block_rows(one, row, error, self._state, self._constants, False)
         self.n_used += 1
         self._filled += 1
-        if self._filled == self._batch:
+        if self._filled == _BATCH:
             self._digest()
         return (error * self._scale[1:3])[0]
 
@@ -338,13 +332,11 @@ class OnlineThreeBlocks:
         self._filter = self._prefilter.anew(4)
         self._wait = min(ceil(_FORGOTTEN / (min(a, b, f) * self._dt)), _LONGEST_WAIT * _WARM_UP)
         self._fresh, self._skip, self._filled = True, self._wait, 0
-        self._rows, self._state, self._block_rows = np.empty((self._batch, N_ROW)), np.zeros(N_STATE), block_rows
+        self._rows, self._state, self._block_rows = np.empty((_BATCH, N_ROW)), np.zeros(N_STATE), block_rows
         factor = 1.0 if self._memory_s is None else exp(-self._dt / self._memory_s)
         longest = np.inf if self._memory_s is None else self._memory_s
-        stretch = min(_FORGOTTEN / min(a, b, f), longest) / (self._batch * self._dt)
-        self._sums = Sums(
-            factor**self._batch, factor ** np.arange(self._batch - 1.0, -1.0, -1.0), ceil(min(stretch, 1e9))
-        )
+        stretch = min(_FORGOTTEN / min(a, b, f), longest) / (_BATCH * self._dt)
+        self._sums = Sums(factor**_BATCH, factor ** np.arange(_BATCH - 1.0, -1.0, -1.0), ceil(min(stretch, 1e9)))
         self._theta = self._at.theta
         self._constants = self._at.constants(self._dt, least_squares=not self._instruments)
 
@@ -354,7 +346,7 @@ class OnlineThreeBlocks:
         self._filter.run(signals, signals)
         done = 0
         while done < block.shape[0]:
-            n = min(block.shape[0] - done, self._batch - self._filled)
+            n = min(block.shape[0] - done, _BATCH - self._filled)
             if self._skip:
                 n = min(n, self._skip)
             rows, part = self._rows[self._filled : self._filled + n], errors[done : done + n]
@@ -367,7 +359,7 @@ class OnlineThreeBlocks:
                 continue
             part *= self._scale[1:3]
             self._filled += n
-            if self._filled == self._batch:
+            if self._filled == _BATCH:
                 self._digest()
 
     def _digest(self) -> None:
@@ -375,7 +367,7 @@ class OnlineThreeBlocks:
         self._filled = 0
         assert self._at is not None
         starving = self._sums.add(self._rows, self._theta)
-        self._quiet = self._quiet + self._batch if starving else 0
+        self._quiet = self._quiet + _BATCH if starving else 0
         self._theta = self._sums.solve() or self._theta
         if self._sums.enough and not starving:
             sd = np.sqrt(np.maximum(np.diag(self._sums.covariance()), 0.0))
@@ -440,14 +432,13 @@ class Linearisation:
         ka, a, kb, b, off_i, kc, c, off_x = (theta * self.units).tolist()
         sd = sd * self.units
         new, keep = replace(self, off_i=off_i, off_x=off_x), 1.0
-        if sd[1] < _ADOPTED * abs(a) and 0 < a * dt < 20:
-            step = max(1.0, 2 * abs(a - self.a) / self.a)
-            new = replace(new, ka=self.ka + (ka - self.ka) / step, a=self.a + (a - self.a) / step)
-            keep = min(keep, _weight(new.a - self.a, self.a, sd[1]))
-        if sd[3] < _ADOPTED * abs(b) and 0 < b * dt < 20:
-            step = max(1.0, 2 * abs(b - self.b) / self.b)
-            new = replace(new, kb=self.kb + (kb - self.kb) / step, b=self.b + (b - self.b) / step)
-            keep = min(keep, _weight(new.b - self.b, self.b, sd[3]))
+        for gain, pole, at, now, spread in (("ka", "a", self.a, a, sd[1]), ("kb", "b", self.b, b, sd[3])):
+            if spread < _ADOPTED * abs(now) and 0 < now * dt < 20:
+                step = max(1.0, 2 * abs(now - at) / at)
+                before, moved = getattr(self, gain), at + (now - at) / step
+                goal = ka if gain == "ka" else kb
+                new = replace(new, **{gain: before + (goal - before) / step, pole: moved})
+                keep = min(keep, _weight(moved - at, at, spread))
         if sd[5] < _ADOPTED * abs(kc):
             new = replace(new, kc=kc, c=c)
         return new, keep

@@ -8,7 +8,7 @@ second-order terms (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
@@ -495,41 +495,25 @@ class JointUkf(JointFilter):
     def __init__(self, start: JointStart) -> None:
         super().__init__(start)
         self._logs = self._logs.astype(np.int64)
-        self._place, self._entry, self._first, self._factor = self._matrices()
+        self._place, self._entry, self._power = self._matrices()
         self._terms = self._series()
 
-    def _matrices(self) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]:
-        """[A, B, E] T in scaled units as products of powers of the followed numbers; the others are taken in."""
+    def _matrices(self) -> tuple[Ints, Array, Ints]:
+        """[A, B, E] T in scaled units as products of powers of the followed numbers: places, sizes, exponents."""
         model, start = self.start.model, self.start
-        found, names = powers_of(model), [p.name for p in model.parameters]
+        nonzero = np.where(self._values0 != 0.0, self._values0, self._size)
+        at = {**start.values, **dict(zip(start.free, nonzero.tolist(), strict=True))}
+        place, entries, power = powers_of(model, at, start.free)
         columns = np.r_[self._state, np.ones(len(model.inputs)), self._disturbance]
-        size = found.size * columns[found.place[:, 1]] / self._state[found.place[:, 0]] / start.rate_hz
+        entries = entries * columns[place[:, 1]] / self._state[place[:, 0]] / start.rate_hz
         # a followed number stands in units of its start (a logarithm) or of its size
-        unit = dict(zip(start.free, np.where(self._logs, self._values0, self._size), strict=True))
-        kept, first = [], [0]
-        for i in range(size.size):
-            for j, power in found.factor[found.start[i] : found.start[i + 1]]:
-                name = names[j]
-                if name in unit:
-                    size[i] *= unit[name] ** float(power)
-                    kept.append((start.free.index(name), power))
-                else:
-                    size[i] *= start.values[name] ** float(power)
-            first.append(len(kept))
-        factor = np.array(kept, dtype=np.int64).reshape(-1, 2)
-        return found.place, size, np.array(first, dtype=np.int64), factor
+        unit = nonzero / np.where(self._logs, self._values0, self._size)
+        return place, entries / np.prod(unit ** power.astype(float), axis=1), power
 
     def _series(self) -> int:
         """Terms of the Taylor series that leave nothing, with parameters twice as large as at the start."""
-        n = self._wide.size
-        A = np.zeros((n, n))
-        for i, (row, column) in enumerate(self._place):
-            if column < n:
-                q = self._factor[self._first[i] : self._first[i + 1]]
-                start = np.where(self._logs, 1.0, self._scaled_parameters)
-                A[row, column] = self._entry[i] * np.prod(start[q[:, 0]] ** q[:, 1].astype(float))
-        norm = 2.0 * float(np.abs(A).sum(axis=1).max())
-        term = 1.0
+        A = self.start.model.matrices(self.start.values).A * self._state / self._state[:, None] / self.start.rate_hz
+        norm, term = 2.0 * float(np.abs(A).sum(axis=1).max()), 1.0
         for order in range(1, _MOST_TERMS + 1):
             term *= norm / order
             if order > norm and term < _REST:
@@ -541,56 +525,33 @@ class JointUkf(JointFilter):
 
     def _run(self, u: Array, y: Array, e: Array) -> None:
         kernels("joint").ukf_block(
-            u, y, e, self._z, self._F, self._logs, self._place, self._entry, self._first, self._factor, self._C,
-            self._dist, self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._fraction,
+            u, y, e, self._z, self._F, self._logs, self._place, self._entry, self._power, self._C, self._dist,
+            self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._fraction,
         )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Powers:
-    """Entries of [A, B, E] that are not zero, each `size` times parameters to their powers."""
+def powers_of(model: LinearModel, at: Mapping[str, float], free: Sequence[str]) -> tuple[Ints, Array, Ints]:
+    """Return the entries of [A, B, E] that are not zero, each a product of powers of the free parameters.
 
-    place: Ints  # (n_entries, 2), row and column
-    size: Array  # (n_entries,)
-    start: Ints  # (n_entries + 1,), factors of entry i are start[i] <= c < start[i + 1]
-    factor: Ints  # (n_factors, 2), place of a parameter, and its exponent
-
-    def matrix(self, values: Array, shape: tuple[int, int]) -> Array:
-        """Return [A, B, E] at parameters.
-
-        `values`: (n_parameters,).
-        """
-        out = np.zeros(shape)
-        for i, (row, column) in enumerate(self.place):
-            factors = self.factor[self.start[i] : self.start[i + 1]]
-            out[row, column] = self.size[i] * np.prod(values[factors[:, 0]] ** factors[:, 1].astype(float))
-        return out
-
-
-def powers_of(model: LinearModel) -> Powers:
-    """Return the matrices of a model as products of powers, in SI units and the order of the model's parameters."""
-    names = [p.name for p in model.parameters]
-    point = np.linspace(1.5, 2.5, len(names))
-    here = _joined(model.matrices(dict(zip(names, point, strict=True))))
-    slopes = np.array([_joined(model.derivative(dict(zip(names, point, strict=True)), name)) for name in names])
+    Their places (n_entries, 2), their values at the parameters `at`, none of the free ones zero, and their exponents
+    (n_entries, n_free).
+    """
+    here = _joined(model.matrices(at))
     rows, columns = np.nonzero(here)
-    exponents = np.rint(point[:, None] * slopes[:, rows, columns] / here[rows, columns]).astype(np.int64)
-    size = here[rows, columns] / np.prod(point[:, None] ** exponents, axis=0)
-    counted = [[(j, int(k)) for j, k in enumerate(column) if k] for column in exponents.T]
-    found = Powers(
-        place=np.column_stack([rows, columns]).astype(np.int64),
-        size=size,
-        start=np.cumsum([0, *map(len, counted)]).astype(np.int64),
-        factor=np.array([pair for entry in counted for pair in entry], dtype=np.int64).reshape(-1, 2),
-    )
-    for other in (point[::-1].copy(), -0.7 * point, 3.1 * point**2):
-        exact = _joined(model.matrices(dict(zip(names, other, strict=True))))
-        if not np.allclose(found.matrix(other, here.shape), exact, rtol=1e-12, atol=0.0):
+    entries, values = here[rows, columns], np.array([at[name] for name in free])
+    slopes = np.array([_joined(model.derivative(at, name))[rows, columns] for name in free])
+    power = np.rint(values * slopes.T / entries[:, None]).astype(np.int64)
+    for factor in (0.7, -1.1, 3.1):
+        ratio = factor ** np.arange(1.0, values.size + 1.0)
+        exact = _joined(model.matrices({**at, **dict(zip(free, (values * ratio).tolist(), strict=True))}))
+        found = np.zeros(here.shape)
+        found[rows, columns] = entries * np.prod(ratio ** power.astype(float), axis=1)
+        if not np.allclose(found, exact, rtol=1e-12, atol=0.0):
             raise EstimationError(
                 f"the matrices of model {model.name!r} are not products of powers of its parameters; the unscented "
                 "filter wants that. Use JointEkf"
             )
-    return found
+    return np.column_stack([rows, columns]).astype(np.int64), entries, power
 
 
 def _joined(space: StateSpace) -> Array:

@@ -171,16 +171,15 @@ def ekf_block(
 
 
 @compiled
-def _fill(q: Array, logs: Ints, place: Ints, scale: Array, start: Ints, factor: Ints, D: Array, t: Array) -> None:
+def _fill(q: Array, logs: Ints, place: Ints, scale: Array, power: Ints, D: Array, t: Array) -> None:
     """Evaluate the continuous-time matrices [A, B, E] T at scaled parameters: entries are products of powers."""
     for j in range(logs.size):
         t[j] = np.exp(q[j]) if logs[j] else q[j]
     for i in range(scale.size):
         acc = scale[i]
-        for c in range(start[i], start[i + 1]):
-            g, power = t[factor[c, 0]], factor[c, 1]
-            for _ in range(abs(power)):
-                acc = acc * g if power > 0 else acc / g
+        for j in range(logs.size):
+            for _ in range(abs(power[i, j])):
+                acc = acc * t[j] if power[i, j] > 0 else acc / t[j]
         D[place[i, 0], place[i, 1]] = acc
 
 
@@ -216,8 +215,8 @@ def _move(D: Array, x: Array, u: Array, late: Array, o: Array, fraction: float, 
 
 @compiled
 def ukf_block(
-    u: Array, y: Array, e: Array, z: Array, F: Array, logs: Ints, place: Ints, scale: Array, start: Ints, factor: Ints,
-    C: Array, dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, terms: int,
+    u: Array, y: Array, e: Array, z: Array, F: Array, logs: Ints, place: Ints, scale: Array, power: Ints, C: Array,
+    dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, terms: int,
     fraction: float,
 ) -> None:  # fmt: skip
     """Run the unscented filter with points at √n standard deviations.
@@ -241,7 +240,7 @@ def ukf_block(
             # the central point, and the matrices there: the step is linear in states, offsets and disturbances
             for i in range(n):
                 point[i] = z[i]
-            _fill(q, logs, place, scale, start, factor, D, t)
+            _fill(q, logs, place, scale, power, D, t)
             _move(D, x, now, late, o, fraction, terms, t)
             for i in range(n_x):
                 up[i] = x[i]
@@ -262,7 +261,7 @@ def ukf_block(
                     to = away if side == 0 else -away
                     for i in range(n):
                         point[i] = z[i] + (to * F[s + j, i] if i < s + j else to if i == s + j else 0.0)
-                    _fill(q, logs, place, scale, start, factor, D, t)
+                    _fill(q, logs, place, scale, power, D, t)
                     _move(D, x, now, late, o, fraction, terms, t)
                     for i in range(n_x):
                         ends[side * n_x + i, j] = x[i]
