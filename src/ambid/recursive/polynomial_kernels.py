@@ -127,14 +127,15 @@ def _learn(
     limit: Array,
     s: Array,
     t: int,
+    psi: Array,
+    gain: Array,
     work: Array,
 ) -> None:
     """One Gauss-Newton step (Ljung & Söderström 1983, sec. 3.4), from where the filters stand to where the data say.
 
     The two differ only while C or F would be unstable: what the data said is then kept and not lost.
     """
-    n, psi, gain, f = theta.size, work[0, : theta.size], work[1], work[2, : theta.size]
-    e = s[meta[_E], t]
+    n, e = theta.size, s[meta[_E], t]
     for j in range(n):
         k = meta[_COLUMNS] + j
         psi[j] = plan[k, 2] * s[plan[k, 0], t - plan[k, 1]]
@@ -154,8 +155,8 @@ def _learn(
         count[_HELD] += 1
     for j in range(n):
         F[j, j] /= forget
-    project(F, psi, f)
-    size = shrink(F, f, 1.0, gain)
+    project(F, psi, work)
+    size = shrink(F, work, 1.0, gain)
     # forgotten while the coefficients are held, too: after a long calm the noise would be taken for small too long
     real[_SQUARES] = keep * real[_SQUARES] + e * e / size
     real[_WEIGHT] = keep * real[_WEIGHT] + 1.0
@@ -167,7 +168,7 @@ def _learn(
     for j in range(n):
         theta[j] += gain[j] * (e / size)
     level = coef[_FIRST + n - 1]
-    count[_PROJECTED] += follow(plan, meta, theta, coef, work[2])
+    count[_PROJECTED] += follow(plan, meta, theta, coef, work)
     # the past of v and e is linear in the constant, and its first steps may be large
     step, ones = coef[_FIRST + n - 1] - level, plan[meta[_COLUMNS] + n - 1, 0]
     for k in range(1, meta[_LONGEST] + 1):
@@ -197,7 +198,8 @@ def run(
     work: Array,
 ) -> None:
     """Take in samples u (m, n_inputs), y (m,); write the errors of prediction; `learn` false leaves coefficients."""
-    longest, width = meta[_LONGEST], s.shape[1]
+    longest, width, n = meta[_LONGEST], s.shape[1], theta.size
+    psi, gain, scratch = work[0, :n], work[1, :n], work[2, :n]
     for k in range(y.size):
         errors[k] = np.nan
         t = count[_POS]
@@ -226,5 +228,5 @@ def run(
         else:
             errors[k] = e
             if learn:
-                _learn(plan, meta, count, real, theta, coef, F, S, limit, s, t, work)
+                _learn(plan, meta, count, real, theta, coef, F, S, limit, s, t, psi, gain, scratch)
         filter_column(plan, meta, meta[_RESIDUAL], meta[_GRADIENT], coef, s, t)
