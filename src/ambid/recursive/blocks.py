@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.bearing.blocks import ThreeBlocks, blocks_of, three_blocks
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import check_channels
+from ambid.recursive.estimator import check_channels, kernels
 from ambid.recursive.streaming import ScalarKalman, StreamingFilter
 
 _WARM_UP = 4000  # samples, from which scales, means and the start are found
@@ -250,7 +250,7 @@ class OnlineThreeBlocks:
         one[0, 3] = (d - m[3]) / g[3]
         self._filter.run(one, one)
         row, error = self._rows[self._filled : self._filled + 1], np.empty((1, 2))
-        self._block_rows(one, row, error, self._state, self._constants, False)
+        kernels("blocks").block_rows(one, row, error, self._state, self._constants, False)
         self.n_used += 1
         self._filled += 1
         if self._filled == _BATCH:
@@ -320,8 +320,6 @@ class OnlineThreeBlocks:
         self._waiting = np.empty((0, 0))
 
     def _set_up(self, ka: float, a: float, kb: float, b: float, kc: float, c: float) -> None:
-        from ambid.recursive.blocks_kernels import block_rows
-
         slowest = 1.0 / (_WARM_UP * self._dt)
         f = min(max(abs(c), slowest), 3.0 / self._dt)
         self._at = Linearisation(
@@ -332,7 +330,7 @@ class OnlineThreeBlocks:
         self._filter = self._prefilter.anew(4)
         self._wait = min(ceil(_FORGOTTEN / (min(a, b, f) * self._dt)), _LONGEST_WAIT * _WARM_UP)
         self._fresh, self._skip, self._filled = True, self._wait, 0
-        self._rows, self._state, self._block_rows = np.empty((_BATCH, N_ROW)), np.zeros(N_STATE), block_rows
+        self._rows, self._state = np.empty((_BATCH, N_ROW)), np.zeros(N_STATE)
         factor = 1.0 if self._memory_s is None else exp(-self._dt / self._memory_s)
         longest = np.inf if self._memory_s is None else self._memory_s
         stretch = min(_FORGOTTEN / min(a, b, f), longest) / (_BATCH * self._dt)
@@ -350,7 +348,9 @@ class OnlineThreeBlocks:
             if self._skip:
                 n = min(n, self._skip)
             rows, part = self._rows[self._filled : self._filled + n], errors[done : done + n]
-            self._block_rows(signals[done : done + n], rows, part, self._state, self._constants, self._fresh)
+            kernels("blocks").block_rows(
+                signals[done : done + n], rows, part, self._state, self._constants, self._fresh
+            )
             self._fresh = False
             done += n
             if self._skip:

@@ -270,7 +270,7 @@ def _instant(memory: Array, H: Array, sensors: Array, now: Array, W: Array, f: A
     The motion has no part in it but for the weights. Row m + 1 of H becomes how it sees the state.
     """
     (m, last), used, total, noise, x = (H.shape[0] - 2, H.shape[1]), now[USED], 0.0, 0.0, 0.0
-    _compare(now, W, False)
+    _compare(now, W, total > 0.0)
     for j in range(last):
         H[m + 1, j] = 0.0
     for i in range(m):
@@ -318,7 +318,7 @@ def fuse_scan(
             clock[STAGE] = TEST
             if _read(y[k], sensors, watch, now):
                 return k
-        working = 0
+        working = np.int64(0)  # a plain 0 is a type of its own: what takes it would be compiled twice
         for i in range(m):
             working += watch[i, OUT] == 0.0
         if clock[STAGE] == TEST:
