@@ -318,7 +318,7 @@ def fuse_scan(
             clock[STAGE] = TEST
             if _read(y[k], sensors, watch, now):
                 return k
-        working = np.int64(0)  # a plain 0 is a type of its own: what takes it would be compiled twice
+        working = int(0.0)  # a plain 0 has a type of its own: what takes it would be compiled twice
         for i in range(m):
             working += watch[i, OUT] == 0.0
         if clock[STAGE] == TEST:

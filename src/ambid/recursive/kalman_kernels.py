@@ -58,7 +58,7 @@ def state_scan(y: Array, u: Array, out: Array, model: Array, memory: Array, work
     rest = memory[n * n + n :].reshape(m, 2 * n + m + 2)
     W, w = work[: 2 * n * n].reshape(n, 2 * n), work[2 * n * n : 2 * n * n + 2 * n]
     f, before = work[2 * n * n + 2 * n :][:n], work[2 * n * n + 3 * n :].reshape(n, n)
-    J, settled, k = np.empty((n, 0)), tally[0] > 0.0, np.int64(0)
+    J, settled, k = np.empty((n, 0)), tally[0] > 0.0, int(0.0)
     while k < n_samples:
         if settled and n <= 2 and m == 1 and n_u == 0:
             k = _steady(k, y, out, A, C, x, rest)

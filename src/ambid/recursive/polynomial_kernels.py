@@ -212,7 +212,7 @@ def run(
         for i in range(meta[_NU]):
             s[2 + i, t] = u[k, i] - real[_LEVELS + 1 + i]
             unknown += u[k, i] * 0.0
-        filter_column(plan, meta, np.int64(0), meta[_RESIDUAL], coef, s, t)
+        filter_column(plan, meta, int(0.0), meta[_RESIDUAL], coef, s, t)
         e = s[meta[_E], t]
         if not np.isfinite(e * e + y[k] * 0.0 + unknown):  # or too large to compute with: all signals are forgotten
             count[_REJECTED] += 1

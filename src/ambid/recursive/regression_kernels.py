@@ -258,7 +258,7 @@ def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
     At fixed counts P is reset where that is due, and the factor chosen with which it cannot pass its limit before the
     next look.
     """
-    p, t = int(s[SIZE]), np.int64(0)  # a plain 0 is a type of its own: what takes it would be compiled twice
+    p, t = int(s[SIZE]), int(0.0)  # a plain 0 has a type of its own: what takes it would be compiled twice
     four, a, q = p == 4 and s[KIND] == LEAST_SQUARES, HEAD + p, p * p
     while t < y.size:
         until = np.inf
