@@ -164,7 +164,7 @@ def test_a_failed_search_is_refused_in_words(balls, rig, monkeypatch):
     from types import SimpleNamespace
 
     monkeypatch.setattr(
-        "ambid.bearing.magnet.estimate.estimate_bearing", lambda *_, **__: SimpleNamespace(status="failed")
+        "ambid.bearing.magnet_estimate.estimate_bearing", lambda *_, **__: SimpleNamespace(status="failed")
     )
     with pytest.raises(EstimationError, match="the search led to numbers without a predictor"):
         identify_nonlinear(balls, rig)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ambid.bearing.magnet.problem import UNITS
+from ambid.bearing.magnet_problem import UNITS
 from ambid.errors import RigError
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.parameters import Parameter

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from ambid.bearing.magnet.likelihood import search, uncertainty
+from ambid.bearing.magnet_likelihood import search, uncertainty
 from ambid.job.bearing_estimate import judge_bearing
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw

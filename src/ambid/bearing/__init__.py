@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ambid.bearing.coil import coil_instrumental as coil_instrumental
     from ambid.bearing.coil import coil_least_squares as coil_least_squares
     from ambid.bearing.linear import greybox as greybox
-    from ambid.bearing.magnet.result import NonlinearBearingEstimate as NonlinearBearingEstimate
+    from ambid.bearing.magnet_result import NonlinearBearingEstimate as NonlinearBearingEstimate
     from ambid.bearing.measured import Measured as Measured
     from ambid.bearing.physical import physical_parameters as physical_parameters
 

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.bearing.physical_target import physical_response
 from ambid.blackbox.frequency_lines import Lines, check_lines
 from ambid.errors import EstimationError, nearest
 from ambid.estimation import start as weak_form
 from ambid.estimation.estimate import Continuous
 from ambid.estimation.linear import directions, one_thread
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, Parametric
-from ambid.estimation.uncertainty import WEAK
-from ambid.physics.discretise import discretise
+from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
 from ambid.signals.response import FrequencyResponse
@@ -49,47 +49,20 @@ def response(
     channels: Channels,
     delay: float,
     *,
-    slope: bool = True,
-    moving: bool = True,
+    moving: bool = False,
 ) -> tuple[Complex, Complex]:
-    """Return the model's response and its derivative by parameters and delay.
+    """Return the model's response in the measured channels and its derivative by parameters, and by the delay.
 
-    `theta`: SI; `names`: parameters to differentiate by; `slope`: whether derivatives are wanted; `moving`: whether the
-    derivative by the delay is one of them. Returns `G`: (n_frequencies, n_outputs, n_inputs), complex; `derivative`:
-    the last by the delay in samples; empty where not wanted.
+    `theta`: SI; `names`: parameters to differentiate by; `delay`: in samples; `moving`: whether the derivative by it
+    comes last. Returns (n_frequencies, n_outputs, n_inputs), and the same with one more axis.
     """
-    space = model.matrices(theta)
-    along = [model.derivative(theta, name) for name in names] if slope else []
-    n, columns, rows = space.A.shape[0], list(channels.inputs), list(channels.outputs)
-    if ln.held:
-        whole = int(np.floor(delay))
-        points = np.exp(1j * ln.omega * ln.dt)
-        late = np.exp(-1j * ln.omega * ln.dt)[:, None, None]
-        shift = late**whole
-        fraction = delay - whole
-        at, directions = discretise(space, ln.dt, fraction=fraction if fraction or moving else None, derivatives=along)
-        A, C = at.A, at.C[rows]
-        B = at.B[:, columns] + at.B_late[:, columns] * late
-        changes = [(d.A, d.B[:, columns] + d.B_late[:, columns] * late, d.C[rows]) for d in directions if slope]
-    else:
-        points = 1j * ln.omega
-        shift = np.exp(-1j * ln.omega * ln.dt * delay)[:, None, None]
-        A, C = space.A, space.C[rows]
-        B = np.broadcast_to(space.B[:, columns], (points.size, n, len(columns)))
-        changes = [(d.A, d.B[:, columns][None], d.C[rows]) for d in along]
-    pencil = points[:, None, None] * np.eye(n) - A
-    right = np.linalg.solve(pencil, B.astype(np.complex128)) * shift
-    G = C @ right
-    if not slope:
-        return G, np.empty((*G.shape, 0), dtype=np.complex128)
-    wide = np.broadcast_to(C.T.astype(np.complex128), (points.size, n, len(rows)))
-    left = np.swapaxes(np.linalg.solve(np.swapaxes(pencil, 1, 2), wide), 1, 2)
-    out = np.empty((*G.shape, len(names) + int(moving)), dtype=np.complex128)
-    for j, (dA, dB, dC) in enumerate(changes[: out.shape[-1]]):
-        out[..., j] = left @ (dA @ right + dB * shift) + dC @ right
-    if moving and not ln.held:
-        out[..., -1] = -1j * (ln.omega * ln.dt)[:, None, None] * G
-    return G, out
+    found = physical_response(
+        model, theta, ln.omega, dt=ln.dt if ln.held else None, delay_s=delay * ln.dt, along=names, with_delay=moving
+    )
+    G, slope = (x[:, channels.outputs][:, :, channels.inputs] for x in found)
+    if moving:
+        slope[..., -1] *= ln.dt
+    return G, slope
 
 
 def start_values(
@@ -174,7 +147,7 @@ class PhysicalProblem:
         n_rows = 2 * self.lines.n_lines * self.lines.entries
         try:
             with np.errstate(all="ignore"):  # a step too far overflows: the search turns back from what is not finite
-                G, _ = response(self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v), slope=False)
+                G, _ = response(self.model, self.theta(v), (), self.lines, self.channels, self.delay_at(v))
                 rows = self.lines.whitened(G - self.lines.G)
         except (np.linalg.LinAlgError, ValueError):
             rows = np.full(n_rows, _FAR)
@@ -205,9 +178,6 @@ class PhysicalProblem:
         theta = self.theta(v)
         return np.array([(theta[p.name] - float(p.value or 0.0)) / float(p.sd or np.inf)
                          for p in self.estimated if p.role == "prior"])  # fmt: skip
-
-
-_NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -255,10 +225,8 @@ def frequency_estimate(
     if not check.passed:
         covariance = _robust(ln, whole, J, r)[:n, :n]
     names = tuple(p.name for p in problem.estimated)
-    reference = problem.model.references(theta)
-    scale = np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
-    sizes, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    weakest = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
+    scale = natural_sizes(names, theta, problem.model.references(theta))
+    singular_values, weakest = weakest_direction(names, covariance, scale)
     sd = np.sqrt(np.diag(covariance))
     seen = {k: converged and bool(s < WEAK) for k, s in zip(names, sd / scale, strict=True)}
     alone = np.sqrt(np.diag(directions(data).inverse())[:n])
@@ -281,7 +249,7 @@ def frequency_estimate(
     return FrequencyEstimate(
         status="converged" if converged else "stalled",
         model=problem.model.name,
-        parameters=tuple(_parameter(p, theta[p.name], spread, seen, own) for p in parameters),
+        parameters=tuple(EstimatedParameter.of(p, theta, spread, seen, own) for p in parameters),
         covariance_names=names,
         covariance=covariance,
         covariance_method="information" if check.passed else "robust",
@@ -301,8 +269,8 @@ def frequency_estimate(
         checks=checks,
         warnings=tuple(warnings),
         information={
-            "singular_values": (1 / np.sqrt(np.maximum(sizes, 1e-300))).tolist(),
-            "weakest_direction": dict(zip(names, weakest.tolist(), strict=True)),
+            "singular_values": singular_values.tolist(),
+            "weakest_direction": weakest,
         },
         record={"lines": ln.n_lines, "rate_hz": frf.rate_hz, "method": frf.method, "hold": frf.hold},
     )
@@ -316,23 +284,6 @@ def _robust(ln: Lines, whole: Array, J: Array, r: Array) -> Array:
     own = half.T @ half * ln.alike
     larger = np.maximum(1.0, np.sqrt(np.diag(whole) / np.maximum(np.diag(own), 1e-300)))
     return np.asarray(own * np.outer(larger, larger))
-
-
-def _parameter(
-    p: Parameter, value: float, sd: Mapping[str, float], seen: Mapping[str, bool], alone: Mapping[str, float]
-) -> EstimatedParameter:
-    spread = sd.get(p.name, 0.0)
-    share = float(1 / (1 + (alone[p.name] / p.sd) ** 2)) if p.role == "prior" and p.sd else None
-    return EstimatedParameter(
-        name=p.name,
-        unit=p.unit,
-        value=value,
-        sd=spread,
-        ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
-        role=p.role,
-        identifiable=seen.get(p.name, True),
-        data_share=share,
-    )
 
 
 MAX_DELAY = 6  # samples, searched when the delay is "auto"

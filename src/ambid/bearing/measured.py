@@ -124,7 +124,7 @@ def _of_estimate(estimate: FrequencyEstimate, frf: FrequencyResponse, frequency_
         inputs=tuple(plant.inputs.index(x) for x in frf.inputs),
     )
     delay = estimate.delay.samples + estimate.delay.fraction
-    G, slope = response(plant, estimate.values, names, at, channels, delay, moving=False)
+    G, slope = response(plant, estimate.values, names, at, channels, delay)
     return with_spread(f"physical parameters of {estimate.model}", frequency_hz, G, slope, estimate.covariance)
 
 

@@ -15,8 +15,6 @@ from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.predictor import Predictor, assemble
 from ambid.physics.parameters import Parameter
 
-_NORMAL_95 = 1.959963984540054
-
 
 def estimate_of(
     fit: Fit,
@@ -54,7 +52,7 @@ def estimate_of(
         status=fit.status,
         model=problem.model.name,
         record=record,
-        parameters=tuple(_parameter(p, theta, sd, seen, alone) for p in parameters),
+        parameters=tuple(EstimatedParameter.of(p, theta, sd, seen, alone) for p in parameters),
         covariance_names=known.names,
         covariance=known.covariance(robust=robust),
         covariance_method="robust" if robust else "information",
@@ -85,29 +83,6 @@ def estimate_of(
             "robust_over_information_sd": known.inflation,
         },
         rig=rig,
-    )
-
-
-def _parameter(
-    p: Parameter,
-    theta: Mapping[str, float],
-    sd: Mapping[str, float],
-    seen: Mapping[str, bool],
-    alone: Mapping[str, float],
-) -> EstimatedParameter:
-    value, spread = theta[p.name], sd.get(p.name, 0.0)
-    share = None
-    if p.role == "prior" and p.sd is not None:
-        share = float(1 / (1 + (alone[p.name] / p.sd) ** 2))
-    return EstimatedParameter(
-        name=p.name,
-        unit=p.unit,
-        value=value,
-        sd=spread,
-        ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
-        role=p.role,
-        identifiable=seen.get(p.name, True),
-        data_share=share,
     )
 
 

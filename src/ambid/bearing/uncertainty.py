@@ -19,7 +19,7 @@ from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import Workspace, linearise, products
-from ambid.estimation.uncertainty import WEAK
+from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 
 _SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
 _LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask
@@ -121,13 +121,9 @@ def uncertainty(fit: Fit) -> Uncertainty:
     noise_only = fit.J_prior.copy()
     noise_only[:, :n] = 0.0
     data_only = np.sqrt(np.diag(directions(np.vstack([fit.J, noise_only])).inverse())[:n]) * size
-    values = fit.vector[sl["physical"]] * size
     theta = problem.parameters(fit.vector)
-    reference = problem.model.references(theta)
-    scale = np.array([max(abs(v), reference.get(k, 0.0)) for k, v in zip(problem.estimated, values, strict=True)])
-    scale = np.maximum(scale, 1e-300)
-    eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
-    weak = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
+    scale = natural_sizes(problem.estimated, theta, problem.model.references(theta))
+    singular_values, weakest = weakest_direction(problem.estimated, information, scale)
     delay_sd = float(np.sqrt(whole[sl["fraction"], sl["fraction"]][0, 0])) if problem.fractional else None
     return Uncertainty(
         names=problem.estimated,
@@ -135,8 +131,8 @@ def uncertainty(fit: Fit) -> Uncertainty:
         robust=_gram(whole[:n] @ _scores(fit).T) * unit,
         data_only_sd=data_only,
         scale=scale,
-        singular_values=1 / np.sqrt(np.maximum(eigenvalues, 1e-300)),
-        weakest=dict(zip(problem.estimated, weak.tolist(), strict=True)),
+        singular_values=singular_values,
+        weakest=weakest,
         delay_sd=delay_sd,
         fisher=whole[:n, :n] * unit,
         disagreement=np.zeros(n),

@@ -11,6 +11,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
+from ambid.physics.parameters import Parameter
+
+_NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +29,34 @@ class EstimatedParameter:
     # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
     identifiable: bool
     data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
+
+    @classmethod
+    def of(
+        cls,
+        p: Parameter,
+        theta: Mapping[str, float],
+        sd: Mapping[str, float],
+        seen: Mapping[str, bool],
+        alone: Mapping[str, float] | None = None,
+    ) -> EstimatedParameter:
+        """Return a parameter as it came out.
+
+        `theta`, `sd`, `seen`: by name, value, standard deviation and whether the data show it; `alone`: standard
+        deviations that the data alone would give, for the share of a prior.
+        """
+        value, spread, share = theta[p.name], sd.get(p.name, 0.0), None
+        if alone is not None and p.role == "prior" and p.sd:
+            share = float(1 / (1 + (alone[p.name] / p.sd) ** 2))
+        return cls(
+            name=p.name,
+            unit=p.unit,
+            value=value,
+            sd=spread,
+            ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
+            role=p.role,
+            identifiable=seen.get(p.name, True),
+            data_share=share,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

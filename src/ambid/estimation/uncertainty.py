@@ -8,7 +8,7 @@ that holds the inputs fixed would be right under feedback.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -170,3 +170,21 @@ def _triangles(rows: Array, length: int) -> list[Array]:
     if len(edges) < 3 and length < n:
         edges = [0, n // 2, n]
     return [triangle_of([rows[a:b].reshape(-1, width)]) for a, b in pairwise(edges)]
+
+
+def natural_sizes(names: Sequence[str], theta: Mapping[str, float], reference: Mapping[str, float]) -> Array:
+    """Return what standard deviations are judged against: the value, or the natural scale of one that may be zero.
+
+    `theta`, `reference`: values and natural scales by name, SI. Returns (n,).
+    """
+    return np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
+
+
+def weakest_direction(names: Sequence[str], covariance: Array, size: Array) -> tuple[Array, dict[str, float]]:
+    """Return 1 over the relative standard deviation along each direction, largest first, and the last direction.
+
+    `covariance`: (n, n); `size`: (n,), see `natural_sizes`; the share of each parameter, largest in magnitude 1.
+    """
+    eigenvalues, axes = np.linalg.eigh(covariance / np.outer(size, size))
+    weak = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
+    return 1 / np.sqrt(np.maximum(eigenvalues, 1e-300)), dict(zip(names, weak.tolist(), strict=True))

@@ -10,11 +10,10 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.contact import weight_carried
-from ambid.bearing.magnet.likelihood import BearingFit, BearingUncertainty
-from ambid.bearing.magnet.problem import LEVELS, UNITS
-from ambid.bearing.magnet.rescue import RescuedFit
-from ambid.bearing.magnet.result import NonlinearBearingEstimate
+from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
+from ambid.bearing.magnet_problem import LEVELS, UNITS, weight_carried
+from ambid.bearing.magnet_rescue import RescuedFit
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.bearing.rescue import describe_search
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.uncertainty import WEAK

@@ -12,8 +12,7 @@ from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 
-from ambid.bearing.magnet.contact import touching
-from ambid.bearing.magnet.problem import UNITS, BearingRecord
+from ambid.bearing.magnet_problem import UNITS, BearingRecord, touching
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.progress import Tick
 from ambid.job.data import Reading, Source, known_rig, load, origin

@@ -22,7 +22,7 @@ from ambid.record import Record
 from ambid.rig import Rig
 
 if TYPE_CHECKING:
-    from ambid.bearing.magnet.result import NonlinearBearingEstimate
+    from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.bearing.uncertainty import Uncertainty
     from ambid.estimation.likelihood import Fit
     from ambid.estimation.parts import Check
@@ -209,8 +209,8 @@ def identify_nonlinear_used(
     **words: Unpack[BearingWords],
 ) -> tuple[NonlinearBearingEstimate, tuple[TakenRecord, ...]]:
     """Return what `identify_nonlinear` does, and the records as they were used, held ones last."""
-    from ambid.bearing.magnet.estimate import estimate_bearing
-    from ambid.bearing.magnet.likelihood import uncertainty
+    from ambid.bearing.magnet_estimate import estimate_bearing
+    from ambid.bearing.magnet_likelihood import uncertainty
     from ambid.job.bearing_estimate import judge_bearing
     from ambid.job.bearing_records import bearing_rig, laws_of, numbers_of, take_all
     from ambid.validate.nonlinear_bearing import validation

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Unpack
 
-from ambid.bearing.magnet.result import NonlinearBearingEstimate, bearing_from_json
+from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_json
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import SCHEMA, fit_from_json
 from ambid.errors import AmbidError, EstimationError

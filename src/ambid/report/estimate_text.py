@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.result import Curve, NonlinearBearingEstimate
+from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
 from ambid.report.numbers import prefixed, sized

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.problem import BearingRecord
-from ambid.bearing.magnet.result import Curve, Curves, NonlinearBearingEstimate
+from ambid.bearing.magnet_problem import BearingRecord
+from ambid.bearing.magnet_result import Curve, Curves, NonlinearBearingEstimate
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model

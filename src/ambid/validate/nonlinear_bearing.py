@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.contact import weight_carried
-from ambid.bearing.magnet.likelihood import BearingFit, run, sweep
-from ambid.bearing.magnet.problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
-from ambid.bearing.magnet.result import NonlinearBearingEstimate
+from ambid.bearing.magnet_likelihood import BearingFit, run, sweep
+from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
 from ambid.estimation.parts import Check
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
@@ -123,7 +122,7 @@ def _fit(
     estimate: NonlinearBearingEstimate, record: BearingRecord, levels: Mapping[str, float], delay: float
 ) -> BearingFit:
     """The estimate's problem on one record, and its criterion there (infinite without a predictor)."""
-    from ambid.bearing.magnet.likelihood import criterion
+    from ambid.bearing.magnet_likelihood import criterion
 
     values, law = estimate.values, estimate.law
     numbers = tuple(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.bearing.magnet.problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
+from ambid.bearing.magnet_problem import BODY, SIGNED, BearingProblem, BearingRecord, Number
 from ambid.physics.coenergy_law import MagnetLaw, law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.presets import Preset, preset

@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from ambid.bearing.magnet.problem import UNITS, BearingRecord
-from ambid.bearing.magnet.result import NonlinearBearingEstimate
+from ambid.bearing.magnet_problem import UNITS, BearingRecord
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset

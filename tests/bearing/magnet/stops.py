@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ambid.bearing.magnet.problem import BearingRecord
+from ambid.bearing.magnet_problem import BearingRecord
 
 K, LEAK, MASS, RESISTANCE, RATE, STEPS = 3.9e-6, 3e-3, 0.05, 3.0, 5000.0, 4
 GAP = 0.2e-3  # at position 0

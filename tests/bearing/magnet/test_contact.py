@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet.contact import touching, weight_carried
-from ambid.bearing.magnet.estimate import estimate_bearing
-from ambid.bearing.magnet.likelihood import search, uncertainty
+from ambid.bearing.magnet_estimate import estimate_bearing
+from ambid.bearing.magnet_likelihood import search, uncertainty
+from ambid.bearing.magnet_problem import touching, weight_carried
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.validate.nonlinear_bearing import whiteness

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet.estimate import estimate_bearing
-from ambid.bearing.magnet.likelihood import criterion, search, uncertainty
-from ambid.bearing.magnet.start import balance
+from ambid.bearing.magnet_estimate import balance, estimate_bearing
+from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet.likelihood import criterion, linearise, prior_rows, run
-from ambid.bearing.magnet.problem import BearingRecord
+from ambid.bearing.magnet_likelihood import criterion, linearise, prior_rows, run
+from ambid.bearing.magnet_problem import BearingRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from tests.bearing.magnet.bearings import as_seen, problem_of, unstable
 

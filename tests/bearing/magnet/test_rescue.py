@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet import rescue
-from ambid.bearing.magnet.estimate import estimate_bearing
-from ambid.bearing.magnet.likelihood import uncertainty
-from ambid.bearing.magnet.rescue import RescuedFit, bearing_cost, failure, global_problems
+from ambid.bearing import magnet_rescue as rescue
+from ambid.bearing.magnet_estimate import estimate_bearing
+from ambid.bearing.magnet_likelihood import uncertainty
+from ambid.bearing.magnet_rescue import RescuedFit, bearing_cost, failure, global_problems
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset

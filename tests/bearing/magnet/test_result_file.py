@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet.result import bearing_from_json, bearing_to_json, linearised
+from ambid.bearing.magnet_result import bearing_from_json, bearing_to_json, linearised
 from ambid.errors import EstimationError
 from ambid.physics.presets import preset
 from tests.bearing.magnet.estimates import by_hand, seen

@@ -31,9 +31,10 @@ def test_slope_is_exact(held):
 
     def flat(x: np.ndarray) -> np.ndarray:
         theta = dict(zip(names, x[:-1].tolist(), strict=True))
-        return response(of, theta, names, ln, both, float(x[-1]), slope=False)[0].ravel()
+        return response(of, theta, (), ln, both, float(x[-1]))[0].ravel()
 
-    found = response(of, dict(zip(names, v[:-1].tolist(), strict=True)), names, ln, both, 1.4)[1].reshape(-1, v.size)
+    theta = dict(zip(names, v[:-1].tolist(), strict=True))
+    found = response(of, theta, names, ln, both, 1.4, moving=True)[1].reshape(-1, v.size)
     steps = np.abs(v) * 1e-2
     steps[5] = 10.0  # a damping shows beside sqrt(m k) only
     wanted = extrapolated(flat, v, steps)

@@ -9,8 +9,8 @@ from time import perf_counter
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.likelihood import BearingFit, criterion, run, search
-from ambid.bearing.magnet.problem import BearingProblem, BearingRecord
+from ambid.bearing.magnet_likelihood import BearingFit, criterion, run, search
+from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.problem import noise_floor
 from ambid.estimation.progress import Tick, silent

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.problem import BODY, LEVELS, UNITS
+from ambid.bearing.magnet_problem import BODY, LEVELS, UNITS
 from ambid.estimation.documents import (
     covariance_apart,
     covariance_together,

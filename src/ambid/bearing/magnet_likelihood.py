@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.bearing.magnet.problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
+from ambid.bearing.magnet_problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
 
@@ -90,7 +90,7 @@ def sweep(problem: BearingProblem, vector: Array, r: int, found: Innovations, *,
     `vector`: (size,); `r`: which record; `found`: gets the innovations; `slopes`: whether the likelihood.s rows are
     wanted. Yields None, and ends, where there is no predictor.
     """
-    from ambid.bearing.magnet._kernels import predict
+    from ambid.bearing.magnet_kernels import predict
 
     record, n_e = problem.records[r], len(problem.estimated)
     theta, whole = problem.theta(vector, record.rate_hz)
