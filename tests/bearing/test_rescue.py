@@ -138,7 +138,7 @@ def test_it_is_not_called_where_the_ordinary_starts_work(name: str, monkeypatch:
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a global search where none is needed")
 
-    monkeypatch.setattr(home, "rescued", refuse)
+    monkeypatch.setattr(home, "rescue", refuse)
     for n, louder in ((400, 1.0), (1500, 10.0)):
         noise = {k: v * louder for k, v in SETTINGS[name].noise.items() if k in ("position", "current")}
         bench = run(name, n, 1, **noise)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
-from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescued
+from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import stable
 from ambid.estimation.likelihood import Fit, score_statistic, search, workspace_near
@@ -80,8 +80,8 @@ def greybox(
     """
     _check(model, signals, parameters, delay)
     with one_thread():
-        rescue = Rescue(evaluations=evaluations, seed=seed, workers=workers)
-        return _greybox(model, signals, parameters, delay, noise, tick, rescue)
+        how = Rescue(evaluations=evaluations, seed=seed, workers=workers)
+        return _greybox(model, signals, parameters, delay, noise, tick, how)
 
 
 def _greybox(
@@ -91,30 +91,30 @@ def _greybox(
     delay: Delay,
     noise: Literal["auto", "levels", "gain"],
     tick: Callable[[], None] | None,
-    rescue: Rescue,
+    how: Rescue,
 ) -> Fit:
     """Ordinary starts, and others where those fail."""
     begun = perf_counter()
 
-    def followed(candidates: Sequence[Candidate]) -> Fit:
-        return _followed(candidates, tick, noise, search_delay=delay == "auto")
+    def follow(candidates: Sequence[Candidate]) -> Fit:
+        return _follow(candidates, tick, noise, search_delay=delay == "auto")
 
     try:
         candidates = starts(model, signals, parameters, delay, tick=tick)
     except EstimationError as failure:
-        fit = rescued(None, str(failure), model, signals, parameters, delay, rescue, followed, tick)
+        fit = rescue(None, str(failure), model, signals, parameters, delay, how, follow, tick)
         if fit is None:
             raise
         return fit
     start_s = perf_counter() - begun
-    fit = followed(candidates)
-    why = reason(fit) if rescue.evaluations else ""
+    fit = follow(candidates)
+    why = reason(fit) if how.evaluations else ""
     if why:
-        fit = rescued(fit, why, model, signals, parameters, delay, rescue, followed, tick) or fit
+        fit = rescue(fit, why, model, signals, parameters, delay, how, follow, tick) or fit
     return replace(fit, start_s=start_s)
 
 
-def _followed(
+def _follow(
     candidates: Sequence[Candidate],
     tick: Callable[[], None] | None,
     noise: Literal["auto", "levels", "gain"],
@@ -124,7 +124,7 @@ def _followed(
     """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay."""
     fit: Fit | None = None
     for candidate in candidates:
-        found = _searched(candidate, tick, with_disturbances=noise != "auto")
+        found = _search(candidate, tick, with_disturbances=noise != "auto")
         fit = found if fit is None or found.criterion < fit.criterion else fit
         if found.status == "converged":
             break
@@ -136,7 +136,7 @@ def _followed(
     return _with_gain(fit, tick, force=noise == "gain") if noise != "levels" else fit
 
 
-def _searched(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
+def _search(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:
     """Search with sensor noise alone (output error) where that explains a stable plant, else with disturbances too."""
     if not with_disturbances:
         fit = _quiet(candidate.problem, candidate.vector, tick, candidate.work)

@@ -20,12 +20,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ambid.bearing import rescue
 from ambid.bearing.linear import greybox
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, linearise, promise, search
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number
-from ambid.bearing.magnet_rescue import EVALUATIONS, rescued
+from ambid.bearing.magnet_rescue import EVALUATIONS, rescue
 from ambid.bearing.multistart import Signals
+from ambid.bearing.rescue import EVALUATIONS as LINEAR_EVALUATIONS
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
@@ -64,8 +64,7 @@ def estimate_bearing(
     `records`: at least one of a rotor that is free to move; `known`: what is known of the numbers, by name; `laws`: the
     likelihood chooses; `delay`: of the voltage in samples of the first record; None: found; `eddy`: force behind a pole
     a/(s + a); `drift`: a force that walks slowly: what the law leaves over; `tick`: called after each evaluation;
-    KeyboardInterrupt ends in the best so far; `seed`: of the global search. Returns a `RescuedFit` where there was a
-    global search.
+    KeyboardInterrupt ends in the best so far; `seed`: of the global search, which `global_search` of the fit tells of.
     """
     free = [r for r in records if not r.held]
     if not free:
@@ -91,7 +90,7 @@ def estimate_bearing(
                     fit = _extended(fit, law, known, short, linear, ticks[-3])
         whole = replace(fit.problem, records=tuple(records))
         fit = search(whole, fit.vector, tick=ticks[-2])
-        fit = rescued(
+        fit = rescue(
             fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),
             search_delay=delay is None, seed=seed, evaluations=evaluations, tick=again,
@@ -294,7 +293,7 @@ def linear_start(
         for p in model.parameters
     ]
     parts = _stretches(record)
-    for (first, last), evaluations in [*((part, 0) for part in parts), (parts[0], rescue.EVALUATIONS)]:
+    for (first, last), evaluations in [*((part, 0) for part in parts), (parts[0], LINEAR_EVALUATIONS)]:
         if evaluations and found:
             break  # what was found speaks against the signs, not against the start values
         part = Signals(u=record.u[first:last, None], y=record.y[first:last], rate_hz=record.rate_hz)

@@ -7,9 +7,8 @@ Astrom 1980), exact in state and covariance. Its gradient and Fisher information
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
-
-Status = Literal["converged", "stalled", "failed"]
+from ambid.estimation.search import Status
 
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
@@ -50,6 +48,8 @@ class BearingFit:
     criterion: float  # twice the negative log-likelihood but for constants, with the squared residuals of the priors
     status: Status
     evaluations: int
+    # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue.look_elsewhere`
+    global_search: Mapping[str, object] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

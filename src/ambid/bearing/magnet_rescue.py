@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from time import perf_counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, run, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
+from ambid.bearing.rescue import FAR, explained_by_past, look_elsewhere
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.problem import noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -19,8 +19,7 @@ _ITERATIONS = 15  # iterations from each place found
 _CHOICE = 2.0  # numbers' worth (BIC) by which a fit must be better: in noisy records delays and places nearly tie
 _EVEN = 0.5  # of the criterion: a fit with the same delay that has converged is taken where it is no worse
 EVALUATIONS = 800  # of the likelihood: one to three seconds
-FAR = 0.5  # part of the innovations' variance that a linear regression may explain before a fit counts as failed
-_PAST = 10  # samples of innovations and voltages that it looks at
+_PAST = 10  # samples of voltages that a regression looks at
 _LOOKED = 4096  # samples of each record that it looks at
 _SAMPLES = 4000  # of all records together, on which the global search compares
 _SHORTEST = 500  # samples of one record
@@ -31,16 +30,7 @@ _FORCE, _VOLTAGE = (1e-4, 3.0), (3e-3, 3.0)  # noise levels, over what the senso
 _TRIED = 4  # delays that are searched from
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RescuedFit(BearingFit):
-    """A fit whose ordinary start values failed."""
-
-    # ``why``, ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per measured value, None
-    # where there is none), ``taken``, ``interrupted``
-    global_search: Mapping[str, object]
-
-
-def rescued(
+def rescue(
     before: BearingFit,
     records: Sequence[BearingRecord],
     finish: Callable[[BearingFit], BearingFit],
@@ -54,45 +44,34 @@ def rescued(
 
     `before`: of all records, at the end of the ordinary way; `finish`: what follows a search over all records; `seed`:
     equal seeds give equal results; `evaluations`: of the likelihood in the global search, at most; 0 for none; `tick`:
-    a KeyboardInterrupt ends in the best so far. Returns a `RescuedFit` where there was a global search.
+    a KeyboardInterrupt ends in the best so far.
     """
-    why = failure(before) if evaluations else ""
+    why, tick = failure(before) if evaluations else "", tick or silent
     if not why:
         return before
-    count, after, interrupted = 0, None, False
-
-    def told(stage: str, done: float | None = None, /) -> None:
-        nonlocal count
-        count += stage == STAGE and done is not None
-        if tick is not None:
-            tick(stage, None)
-
     try:
-        if tick is not None:
-            tick(STAGE, None)
+        tick(STAGE, None)
     except KeyboardInterrupt:  # before it began: the fit has not failed, it was ended
         return before
-    began, cost = perf_counter(), bearing_cost(before, search_delay=search_delay)
-    try:
-        places = global_problems(cost, seed=seed, evaluations=evaluations, tick=told)
-        fits = [search(p, p.start(), iterations=_ITERATIONS, tick=told) for p in places]
+    cost = bearing_cost(before, search_delay=search_delay)
+
+    def look(note: Tick) -> BearingFit | None:
+        places = global_problems(cost, seed=seed, evaluations=evaluations, tick=note)
+        fits = [search(p, p.start(), iterations=_ITERATIONS, tick=note) for p in places]
         fits = [f for f in fits if f.status != "failed"]
-        if fits:
-            nearest = min(fits, key=lambda f: f.criterion)
-            after = finish(search(_whole(nearest.problem, records, before.problem.skip), nearest.vector, tick=told))
-    except KeyboardInterrupt:
-        interrupted = True
+        if not fits:
+            return None
+        nearest = min(fits, key=lambda f: f.criterion)
+        return finish(search(_whole(nearest.problem, records, before.problem.skip), nearest.vector, tick=note))
+
+    def so_far() -> BearingFit | None:  # not a step further: what was found, with its information
         places = cost.found()
-        if places:  # not a step further: what was found, with its information
-            whole = _whole(places[0], records, before.problem.skip)
-            after = search(whole, whole.start(), iterations=0)
-    taken = _better(after, before)
-    fit = after if taken and after is not None else before
-    report = {
-        "why": why, "evaluations": count, "seconds": perf_counter() - began, "criterion_before": _per_value(before),
-        "criterion_after": _per_value(after), "taken": taken, "interrupted": interrupted,
-    }  # fmt: skip
-    return RescuedFit(**{f.name: getattr(fit, f.name) for f in fields(BearingFit)}, global_search=report)
+        if not places:
+            return None
+        whole = _whole(places[0], records, before.problem.skip)
+        return search(whole, whole.start(), iterations=0)
+
+    return look_elsewhere(before, why, look, so_far, _better, tick) or before
 
 
 def _whole(problem: BearingProblem, records: Sequence[BearingRecord], skip: int) -> BearingProblem:
@@ -100,16 +79,8 @@ def _whole(problem: BearingProblem, records: Sequence[BearingRecord], skip: int)
     return replace(problem, records=tuple(records), skip=max(skip, int(max(problem.delays.values())) + 8))
 
 
-def _per_value(fit: BearingFit | None) -> float | None:
-    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
-
-
-def _better(after: BearingFit | None, before: BearingFit) -> bool:
+def _better(after: BearingFit, before: BearingFit) -> bool:
     """Whether the later fit says more of the data than its numbers cost, or as much and has converged."""
-    if after is None or after.status == "failed":
-        return False
-    if before.status == "failed":
-        return True
     same = replace(before.problem, skip=after.problem.skip)  # the samples that both have: a longer delay leaves fewer
     n, gain = same.n_used, criterion(same, before.vector) - after.criterion
     gain += (before.problem.size - after.problem.size) * float(np.log(n))
@@ -137,15 +108,7 @@ def _unexplained(fit: BearingFit, r: int) -> float:
     if found is None:
         return 1.0
     e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
-    u, n = fit.problem.records[r].u[: e.shape[0], None], e.shape[0]
-    Z = np.hstack([*[x[_PAST - k : n - k] for x in (e, u) for k in range(1, _PAST + 1)], np.ones((n - _PAST, 1))])
-    sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(e[_PAST:]), axis=1)
-    Z, E = Z[sound], e[_PAST:][sound]
-    if E.shape[0] < 4 * Z.shape[1]:
-        return 0.0
-    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
-    left = np.sum((E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]) ** 2) / (E.shape[0] - Z.shape[1])
-    return 1.0 - float(left / (np.sum(E**2) / E.shape[0]))
+    return explained_by_past(e, fit.problem.records[r].u[: e.shape[0], None], _PAST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

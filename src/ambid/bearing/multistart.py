@@ -84,7 +84,7 @@ def starts(
             "start values"
         )
     racers = _unlike(scored)[:_RACE]
-    return sorted((raced(c, tick) for c in racers), key=lambda c: c.criterion) if len(racers) > 1 else racers
+    return sorted((race(c, tick) for c in racers), key=lambda c: c.criterion) if len(racers) > 1 else racers
 
 
 def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
@@ -97,7 +97,7 @@ def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
     return found
 
 
-def raced(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
+def race(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
     """Search a little way on a short stretch, and keep what does best on the whole record.
 
     `tick`: called after each evaluation.

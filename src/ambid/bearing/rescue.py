@@ -16,10 +16,12 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.magnet_likelihood import BearingFit
 from ambid.bearing.multistart import (
     FARTHEST,
     MAX_DELAY,
@@ -30,7 +32,7 @@ from ambid.bearing.multistart import (
     busiest,
     candidate_problem,
     fixed_values,
-    raced,
+    race,
 )
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.likelihood import Fit, evaluate, search
@@ -73,21 +75,79 @@ def unexplained(fit: Fit) -> float:
     e = None if fit.status == "failed" else innovations(fit.problem, fit.vector)
     if e is None:
         return 1.0
-    at = busiest(fit.problem.u[fit.problem.skip :], _LOOKED)
-    e, u = e[at], fit.problem.u[fit.problem.skip :][at]
-    n, first = e.shape[0], max(_PAST, _INPUTS)
-    if n < 4 * (first + _PAST * e.shape[1] + _INPUTS * u.shape[1]):
+    u = fit.problem.u[fit.problem.skip :]
+    at = busiest(u, _LOOKED)
+    return explained_by_past(e[at], u[at], _INPUTS)
+
+
+def explained_by_past(e: Array, u: Array, depth: int) -> float:
+    """Return the part of the variance of `e` that its last samples, and the last `depth` of `u`, explain.
+
+    `e`: (n_samples, n_outputs); `u`: (n_samples, n_inputs); rows with anything that is not finite are left out.
+    """
+    first, n = max(_PAST, depth), e.shape[0]
+    past = [x[first - k : n - k] for x, most in ((e, _PAST), (u, depth)) for k in range(1, most + 1)]
+    Z, E = np.hstack([*past, np.ones((max(n - first, 0), 1))]), e[first:]
+    sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(E), axis=1)
+    Z, E = Z[sound], E[sound]
+    if E.shape[0] < 4 * Z.shape[1]:
         return 0.0
-    past = [x[first - k : n - k] for x, depth in ((e, _PAST), (u, _INPUTS)) for k in range(1, depth + 1)]
-    Z = np.hstack([*past, np.ones((n - first, 1))])
-    Z, E = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300), e[first:]
+    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
     left = E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]
     before, after = E.T @ E / E.shape[0], left.T @ left / (E.shape[0] - Z.shape[1])
     gained = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
     return 1.0 - float(np.exp(gained / E.shape[1])) if np.isfinite(gained) else 0.0
 
 
-def rescued(
+F = TypeVar("F", Fit, BearingFit)
+
+
+def look_elsewhere(
+    before: F | None,
+    why: str,
+    look: Callable[[Tick], F | None],
+    so_far: Callable[[], F | None],
+    better: Callable[[F, F], bool],
+    tick: Tick,
+) -> F | None:
+    """Return the better of a fit and of one from a global search, with what was done in its `global_search`.
+
+    `before`: what the ordinary starts led to; `why`: why that is not enough; `look`: searches; `so_far`: the best that
+    it has, where a KeyboardInterrupt ends it; `better`: whether the first of two fits is. The report: ``why``,
+    ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per value, None where there is none),
+    ``taken``, ``interrupted``. None where nothing was found at all.
+    """
+    began, count, interrupted = perf_counter(), 0, False
+
+    def note(stage: str, done: float | None = None, /) -> None:
+        nonlocal count
+        count += stage == STAGE and done is not None
+        tick(stage, None)
+
+    try:
+        after = look(note)
+    except KeyboardInterrupt:
+        interrupted, after = True, so_far()
+        if before is None and (after is None or after.status == "failed"):
+            raise
+    taken = after is not None and after.status != "failed"
+    if taken and after is not None and before is not None and before.status != "failed":
+        taken = better(after, before)
+    fit = after if taken else before
+    if fit is None:
+        return None
+    report = {
+        "why": why, "evaluations": count, "seconds": perf_counter() - began, "criterion_before": _per_value(before),
+        "criterion_after": _per_value(after), "taken": taken, "interrupted": interrupted,
+    }  # fmt: skip
+    return replace(fit, global_search=report)
+
+
+def _per_value(fit: Fit | BearingFit | None) -> float | None:
+    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
+
+
+def rescue(
     before: Fit | None,
     why: str,
     model: LinearModel,
@@ -95,48 +155,29 @@ def rescued(
     parameters: Sequence[Parameter],
     delay: Delay,
     how: Rescue,
-    followed: Callable[[Sequence[Candidate]], Fit],
+    follow: Callable[[Sequence[Candidate]], Fit],
     tick: Callable[[], None] | None,
 ) -> Fit | None:
     """Search globally, and locally from what was found.
 
-    `before`: what the ordinary starts led to; `why`: why that is not enough; `followed`: the local search from several
-    candidates; `tick`: a KeyboardInterrupt ends in the best so far, where there is any. Returns the better of both,
-    `global_search` filled in: ``why``, ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per
-    sample, null where there is none), ``taken``, ``interrupted``. None where nothing was found at all.
+    `before`, `why`: see `look_elsewhere`; `follow`: the local search from several candidates; `tick`: a
+    KeyboardInterrupt ends in the best so far, where there is any.
     """
     cost = likelihood_cost(model, signals, parameters, delay) if how.evaluations else None
     if cost is None:
         return before
-    began, run, after, interrupted = perf_counter(), _Seen(), None, False
+    seen: list[tuple[float, Array]] = []
 
-    def note(stage: str, done: float | None = None, /) -> None:
-        del stage, done
-        run.evaluations += 1
-        if tick is not None:
-            tick()
+    def look(note: Tick) -> Fit | None:
+        candidates = global_candidates(cost, signals, how, tick=note, keep=lambda z, value: seen.append((value, z)))
+        candidates = sorted((race(c, tick) for c in candidates), key=lambda c: c.criterion)
+        return follow(candidates[:1]) if candidates else None
 
-    try:
-        candidates = global_candidates(cost, signals, how, tick=note, keep=run.keep)
-        candidates = sorted((raced(c, tick) for c in candidates), key=lambda c: c.criterion)
-        after = followed(candidates[:1]) if candidates else None
-    except KeyboardInterrupt:
-        interrupted = True
-        candidates = [] if run.vector is None else candidates_at(cost, signals, [run.vector])
-        if candidates:  # not a step further: what was found, with its information
-            after = search(candidates[0].problem, candidates[0].vector, steps=0)
-        if before is None and (after is None or after.status == "failed"):
-            raise
-    taken = _better(after, before)
-    fit = after if taken else before
-    if fit is None:
-        return None
-    report = {
-        "why": why, "evaluations": run.evaluations, "seconds": perf_counter() - began,
-        "criterion_before": _per_sample(before), "criterion_after": _per_sample(after), "taken": taken,
-        "interrupted": interrupted,
-    }  # fmt: skip
-    return replace(fit, global_search=report)
+    def so_far() -> Fit | None:  # not a step further: what was found, with its information
+        candidates = candidates_at(cost, signals, [seen[-1][1]]) if seen else []
+        return search(candidates[0].problem, candidates[0].vector, steps=0) if candidates else None
+
+    return look_elsewhere(before, why, look, so_far, _better, lambda *_: tick() if tick is not None else None)
 
 
 def describe_search(report: Mapping[str, object]) -> str:
@@ -158,29 +199,8 @@ def describe_search(report: Mapping[str, object]) -> str:
     return out + f"the fit comes from there, its likelihood criterion lies {fall:.2g} per sample lower"
 
 
-@dataclass(slots=True)
-class _Seen:
-    """What an interruption must not lose."""
-
-    vector: Array | None = None
-    value: float = np.inf
-    evaluations: int = 0
-
-    def keep(self, vector: Array, value: float) -> None:
-        if value < self.value:
-            self.vector, self.value = vector, value
-
-
-def _per_sample(fit: Fit | None) -> float | None:
-    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
-
-
-def _better(after: Fit | None, before: Fit | None) -> bool:
+def _better(after: Fit, before: Fit) -> bool:
     """Whether the later fit says more of the data than its numbers cost, or as much and has converged."""
-    if after is None or after.status == "failed":
-        return False
-    if before is None or before.status == "failed":
-        return True
     # compared per sample, because a longer delay may leave fewer samples
     n = before.problem.n_used
     gain = n * (before.criterion / n - after.criterion / after.problem.n_used)

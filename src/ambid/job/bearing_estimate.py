@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, weight_carried
-from ambid.bearing.magnet_rescue import RescuedFit
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.bearing.rescue import describe_search
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
@@ -193,7 +192,7 @@ def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> 
     """What a reader has to know before using the numbers, most important first."""
     found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
 
-    if isinstance(fit, RescuedFit):
+    if fit.global_search is not None:
         found.append(describe_search(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
