@@ -26,7 +26,6 @@ from ambid.track.lines_file import NORMAL_95
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
-    from rich.text import Text
 
 STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
 KEYS = "h hold   t track   a accept   r revert   q end"
@@ -248,6 +247,9 @@ class TrackView:
     pressed: str = ""  # the flag that the operator set last; empty without
 
 
+Parts = list[str | tuple[str, str]]  # of a line, those with a style of their own as pairs
+
+
 def live_view(view: TrackView, *, ascii_only: bool = False) -> Group:
     """Make what is shown.
 
@@ -256,41 +258,29 @@ def live_view(view: TrackView, *, ascii_only: bool = False) -> Group:
     from rich.console import Group
     from rich.text import Text
 
-    parts: list[Text | Table] = [
-        _head(view, ascii_only),
-        Text(),
-        _parameters(view, ascii_only),
-        Text(),
-        _error(view, ascii_only),
-        _counts(view),
-        *_decisions(view),
-    ]
+    after = [_error(view, ascii_only), _counts(view), *_decisions(view)]
     if view.keys:
         pressed = f"   (pressed: {view.pressed})" if view.pressed else ""
-        parts += [Text(), Text(f"keys: {KEYS}{pressed}", style="dim", no_wrap=True, overflow="ellipsis")]
-    return Group(*parts)
+        after += [[], [(f"keys: {KEYS}{pressed}", "dim")]]
+    first, *rest = (Text.assemble(*x, no_wrap=True, overflow="ellipsis") for x in (_head(view, ascii_only), *after))
+    return Group(first, Text(), _parameters(view, ascii_only), Text(), *rest)
 
 
-def _head(view: TrackView, ascii_only: bool) -> Text:
-    from rich.text import Text
-
+def _head(view: TrackView, ascii_only: bool) -> Parts:
     h, t = view.header, view.line.t
-    done = t - view.begin_s
-    name = str(h.record.get("file") or "record")
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append(f"{name}", style="bold").append(f": model {h.model}, {h.method}\n")
     mark = "*" if ascii_only else "●"
-    text.append(f"{mark} {view.line.state:<9}", style=STATE_STYLES[view.line.state])
-    text.append(f" t {t:.2f} s")
+    state = (f"{mark} {view.line.state:<9}", STATE_STYLES[view.line.state])
+    parts: Parts = [(str(h.record.get("file") or "record"), "bold"), f": model {h.model}, {h.method}\n", state]
+    parts.append(f" t {t:.2f} s")
     if view.length_s:
-        share = min(max(done / view.length_s, 0.0), 1.0)
+        share = min(max((t - view.begin_s) / view.length_s, 0.0), 1.0)
         full = round(20 * share)
         on, off = ("#", ".") if ascii_only else ("█", "░")
-        text.append(f" of {view.begin_s + view.length_s:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
+        parts.append(f" of {view.begin_s + view.length_s:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
     if view.behind_s is not None:
         late = view.behind_s > 10 * h.every_s
-        text.append(f"  {sized(max(view.behind_s, 0.0), 's')} behind", style="bold red" if late else "")
-    return text
+        parts.append((f"  {sized(max(view.behind_s, 0.0), 's')} behind", "bold red" if late else ""))
+    return parts
 
 
 def _parameters(view: TrackView, ascii_only: bool) -> Table:
@@ -368,47 +358,33 @@ def sparkline(values: Sequence[float], limit: float, *, width: int = _SPARK, asc
     return "".join(letters)
 
 
-def _error(view: TrackView, ascii_only: bool) -> Text:
-    from rich.text import Text
-
+def _error(view: TrackView, ascii_only: bool) -> Parts:
     error, limit = view.line.error, view.header.limit
-    text = Text(no_wrap=True, overflow="ellipsis")
     shown = "  ?  " if math.isnan(error) else f"{error:5.3g}"
-    text.append("model error ").append(shown, style="bold red" if error > limit else "bold green")
-    text.append(f"  limit {limit:g}  ")
     over = (_PLAIN_BLOCKS if ascii_only else _BLOCKS)[4:]
-    for letter in sparkline(view.errors, limit, ascii_only=ascii_only):
-        text.append(letter, style="red" if letter in over else "green")
-    if len(view.errors) > 1:
-        text.append(f"  last {sized(len(view.errors) * view.header.every_s, 's')}", style="dim")
-    return text
+    spark = sparkline(view.errors, limit, ascii_only=ascii_only)
+    return [
+        "model error ",
+        (shown, "bold red" if error > limit else "bold green"),
+        f"  limit {limit:g}  ",
+        *((letter, "red" if letter in over else "green") for letter in spark),
+        (f"  last {sized(len(view.errors) * view.header.every_s, 's')}" if len(view.errors) > 1 else "", "dim"),
+    ]
 
 
-def _counts(view: TrackView) -> Text:
-    from rich.text import Text
-
+def _counts(view: TrackView) -> Parts:
     done = view.line.t - view.begin_s
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append(f"{view.updates} updates, {view.rejected} samples rejected")
+    parts: Parts = [f"{view.updates} updates, {view.rejected} samples rejected"]
     if view.open_changes:
-        plural = "" if view.open_changes == 1 else "s"
-        text.append(f", {view.open_changes} open change{plural}", style="bold red")
+        parts.append((f", {_counted(view.open_changes, 'open change')}", "bold red"))
     speed = speed_words(round(done * view.header.rate_hz), done, view.wall_s)
-    if speed:
-        text.append(f"\n{speed}", style="dim")
-    return text
+    return [*parts, (f"\n{speed}", "dim")] if speed else parts
 
 
-def _decisions(view: TrackView) -> list[Text]:
-    from rich.text import Text
-
-    if not view.decisions:
-        return []
-    lines = [Text()]
+def _decisions(view: TrackView) -> list[Parts]:
+    lines: list[Parts] = [[]] if view.decisions else []
     for e in view.decisions[-_DECISIONS:]:
-        text = Text(no_wrap=True, overflow="ellipsis")
-        text.append(f"{e.t:10.3f} s  ", style="dim")
         who = f" {e.parameter}" if e.parameter else ""
-        text.append(f"{e.kind}{who}: ", style="bold red" if e.kind in _BAD else "bold").append(" ".join(e.why.split()))
-        lines.append(text)
+        what = (f"{e.kind}{who}: ", "bold red" if e.kind in _BAD else "bold")
+        lines.append([(f"{e.t:10.3f} s  ", "dim"), what, " ".join(e.why.split())])
     return lines
