@@ -271,9 +271,9 @@ def test_limits_act_and_are_counted_across_calls() -> None:
     parts = [running.advance(x) for x in np.split(u, 9 * np.arange(1, 200))]
     assert np.abs(np.concatenate([p.command for p in parts])).max() == 3.0
     assert running.n_done == 2000
-    for name in ("first_contact", "first_saturated", "n_saturated", "n_over_current"):
-        assert getattr(running, name) == getattr(plain, name)
-        assert getattr(running, name) is not None
+    assert running.counts.tolist() == [2000, plain.first_contact, plain.first_saturated, plain.n_saturated]
+    assert running.counts.min() >= 0
+    assert running.n_over_current == plain.n_over_current > 0
 
 
 def test_an_unstable_end_is_told_by_its_pole() -> None:

@@ -289,7 +289,7 @@ class VaryingLoop:
         self._run: Callable[..., int] = run
         self._rng, self.current_offset = np.random.default_rng(seed), current_offset
         self._x = self.standing.centre.copy() if start is None else _vector("start", start, self.standing.centre.size)
-        self._memory, self._counts = np.zeros(3), np.array([0, -1, -1, 0])
+        self._memory, self.counts = np.zeros(3), np.array([0, -1, -1, 0])
         self._line = np.full(whole + 2, self.standing.centre_input)
         self.n_over_current = 0
         force, voltage = self.noise.held_rms(rate_hz)
@@ -317,22 +317,7 @@ class VaryingLoop:
     @property
     def n_done(self) -> int:
         """Samples so far."""
-        return int(self._counts[0])
-
-    @property
-    def first_contact(self) -> int | None:
-        """First sample at which the rotor lay at a stop."""
-        return None if self._counts[1] < 0 else int(self._counts[1])
-
-    @property
-    def first_saturated(self) -> int | None:
-        """First sample at which the command was limited."""
-        return None if self._counts[2] < 0 else int(self._counts[2])
-
-    @property
-    def n_saturated(self) -> int:
-        """Number of limited commands."""
-        return int(self._counts[3])
+        return int(self.counts[0])
 
     def advance(self, excitation: Array, setpoint: ArrayLike | None = None) -> Stretch:
         """Run on for as many samples as there are of the excitation, new arrays each time."""
@@ -348,12 +333,12 @@ class VaryingLoop:
         if self.current_offset and "current" in of.outputs:
             noise[:, self._roles[1]] += self.current_offset
             u += self.loop.kc * self.current_offset
-        force, speed, angle = self._loads(first, n)
+        force, speed, angle, loads = self._loads(first, n)
         column = of.disturbances.index("force") if "force" in of.disturbances else -1
         measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, self._x.size))
         lost = self._run(
             u, wanted, noise, force, column, pieces.edges, pieces.equations, pieces.gains, self._x, self._memory,
-            self._line, self._counts, standing.centre, standing.centre_input, *self._law, measured, command, states,
+            self._line, self.counts, standing.centre, standing.centre_input, *self._law, measured, command, states,
         )  # fmt: skip
         if lost >= 0:
             raise ModelError(self._loss(first + lost))
@@ -361,7 +346,7 @@ class VaryingLoop:
             i, (low, high) = states[:, of.states.index("current")], self.limits.current
             self.n_over_current += int(np.count_nonzero((i < low) | (i > high)))
         truth = {name: np.repeat(values, np.diff(pieces.edges)) for name, values in pieces.theta.items()}
-        truth.update(self._true_loads(first, n))
+        truth.update(loads)
         return Stretch(
             first=first, command=command, measured=measured, states=states[:, : len(of.states)], speed=speed,
             angle=angle, truth=MappingProxyType(truth),
@@ -379,28 +364,20 @@ class VaryingLoop:
             " another loop, or more substeps"
         )
 
-    def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None]:
-        """Return load and unbalance over each sample (empty for none), and speed and angle at the sampling instants."""
+    def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None, dict[str, Array]]:
+        """Return the force over each sample (empty for none), speed and angle at its instant, and the true loads."""
         v, rate = self.variation, self.rate_hz
-        if v.force is None and v.unbalance is None:
-            return np.empty(0), None, None
         instants = first + np.arange(n, dtype=np.float64)
-        force = np.zeros(n) if v.force is None else v.force.at(instants + 0.5, rate)
+        truth = {} if v.force is None else {"force": v.force.at(instants + 0.5, rate)}
+        force = truth.get("force", np.empty(0))
         if v.unbalance is None:
-            return force, None, None
+            return force, None, None, truth
         u = v.unbalance
         middle = u.speed.at(instants + 0.5, rate)
-        force = force + u.moment * middle**2 * np.cos(u.speed.integral(instants + 0.5, rate) + u.phase)
-        return force, u.speed.at(instants, rate), u.speed.integral(instants, rate)
-
-    def _true_loads(self, first: int, n: int) -> dict[str, Array]:
-        v, found = self.variation, {}
-        if v.force is not None:
-            found["force"] = v.force.at(first + 0.5 + np.arange(n, dtype=np.float64), self.rate_hz)
-        if v.unbalance is not None:
-            found["unbalance"] = np.full(n, v.unbalance.moment)
-            found["unbalance_phase"] = np.full(n, v.unbalance.phase)
-        return found
+        turning = u.moment * middle**2 * np.cos(u.speed.integral(instants + 0.5, rate) + u.phase)
+        truth |= {"unbalance": np.full(n, u.moment), "unbalance_phase": np.full(n, u.phase)}
+        force = turning if v.force is None else force + turning
+        return force, u.speed.at(instants, rate), u.speed.integral(instants, rate), truth
 
 
 def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.random.Generator) -> Simulation:
@@ -414,6 +391,7 @@ def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.rand
     truth = {**standing.parameters(), **begin, "delay": loop.delay}
     truth |= {} if isinstance(plant, LinearPlant) else nonlinear_truth(plant)
     truth |= {"i_offset": running.current_offset} if running.current_offset else {}
+    contact, saturated = (None if k < 0 else int(k) for k in running.counts[1:3])
     return Simulation(
         record=Record(
             rate_hz=rate_hz,
@@ -424,9 +402,9 @@ def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.rand
         states=np.concatenate([s.states for s in stretches]),
         state_names=of.states,
         truth=MappingProxyType(truth),
-        first_contact=running.first_contact,
-        first_saturated=running.first_saturated,
-        n_saturated=running.n_saturated,
+        first_contact=contact,
+        first_saturated=saturated,
+        n_saturated=int(running.counts[3]),
         n_over_current=running.n_over_current,
         largest_pole=_largest_pole(running),
     )
