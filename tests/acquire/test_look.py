@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquire.amplitude import Room, ended, looking
+from ambid.acquire.amplitude import Room, make_look, why_incomplete
 from ambid.acquire.device import DeviceEvent
 from ambid.acquire.session import Course, RunReport
 from ambid.rig import rig_from_text
@@ -18,7 +18,7 @@ WHOLE = RunReport(samples=100, wanted=100, lost=0, first=0, after=100, fault=Non
 def test_a_look_gives_the_samples_by_role_in_si():
     rig = prototype()
     with Spoiled(rig) as device:
-        report, seen = looking(device, rig, lambda: False)(Course(mode="levitate", seconds=0.5, settle_s=0.5))
+        report, seen = make_look(device, rig, lambda: False)(Course(mode="levitate", seconds=0.5, settle_s=0.5))
         assert device.state == "idle"
     assert report.complete
     assert set(seen) == {"voltage", "position", "current"}
@@ -30,7 +30,7 @@ def test_a_look_gives_the_samples_by_role_in_si():
 def test_a_look_that_shows_nothing_gives_empty_arrays():
     rig = prototype()
     with Spoiled(rig) as device:
-        report, seen = looking(device, rig, lambda: True)(Course(mode="sample", seconds=0.5))
+        report, seen = make_look(device, rig, lambda: True)(Course(mode="sample", seconds=0.5))
     assert report.interrupted
     assert all(values.shape == (0,) for values in seen.values())
 
@@ -87,5 +87,5 @@ def test_the_voltage_is_what_the_pulse_widths_allowed_can_order(duty, volts):
     ids=["whole", "fault", "interrupted", "lost", "short"],
 )
 def test_why_a_run_is_not_whole(changes, said):
-    found = ended(replace(WHOLE, **changes), "the trial")
+    found = why_incomplete(replace(WHOLE, **changes), "the trial")
     assert (len(found) == 1 and said in found[0]) if said else found == ()

@@ -14,7 +14,7 @@ import pytest
 
 from ambid.acquire.default_daq import fault_words
 from ambid.acquire.device import DeviceEvent
-from ambid.cli import _Told
+from ambid.cli import _BestEffort
 from ambid.cli.interrupts import Stop, signals
 
 PROTOTYPE = files("ambid").joinpath("data", "prototype.toml").read_text(encoding="utf-8")
@@ -324,7 +324,7 @@ def test_more_than_two_signals_tear_no_cleaning_off():
 def test_what_is_said_of_a_recording_to_nobody_does_not_end_it():
     with FileIO("/dev/full", "w") as full:
         before = io.TextIOWrapper(io.BufferedWriter(full))
-        told = _Told.of(before)
+        told = _BestEffort.of(before)
         told.write("a note\n")
         told.flush()
         with pytest.raises(OSError, match="space"):

@@ -200,7 +200,7 @@ def test_current_with_the_output_off_stops_it_at_rest(tmp_path):
 def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
     device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 40))
     with device:
-        look = room.looking(device, prototype(), lambda: False)
+        look = room.make_look(device, prototype(), lambda: False)
         step = judge.rest(look, room.Room.of(prototype()), SHORT)
     assert step.passed
     assert "with the output off" in step.cautions[0]

@@ -78,7 +78,7 @@ def _ordered(rig: Rig, limits: tuple[float, float]) -> tuple[float, float]:
 Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
 
 
-def looking(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
+def make_look(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
     """Return a way of running a course: it gives the report, and by role what came, SI, seen through the rig.
 
     `device`: opened, idle; `stopped`: as `session.run`.
@@ -107,7 +107,7 @@ class Kept:
         self.values.append(self._view.block(frame.block).values)
 
 
-def ended(report: RunReport, what: str) -> tuple[str, ...]:
+def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
     """Say why a run is not whole.
 
     `report`: of the run; `what`: what it was for. Returns empty where it is whole.
@@ -180,7 +180,7 @@ def find_amplitude(
 ) -> Size:
     """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
 
-    `look`: see `looking`; `room`: limits; `trial`: what is played; `resting`: position in m and current
+    `look`: see `make_look`; `room`: limits; `trial`: what is played; `resting`: position in m and current
     in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
     reasons where it tripped, or used too much. It may use less than its part where trials have run out.
     """
@@ -193,7 +193,7 @@ def find_amplitude(
     findings: list[str] = []
     while True:
         report, seen = look(trial.course(size, rate_hz))
-        reasons = ended(report, f"excitation of {size:.3g} V")
+        reasons = why_incomplete(report, f"excitation of {size:.3g} V")
         if reasons:
             return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
         worst, used = _used(seen, room, resting, use)
@@ -217,9 +217,9 @@ def fitting_amplitude(
     `device`: opened, idle; `rig`: of the device; `trial`: what is played; `use`: part of the room; `stopped`: as
     `session.run`. Returns peak in V.
     """
-    look, room = looking(device, rig, stopped), Room.of(rig)
+    look, room = make_look(device, rig, stopped), Room.of(rig)
     report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
-    reasons = ended(report, "the look before the excitation")
+    reasons = why_incomplete(report, "the look before the excitation")
     if not reasons:
         resting = {role: float(seen[role].mean()) for role in room.trips}
         found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=use)

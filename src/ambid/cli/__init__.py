@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         warnings.simplefilter("ignore")
     _hold_standard_files()
     if sys.stderr is not None:
-        sys.stderr = _Told.of(sys.stderr)
+        sys.stderr = _BestEffort.of(sys.stderr)
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -52,7 +52,7 @@ def _hold_standard_files() -> None:
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115 - stays open to the end
 
 
-class _Told(io.TextIOWrapper):
+class _BestEffort(io.TextIOWrapper):
     """Standard error of which nothing depends: a recording goes on where nobody reads what is said of it."""
 
     _before: TextIO
@@ -84,7 +84,7 @@ def run(arguments: Sequence[str]) -> int:
     code.
     """
     if sys.stdout is None:  # it was closed before the program began
-        sys.stdout = _Nobody()
+        sys.stdout = _ClosedOutput()
     words, trace = [w for w in arguments if w != "--traceback"], "--traceback" in arguments
     try:
         from ambid.cli.app import run_verb
@@ -93,10 +93,10 @@ def run(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
+        return _refuse("interrupted; nothing was written", INTERRUPTED, trace=False)
     except BrokenPipeError:
         # The interpreter flushes standard output once more when it ends: give it somewhere to go.
-        if not isinstance(sys.stdout, _Nobody):
+        if not isinstance(sys.stdout, _ClosedOutput):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Exception as error:
@@ -104,24 +104,22 @@ def run(arguments: Sequence[str]) -> int:
         from ambid.errors import AmbidError
 
         if interrupts(error):
-            return _refused("interrupted; nothing was written", INTERRUPTED, trace=False)
+            return _refuse("interrupted; nothing was written", INTERRUPTED, trace=False)
         said = str(error) if isinstance(error, AmbidError) else refusal(error)
         if said is not None:
-            return _refused(said, 2, trace=trace)
+            return _refuse(said, 2, trace=trace)
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
-            return _refused(
+            return _refuse(
                 f"the output cannot be written: {error.strerror}. Make room, or write elsewhere", 2, trace=trace
             )
         if isinstance(error, MemoryError):
-            return _refused(
-                "there is not enough memory. Close other programs, or take a shorter record", 2, trace=trace
-            )
+            return _refuse("there is not enough memory. Close other programs, or take a shorter record", 2, trace=trace)
         where = f"{type(error).__name__}: {' '.join(str(error).split())}"
         advice = "" if trace else ". Run with --traceback, and report it"
-        return _refused(f"a defect of ambid: {where}{advice}", 1, trace=trace)
+        return _refuse(f"a defect of ambid: {where}{advice}", 1, trace=trace)
 
 
-class _Nobody(io.TextIOBase):
+class _ClosedOutput(io.TextIOBase):
     """A standard output that nobody reads, as a pipe whose reader has gone."""
 
     def write(self, text: str) -> int:
@@ -130,7 +128,7 @@ class _Nobody(io.TextIOBase):
         return 0
 
 
-def _refused(line: str, code: int, *, trace: bool) -> int:
+def _refuse(line: str, code: int, *, trace: bool) -> int:
     """Print one line on standard error, after the traceback if it is wanted."""
     if trace:
         import traceback

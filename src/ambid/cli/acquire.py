@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.devices import course_mode, opened
+from ambid.cli.devices import course_mode, open_bench
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
@@ -109,7 +109,7 @@ def command(
     job = Recording(known, port, record, trial, force=force)
     start, before = start_of_track(track), _changed(record)
     try:
-        opening = opened(port, known, bench=bench, pace=pace, seed=seed)
+        opening = open_bench(port, known, bench=bench, pace=pace, seed=seed)
         with watching() as watch, signals(job.stop.take), opening as device:
             course = job.course(device, watch, played=excitation is not None, amplitude=amplitude)
             if track is None:

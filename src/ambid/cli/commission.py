@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.devices import opened
+from ambid.cli.devices import open_bench
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import end
@@ -18,7 +18,6 @@ from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquire.device import Device
     from ambid.acquire.recording import Progress
     from ambid.job.commissioning_steps import Step, StepName
 
@@ -72,7 +71,7 @@ def command(
     if folder.exists():
         check_folder(folder)
     last: list[Step] = []
-    with watching() as watch, signals(stop.take), opened(port, known, bench=bench, pace=pace, seed=seed) as device:
+    with watching() as watch, signals(stop.take), open_bench(port, known, bench=bench, pace=pace, seed=seed) as device:
         new = _make(folder)
 
         def begin(name: StepName) -> None:
@@ -91,8 +90,14 @@ def command(
             typer.echo(said)
 
         def agreed(name: StepName) -> bool:
+            del name
             watch.clear()
-            return _agreed(name, device, yes=yes)
+            asked = "The controller will switch its output on and lift the rotor."
+            return (
+                yes
+                or device.info.kind != "serial"  # a real bench alone moves
+                or typer.confirm(f"{asked} Is the bench clear, the emergency stop at hand?")
+            )
 
         def alive(stage: str, done: float | None = None, /) -> None:
             del done
@@ -153,13 +158,3 @@ def _make(folder: Path) -> bool:
     except OSError as failure:
         raise AmbidError(f"-o {folder} cannot be made: {failure.strerror or failure}. Choose another folder") from None
     return new
-
-
-def _agreed(name: StepName, device: Device, *, yes: bool) -> bool:
-    """Ask before a real bench moves."""
-    del name
-    if yes or device.info.kind != "serial":
-        return True
-    return typer.confirm(
-        "The controller will switch its output on and lift the rotor. Is the bench clear, the emergency stop at hand?"
-    )

@@ -36,7 +36,7 @@ def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) 
 
 
 @contextmanager
-def opened(
+def open_bench(
     port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int
 ) -> Iterator[Device]:
     """Open a device and close it.

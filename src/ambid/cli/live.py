@@ -160,7 +160,7 @@ class Follower:
     @property
     def events(self) -> tuple[Event, ...]:
         """Events in their order: changes with what was decided on each, and of routine decisions the last."""
-        notable = _copied(self._notable)
+        notable = _copy_of(self._notable)
         routine = [e for e in self._latest.copy().values() if e not in notable]
         return tuple(sorted([*notable, *routine], key=lambda e: e.t))
 
@@ -252,7 +252,7 @@ class Follower:
         samples = header.record.get("samples")
         behind = wall - (line.t - self._begin_s) if self._real_time else None
         return TrackView(
-            header=header, line=line, errors=_copied(self._errors), decisions=self.events, ranges=dict(self._ranges),
+            header=header, line=line, errors=_copy_of(self._errors), decisions=self.events, ranges=dict(self._ranges),
             begin_s=self._begin_s,
             length_s=samples / header.rate_hz if isinstance(samples, (int, float)) else None,
             wall_s=wall, behind_s=behind, rejected=tally.rejected_samples, updates=tally.updates,
@@ -270,7 +270,7 @@ class Follower:
             self._ranges[name] = (min(before[0], low), max(before[1], high))
 
 
-def _copied(things: deque[T]) -> tuple[T, ...]:
+def _copy_of(things: deque[T]) -> tuple[T, ...]:
     """Copy what the other thread adds to meanwhile."""
     while True:
         with suppress(RuntimeError):

@@ -96,7 +96,7 @@ def command(
         respond, by_role, limits, point = _bench(preset, source, rate, seed, closed, nonlinear, position)
         rate_hz = respond.keywords["rate_hz"]
         n = _samples(duration, rate_hz)
-        shape = _repeated(
+        shape = _repeat(
             lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
         )
         peak = _largest(by_role, shape, limits, point) if amplitude is None else amplitude
@@ -107,7 +107,7 @@ def command(
         comments: tuple[str, ...] = ()
         if record.suffix not in (".h5", ".hdf5"):
             between = "" if band is None else f" in {band} Hz"
-            comments = (_made(rig, f"{kind} of {peak:.6g} V{between}", seed), f"truth: {truth_words(done)}")
+            comments = (_recipe(rig, f"{kind} of {peak:.6g} V{between}", seed), f"truth: {truth_words(done)}")
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
     warn(done)
     typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {kind} of {peak:.4g} V, seed {seed}")
@@ -171,7 +171,7 @@ def _samples(duration: float, rate_hz: float) -> int:
     return round(count)
 
 
-def _repeated(make: Callable[[int], Array], n: int, periods: int) -> Array:
+def _repeat(make: Callable[[int], Array], n: int, periods: int) -> Array:
     """Lay equal periods one behind the other."""
     import numpy as np
 
@@ -180,7 +180,7 @@ def _repeated(make: Callable[[int], Array], n: int, periods: int) -> Array:
     return np.tile(make(n // periods), periods)
 
 
-def _made(rig: str, what: str, seed: int) -> str:
+def _recipe(rig: str, what: str, seed: int) -> str:
     from importlib.metadata import version
 
     return f"simulated by ambid {version('ambid')}: {Path(rig).name}, {what}, seed {seed}"
@@ -204,7 +204,7 @@ def _run_scenario(
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")
         size = f" of {told['size']:.6g} ({told['size_is']})" if "size" in told else ""
-        made = _made(rig, f"scenario {told['name']}{size}, excitation of {told['amplitude']:.6g} V", seed)
+        made = _recipe(rig, f"scenario {told['name']}{size}, excitation of {told['amplitude']:.6g} V", seed)
         comments = () if record.suffix in (".h5", ".hdf5") else (made, *lines)
         lost = 0
 

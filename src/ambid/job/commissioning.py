@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
-from ambid.acquire.amplitude import Room, looking
+from ambid.acquire.amplitude import Room, make_look
 from ambid.acquire.device import Device
 from ambid.acquire.recording import Acquired, Listeners, acquire
 from ambid.acquire.session import Course
@@ -47,7 +47,7 @@ class Commissioned:
     @property
     def passed(self) -> bool:
         """Whether every step was done and is good enough."""
-        return _passed(self.steps)
+        return _all_passed(self.steps)
 
 
 class Declined(AmbidError):
@@ -110,10 +110,10 @@ def commission(
     guide.check()
     write_text(place / "rig.toml", rig_text(rig, place))
     done: list[Step] = []
-    for name, do in guide.steps(confirm or _agreed):
+    for name, do in guide.steps(confirm or (lambda _: True)):
         if on_begin is not None:
             on_begin(name)
-        step = _done(name, do)
+        step = _do(name, do)
         done.append(step)
         write_text(place / "commission.json", _summary(done, device, guide.wishes))
         if on_step is not None:
@@ -123,12 +123,7 @@ def commission(
     return Commissioned(steps=tuple(done), estimate=guide.estimate, folder=place)
 
 
-def _agreed(name: StepName) -> bool:
-    del name
-    return True
-
-
-def _done(name: StepName, do: Callable[[], Step]) -> Step:
+def _do(name: StepName, do: Callable[[], Step]) -> Step:
     """Do a step; what makes it impossible is its reason."""
     try:
         return do()
@@ -138,7 +133,7 @@ def _done(name: StepName, do: Callable[[], Step]) -> Step:
         return Step(name=name, reasons=(str(failure),))
 
 
-def _passed(steps: Sequence[Step]) -> bool:
+def _all_passed(steps: Sequence[Step]) -> bool:
     return bool(steps) and steps[-1].name == STEPS[-1] and all(s.passed for s in steps)
 
 
@@ -182,7 +177,7 @@ class _Guide:
     def steps(self, confirm: Callable[[StepName], bool]) -> Iterator[tuple[StepName, Callable[[], Step]]]:
         """Yield one step after the other; whoever iterates does it, and stops at one that is not passed."""
         device, room, wishes = self._device, self._room, self.wishes
-        look = looking(device, self._rig, self._stopped)
+        look = make_look(device, self._rig, self._stopped)
         found: dict[str, Step] = {}
 
         def keep(step: Step) -> Step:
@@ -273,7 +268,7 @@ def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
             "device": {"kind": info.kind, "port": info.port, "identity": dict(info.identity), "rate_hz": info.rate_hz},
             "wishes": {name: getattr(wishes, name) for name in wishes.__slots__},
             "steps": [s.as_json() for s in done],
-            "passed": _passed(done),
+            "passed": _all_passed(done),
         },
         indent=1,
     )

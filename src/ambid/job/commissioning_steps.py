@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ambid.acquire.amplitude import Look, Room, Trial, ended, find_amplitude, moving_band
+from ambid.acquire.amplitude import Look, Room, Trial, find_amplitude, moving_band, why_incomplete
 from ambid.acquire.device import Device
 from ambid.acquire.recording import Acquired
 from ambid.acquire.session import Course
@@ -121,11 +121,11 @@ def self_test(device: Device) -> Step:
 def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     """Look at the sensors with the output off.
 
-    `look`: see `looking`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
+    `look`: see `make_look`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
     or a current is shown that cannot be.
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
-    reasons = list(ended(report, "the look at rest"))
+    reasons = list(why_incomplete(report, "the look at rest"))
     cautions: list[str] = []
     shown = {role: _mean_sd(x) for role, x in seen.items() if role in ("position", "current") and x.size}
     for role, (mean, sd) in shown.items():
@@ -156,11 +156,11 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
 def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     """Lift the rotor and let it hover without excitation.
 
-    `look`: see `looking`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
+    `look`: see `make_look`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
     tripped, the rotor strays, or no room is left.
     """
     report, seen = look(Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s))
-    reasons = list(ended(report, "levitation"))
+    reasons = list(why_incomplete(report, "levitation"))
     if not seen["position"].size:
         return Step(name="levitate", reasons=tuple(reasons) or ("no sample came after lift-off",))
     shown = {role: _mean_sd(seen[role]) for role in _UNITS}
@@ -193,7 +193,7 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
 def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
     """Find the largest excitation that keeps to its part of the room.
 
-    `look`: see `looking`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
+    `look`: see `make_look`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
     itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
     `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """
@@ -232,7 +232,7 @@ def record(name: str, done: Acquired) -> Step:
     sensor saturates or stands still. Little signal over noise is a caution: whether it is enough is decided by the
     intervals of what is identified.
     """
-    reasons = list(ended(done.run, f"the {name}"))
+    reasons = list(why_incomplete(done.run, f"the {name}"))
     if done.not_stored:
         reasons += [f"{done.not_stored} samples of the {name} are not stored: {done.troubles[0]}"]
     findings = [
@@ -308,7 +308,7 @@ def tracking(done: LiveTrack, limit: float) -> Step:
     `done`: from `track_live`, with its lines; `limit`: acceptable model error. Returns not passed where it ended early,
     the error is beyond the limit, or a change was found.
     """
-    reasons = list(ended(done.run, "tracking"))
+    reasons = list(why_incomplete(done.run, "tracking"))
     summary, lines = done.track.summary, done.track.lines
     if not lines or summary is None:
         return Step(name="track", reasons=tuple(reasons) or ("no line of the track came: track longer",))

@@ -52,7 +52,7 @@ def known_rig(rig: Rig | str | Path | None) -> Rig:
     return default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)
 
 
-def remembered(rig: Rig) -> dict[str, object]:
+def rig_entry(rig: Rig) -> dict[str, object]:
     """Return what a result keeps of its rig, so that other records are read and judged alike."""
     folder = Path.cwd() if rig.source is None else rig.source.resolve().parent
     return {"name": rig.name, "text": rig_text(rig, folder), "folder": str(folder)}

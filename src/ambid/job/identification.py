@@ -16,7 +16,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, remembered, signals_of
+from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, rig_entry, signals_of
 from ambid.physics.models import model
 from ambid.record import Record
 from ambid.rig import Rig
@@ -134,7 +134,7 @@ def judge(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
         means={role: float(bench[role].mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
         one_step=fit_of(e * problem.scales.output, y), simulation=None if error is None else fit_of(error, y),
-        checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=remembered(rig),
+        checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     return replace(estimate, global_search=fit.global_search)
 
@@ -234,7 +234,7 @@ def identify_nonlinear_used(
     say("check")
     estimate = judge_bearing(fit, uncertainty(fit), taken, delay_given=wanted != "auto")
     clock.lap("checks")
-    estimate = replace(estimate, timing_s=clock.laps, rig=remembered(bench))
+    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench))
     if second is not None:
         estimate = replace(estimate, validation=validation(estimate, second.record))
     return estimate, taken

@@ -112,7 +112,7 @@ def _coefficients(
     estimator: Any
     if method in REGRESSIONS:
         na, nb, nk = _arx_orders(method, data, orders)
-        u, y, sizes = _scaled(method, data)
+        u, y, sizes = _scale(method, data)
         estimator = _arx(method, (na, nb, nk), data, samples, step)
         label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
     else:
@@ -141,7 +141,7 @@ def _coefficients(
     )  # fmt: skip
 
 
-def _scaled(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]]:
+def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]]:
     """Return inputs, with instruments behind them, and output brought to mean zero and size one, and those sizes.
 
     Both are taken from the first samples, as they come on-line.

@@ -177,14 +177,14 @@ def start_of(
     """
     warnings: list[str] = []
     if given is None:
-        estimate, first = _identified(source, rig, start_s)
+        estimate, first = _identify_beginning(source, rig, start_s)
         numbers = _numbers(estimate, source)
     else:
         estimate, first = given if isinstance(given, Estimate) else _read(given), 0
         try:
             _check_fit(estimate, source, rig)
             if rig_speaks:
-                warnings += _compared(estimate, rig)
+                warnings += _contradictions(estimate, rig)
             numbers = _numbers(estimate, source)
         except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
             raise EstimationError(
@@ -244,7 +244,7 @@ def _numbers(estimate: Estimate, source: BenchRows) -> TrackedNumbers:
     )
 
 
-def _identified(source: BenchRows, rig: Rig, start_s: float | None) -> tuple[Estimate, int]:
+def _identify_beginning(source: BenchRows, rig: Rig, start_s: float | None) -> tuple[Estimate, int]:
     length, rate = source.duration_s, source.replay.rate_hz
     wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if start_s is None else start_s
     n = round(wanted * rate)
@@ -284,7 +284,7 @@ def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
             )
 
 
-def _compared(estimate: Estimate, rig: Rig) -> list[str]:
+def _contradictions(estimate: Estimate, rig: Rig) -> list[str]:
     """Refuse a rig that contradicts the estimate; warn where what it says is not used."""
     found = [said for p in rig.parameters if (said := _parameter(p, estimate))]
     for role in model(rig.model).inputs:
