@@ -286,7 +286,8 @@ def residual_blocks(
     F, outputs = np.ascontiguousarray(M[:, :n]), work.weighted(weight)
     for a in range(0, n_used, _BLOCK):
         part = work.w[a : a + _BLOCK]
-        block = rows[:, : part.shape[0]]
+        # whole in memory also where the last block is shorter: another layout would be compiled anew
+        block = rows.reshape(-1)[: n * part.shape[0] * width].reshape(n, -1, width)
         state_scan(M, part, x)
         np.matmul(part, forcing, out=block)
         sensitivity_scan(F, part, outputs[a : a + _BLOCK], s, block, p)
