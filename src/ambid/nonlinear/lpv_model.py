@@ -107,7 +107,7 @@ class Schedule:
 
 def basis_values(s: Array, n: int, basis: str) -> Array:
     """Return `n` functions (degree + 1) of the scaled scheduling signal, (n_samples, n)."""
-    from ambid.nonlinear.lpv_kernels import basis_rows
+    from ambid.nonlinear.lagged_kernels import basis_rows
 
     out = np.empty((s.size, n))
     basis_rows(np.ascontiguousarray(s), BASES.index(basis), out)
@@ -374,18 +374,13 @@ def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frozen:
-    """The linear model y = (B/A) u + offset/A(1) + H e that stands still at one p; H = C/D or C/(D A).
+    """The linear model y = (B/A) u + offset/A(1) + v that stands still at one p.
 
     With p made of the output it describes movements about the set point that are fast beside its low-pass.
     """
 
-    p: float
-    dt: float
-    nk: int  # smallest lag of the inputs
     a: Array  # (order + 1,), of q^0, q^-1, ...; the first is 1
     b: Array  # (n_exciting, nb), SI, of q^-nk,
-    c: Array  # of the error model; the first is 1
-    d: Array
     # (order,), complex, rad/s, log(z)/dt of the roots z of A, largest real part first; -inf for a root at 0
     poles: Complex
     dc_gain: Array  # (n_exciting,), SI, B(1)/A(1); negative behind an unstable pole
@@ -398,14 +393,6 @@ class Frozen:
     def stable(self) -> bool:
         """Whether all poles are in the left half plane."""
         return bool(np.all(self.poles.real < 0))
-
-    def response(self, frequency: Array) -> Complex:
-        """Return the frequency response from each exciting input at frequencies in Hz, (n, n_exciting), SI."""
-        w = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) * self.dt)
-        below = np.polynomial.polynomial.polyval(w, self.a)
-        above = np.stack([w**self.nk * np.polynomial.polynomial.polyval(w, row) for row in self.b], axis=-1)
-        out: Complex = above / below[:, None]
-        return out
 
 
 # --- model ------------------------------------------------------------------------------------------------------------
@@ -481,7 +468,7 @@ class LpvModel:
         G = np.zeros((of.n_process - 1, of.n_theta))
         for k in range(of.n_process - 1):
             G[k, of.place(k)] = basis_values(s, of.degree + 1, of.basis)[0]
-        values, (_, _, d, c) = G @ self.theta, of.split(self.theta)
+        values = G @ self.theta
         a, b = np.concatenate([[1.0], values[:na]]), values[na:].reshape(m, nb)
         z = roots_of(a)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -489,10 +476,7 @@ class LpvModel:
             gain = b.sum(axis=1) / a.sum()
             slope = root_derivative(a, z)[:, 1:] / (z * self.dt)[:, None]
         turn = np.lexsort((-poles.imag, -poles.real))
-        found = Frozen(
-            p=float(p), dt=self.dt, nk=of.nk, a=a, b=b, c=np.concatenate([[1.0], c]), d=np.concatenate([[1.0], d]),
-            poles=poles[turn], dc_gain=gain,
-        )  # fmt: skip
+        found = Frozen(a=a, b=b, poles=poles[turn], dc_gain=gain)
         if covariance is None:
             return found
         P = G @ covariance @ G.T
@@ -529,7 +513,7 @@ class LpvModel:
 
     def simulate(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.simulate`."""
-        from ambid.nonlinear.lpv_kernels import free_run
+        from ambid.nonlinear.lagged_kernels import scheduled_run
 
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)
@@ -537,7 +521,7 @@ class LpvModel:
         s = np.zeros(found.size) if column < 0 else self.schedule.scaled(np.asarray(u, dtype=np.float64)[:, column])
         level, size = float(self.y_level[0]), float(self.y_scale[0])
         a, b, _, _ = of.split(self.scaled_theta)
-        free_run(
+        scheduled_run(
             found, of.lagged_inputs(us), np.ascontiguousarray(s), BASES.index(of.basis), head, a, b,
             self.schedule.share(self.dt), (self.schedule.middle - level) / size, self.schedule.half / size,
         )  # fmt: skip

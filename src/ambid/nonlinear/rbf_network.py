@@ -312,7 +312,7 @@ def train_by_sample(
     problem: LaggedProblem, theta: Array, method: str, rate: float, passes: int, tick: Tick | None
 ) -> tuple[Array, LearningCurve]:
     """Train the weights, from zero, by one of the recursions; `rate` is that of the descent, or the least gain mu."""
-    from ambid.nonlinear.rbf_kernels import descent_pass
+    from ambid.nonlinear.lagged_kernels import descent_pass
 
     of, rows = problem.function, problem.rows()
     assert isinstance(of, RbfFunction)

@@ -10,8 +10,8 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
+from ambid.nonlinear.lagged_kernels import descent_pass
 from ambid.nonlinear.rbf import rbf
-from ambid.nonlinear.rbf_kernels import descent_pass
 from ambid.nonlinear.rbf_network import GAUSS_NEWTON, rbf_problem, train_by_sample
 from tests.nonlinear.rbf.systems import bumpy, data, network
 
