@@ -25,8 +25,7 @@ from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged import LaggedFunction, Regressors, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
-    bias_caution,
-    conclude,
+    finish,
     guarded,
     laplace,
     problem_at,
@@ -189,8 +188,7 @@ def hammerstein(
     problem = problem_at(of, data.parts, draft.theta, free=draft.free)
     if failed or not np.isfinite(problem.cost(draft.theta)):
         return failed or fail(NO_WEIGHTS)
-    draft.warnings += bias_caution("hammerstein", records, draft)
-    return conclude(
+    return finish(
         "hammerstein", records, asdict(s), data, draft, problem, laplace(problem, draft.theta), units="lags or powers",
         seed=seed,
     )  # fmt: skip

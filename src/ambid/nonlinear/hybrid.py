@@ -37,7 +37,7 @@ from ambid.nonlinear.hybrid_choice import (
     transfer,
 )
 from ambid.nonlinear.lagged import LaggedModel
-from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, conclude, guarded, laplace
+from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, finish, guarded, laplace
 from ambid.nonlinear.narmax import narmax
 from ambid.nonlinear.polynomial import PolynomialFunction, is_noisy, lagged, term_name
 from ambid.nonlinear.records import Scaled, scaled_records
@@ -209,11 +209,6 @@ def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _
     if not np.isfinite(problem.cost(draft.theta)):
         return failed_fit("hybrid", records, used, seed, _DIVERGED, draft.timing_s)
     found = laplace(problem, draft.theta)
-    if s.ne == 0 and records[0].n_inputs and not all(x.open_loop for x in records):
-        draft.warnings.append(
-            "without a noise model (ne = 0) hybrid is biased under feedback unless the equation error is white: raise "
-            "ne, or say --open-loop if there was no feedback"
-        )
     draft.warnings += _cautions(draft, found)
     spare = _spare_units(of, draft.theta, problem, found)
     draft.details |= _details(records, data, draft, problem)
@@ -221,9 +216,9 @@ def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _
         f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and intervals "
         f"beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
     )
-    return conclude(
+    return finish(
         "hybrid", records, used, data, draft, problem, found, units="neurons or terms", how="laplace",
-        why_not=why_not if spare else "", seed=seed,
+        why_not=why_not if spare else "", noise=s.ne != 0, instead="Raise ne", seed=seed,
     )  # fmt: skip
 
 

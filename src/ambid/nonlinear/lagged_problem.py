@@ -357,44 +357,7 @@ def refine(
         problem = problem_of(draft.theta)
 
 
-def finish(
-    structure: str,
-    records: Sequence[IOData],
-    used: Mapping[str, object],
-    data: Scaled,
-    draft: Draft,
-    problem: LaggedProblem,
-    found: Laplace,
-    *,
-    covariance: Array | None,
-    origin: str,
-    seed: int,
-) -> NonlinearFit:
-    """Return the fit of a draft in SI; `covariance` (n_live, n_live) is scaled, `origin` says where it is from."""
-    began = perf_counter()
-    of, whole = draft.function, None
-    unit = np.broadcast_to(of.unit(data.y_scale, data.u_scale), draft.theta.shape)
-    if covariance is not None:
-        whole = np.zeros((draft.theta.size, draft.theta.size))
-        whole[np.ix_(problem.live, problem.live)] = covariance
-        whole *= unit[:, None] * unit
-    x = np.concatenate([of.training_rows(draft.theta, r) for r in problem.rows()])
-    model = LaggedModel(
-        dt=records[0].dt, function=of, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
-        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=of.ellipsoid),
-    )  # fmt: skip
-    draft.timed("result", began)
-    draft.timing_s["all"] = sum(draft.timing_s.values())
-    if np.any(problem.precision):
-        draft.details = {"effective_parameters": found.effective, **draft.details}
-    return draft.result(
-        structure, records, used, seed, model=model, covariance=whole, covariance_from="" if whole is None else origin,
-        n_estimated=int(np.count_nonzero(problem.live)),
-        noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
-    )  # fmt: skip
-
-
-def cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -> list[str]:
+def _cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -> list[str]:
     """Return what a reader must be told of any lagged model; `units` are what it has too many of."""
     out, taken = [], found.effective / problem.n_errors
     if taken > _CROWDED:
@@ -414,18 +377,18 @@ def cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -
     return out
 
 
-def bias_caution(structure: str, records: Sequence[IOData], draft: Draft) -> list[str]:
+def _bias_caution(structure: str, records: Sequence[IOData], draft: Draft, instead: str) -> list[str]:
     """Return what a reader must be told of a model without a noise model, unless there is no feedback."""
     if not records[0].n_inputs or all(x.open_loop for x in records):
         return []
     what = "the free run" if draft.free else "one-step errors"
     return [
         f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are white, "
-        "and nothing says that these records are open loop. Use narmax or nn, or say --open-loop"
+        f"and nothing says that these records are open loop. {instead}, or say --open-loop"
     ]
 
 
-def conclude(
+def finish(
     structure: str,
     records: Sequence[IOData],
     used: Mapping[str, object],
@@ -438,14 +401,19 @@ def conclude(
     how: str = "auto",
     why_not: str = "",
     sampled: Array | None = None,
+    noise: bool = False,
+    instead: str = "Use narmax or nn",
     seed: int,
 ) -> NonlinearFit:
-    """Return the fit of a draft with the covariance that was asked for, and what a reader must be told.
+    """Return the fit of a draft in SI with the covariance that was asked for, and what a reader must be told.
 
     `units` are what a model has too many of, `how` is the setting ``uncertainty``, `sampled` a covariance by bootstrap;
-    `why_not` says why there are no standard deviations.
+    `why_not` says why there are no standard deviations. Without a `noise` model feedback does harm; `instead` says what
+    to do then.
     """
-    draft.warnings += cautions(draft, problem, found, units)
+    draft.warnings += _cautions(draft, problem, found, units)
+    if not noise:
+        draft.warnings += _bias_caution(structure, records, draft, instead)
     robust = how == "sandwich" or (draft.free and how == "auto")
     origin = "sandwich" if robust else "laplace" if np.any(problem.precision) else "information"
     covariance = sandwiched(problem, draft.theta) if robust and not why_not else found.covariance
@@ -459,10 +427,29 @@ def conclude(
             "Say uncertainty = sandwich"
         )
     elif covariance is None and not why_not:
-        why_not = f"no standard deviations: data and prior do not determine the numbers. Fewer {units}"
+        why_not = (
+            "no standard deviations: data and prior do not determine the numbers (condition number "
+            f"{found.condition:.1e}). Fewer {units}, or more excitation"
+        )
     if why_not:
-        covariance = None
         draft.warnings.append(why_not)
-    return finish(
-        structure, records, used, data, draft, problem, found, covariance=covariance, origin=origin, seed=seed
-    )
+    began, of, whole = perf_counter(), draft.function, None
+    unit = np.broadcast_to(of.unit(data.y_scale, data.u_scale), draft.theta.shape)
+    if covariance is not None and not why_not:
+        whole = np.zeros((draft.theta.size, draft.theta.size))
+        whole[np.ix_(problem.live, problem.live)] = covariance
+        whole *= unit[:, None] * unit
+    x = np.concatenate([of.training_rows(draft.theta, r) for r in problem.rows()])
+    model = LaggedModel(
+        dt=records[0].dt, function=of, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
+        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=of.ellipsoid),
+    )  # fmt: skip
+    draft.timed("result", began)
+    draft.timing_s["all"] = sum(draft.timing_s.values())
+    if np.any(problem.precision):
+        draft.details = {"effective_parameters": found.effective, **draft.details}
+    return draft.result(
+        structure, records, used, seed, model=model, covariance=whole, covariance_from="" if whole is None else origin,
+        n_estimated=int(np.count_nonzero(problem.live)),
+        noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
+    )  # fmt: skip

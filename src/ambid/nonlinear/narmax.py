@@ -17,8 +17,10 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions
+from ambid.nonlinear.blocks import Terms
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, finish, guarded, laplace, sandwiched
+from ambid.nonlinear.lagged import Rows
+from ambid.nonlinear.lagged_problem import Draft, finish, guarded, laplace
 from ambid.nonlinear.narmax_choice import (
     Choice,
     NarmaxSettings,
@@ -244,19 +246,6 @@ def _finish(records: Sequence[IOData], s: NarmaxSettings, data: Scaled, fitting:
     of, theta = fitting.choice.function, fitting.theta
     problem = fitting.choice.problem(data.parts, free=fitting.free).at(theta)
     found = laplace(problem, theta)
-    covariance = found.covariance
-    if covariance is None:
-        fitting.warnings.append(
-            f"the data do not tell the chosen terms apart (condition number {found.condition:.1e}). Lower terms or "
-            "degree, or excite more"
-        )
-    elif fitting.free:
-        covariance = sandwiched(problem, theta)
-    fitting.warnings += _cautions(records, s, problem, fitting)
-    if covariance is None:
-        fitting.warnings.append(
-            "no covariance, and so no standard deviations: the data do not determine the coefficients"
-        )
     terms = {
         records[0].outputs[o]: [
             {"term": term_name(x, of.n_outputs, of.m), "err": fitting.choice.err.get((o, x))} for x in own
@@ -268,32 +257,17 @@ def _finish(records: Sequence[IOData], s: NarmaxSettings, data: Scaled, fitting:
         "levels": data.levels(records[0]),
     }  # fmt: skip
     used = {**asdict(s), "focus": "simulation" if fitting.free else "prediction"}
+    if of.is_rational and any(_vanishes(of.terms_block, theta, of.predict(theta, r)[1]) for r in problem.rows()):
+        fitting.warnings.append(
+            "a denominator comes near zero on the training data: predictions there are not to be trusted"
+        )
     return finish(
-        "narmax", records, used, data, fitting, problem, found, covariance=covariance,
-        origin="sandwich" if fitting.free else "information", seed=seed,
+        "narmax", records, used, data, fitting, problem, found, units="terms", noise=s.ne > 0 and not fitting.free,
+        instead="Say focus = prediction" if fitting.free else "Raise ne", seed=seed,
     )  # fmt: skip
 
 
-def _cautions(records: Sequence[IOData], s: NarmaxSettings, problem: LaggedProblem, fitting: _Fitting) -> list[str]:
-    out, of = [], fitting.choice.function
-    may_be_closed = of.m > 0 and not all(x.open_loop for x in records)
-    if fitting.free and may_be_closed:
-        out.append(
-            "fitted to the free run, narmax is biased where a controller was at work, and nothing says that these "
-            "records are open loop: use focus = prediction, or say --open-loop if there was no feedback"
-        )
-    elif not s.ne and may_be_closed:
-        out.append(
-            "without a noise model (ne = 0) narmax is biased under feedback unless the equation error is white: "
-            "raise ne, or say --open-loop if there was no feedback"
-        )
-    if not fitting.free and not np.isfinite(fitting.choice.cost(problem.parts, free=True)):
-        out.append(
-            "the free run diverges on the records that the model was fitted to: it predicts, but does not simulate. "
-            "Choose terms by simulation (selection or pruning), or lower degree"
-        )
-    block = of.terms_block
-    below = [block.denominators(fitting.theta, of.predict(fitting.theta, r)[1].prepared[0]) for r in problem.rows()]
-    if of.is_rational and any(np.any(np.min(a, axis=0) < _NEAR_ZERO * np.max(np.abs(a), axis=0)) for a in below):
-        out.append("a denominator comes near zero on the training data: predictions there are not to be trusted")
-    return out
+def _vanishes(block: Terms, theta: Array, rows: Rows) -> bool:
+    """Whether a denominator comes near zero."""
+    below = block.denominators(theta, rows.prepared[0])
+    return bool(np.any(np.min(below, axis=0) < _NEAR_ZERO * np.max(np.abs(below), axis=0)))

@@ -30,8 +30,7 @@ from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, la
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
-    bias_caution,
-    conclude,
+    finish,
     guarded,
     laplace,
     problem_at,
@@ -338,9 +337,8 @@ def _finish(
     problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
     if not np.isfinite(problem.cost(draft.theta)):
         return failed_fit("narx", records, used, seed, NO_WEIGHTS, draft.timing_s)
-    draft.warnings += bias_caution("narx", records, draft)
     draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
-    return conclude(
+    return finish(
         "narx", records, used, data, draft, problem, laplace(problem, draft.theta), units="neurons or lags",
         how=s.uncertainty, sampled=spread[0] if spread else None, seed=seed,
     )  # fmt: skip

@@ -26,8 +26,7 @@ from ambid.nonlinear.lagged import LaggedFunction
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
-    bias_caution,
-    conclude,
+    finish,
     guarded,
     laplace,
     refine,
@@ -452,7 +451,7 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
         )
     elif not work.at_optimum:
         why_not = "no standard deviations: the training has not come to an optimum"
-    work.warnings += [*bias_caution("rbf", records, work), *_open(problem, None if why_not else found.covariance)]
+    work.warnings += _open(problem, None if why_not else found.covariance)
     work.details = {
         "condition": found.condition,
         "prior_by_output": work.prior.tolist(),
@@ -460,7 +459,7 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
         "held_out_rms": work.held_out,
         **work.details,
     }
-    return conclude(
+    return finish(
         "rbf", records, used, data, work, problem, found, units="units or lags", how=s.uncertainty, why_not=why_not,
         seed=seed,
     )  # fmt: skip
