@@ -195,7 +195,7 @@ class OnlineThreeBlocks:
         both = unit * self._at.units[keep]
         covariance = self._sums.covariance()[np.ix_(keep, keep)] * np.outer(both, both)
         sd = np.sqrt(np.diag(covariance))
-        behind = abs(theta[1] - self._at.a) > 3 * sd[1] or abs(theta[3] - self._at.b) > 3 * sd[3]
+        behind = bool((np.abs(theta - self._at.at)[[1, 3]] > 3 * sd[[1, 3]]).any())
         fit = self._sums.fit()
         return blocks_of(
             theta[keep] * unit,
@@ -323,8 +323,8 @@ class OnlineThreeBlocks:
         slowest = 1.0 / (_WARM_UP * self._dt)
         f = min(max(abs(c), slowest), 3.0 / self._dt)
         self._at = Linearisation(
-            ka=ka, a=a, kb=kb, b=b, off_i=0.0, kc=kc, c=c, off_x=0.0, size_a=a, size_b=b, f=f
-        )  # fmt: skip
+            at=np.array([ka, a, kb, b, 0.0, kc, c, 0.0]), units=np.array([a, a, b, b, 1.0, f, f, 1.0])
+        )
         if self._prefilter is None:
             self._prefilter = ScalarKalman(1.0 / self._dt, q=(_CORNER * a) ** 2, r=1.0)
         self._filter = self._prefilter.anew(4)
@@ -377,75 +377,51 @@ class OnlineThreeBlocks:
             self._constants = self._at.constants(self._dt, least_squares=not self._instruments)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Linearisation:
     """Where the regressions are linearised, in scaled signals."""
 
-    ka: float  # gains in 1/s, poles in rad/s, constants
-    a: float
-    kb: float
-    b: float
-    off_i: float
-    kc: float
-    c: float
-    off_x: float
-    size_a: float  # magnitudes in rad/s by which gain and pole of the two blocks of the current are measured
-    size_b: float
-    f: float  # pole by which the equation of the position is divided, rad/s; also its magnitude
+    # (8,), K_a, a, K_b, b and a constant, K_c, c and a constant; gains in 1/s, poles in rad/s
+    at: Array
+    # (8,), by which the coefficients are measured; that of K_c is the pole by which the equation of the position is
+    # divided, rad/s
+    units: Array
 
     @property
     def theta(self) -> tuple[Array, Array]:
         """Coefficients of the two regressions, shapes (5,) and (3,)."""
-        a, b, f = self.size_a, self.size_b, self.f
-        return (
-            np.array([self.ka / a, self.a / a, self.kb / b, self.b / b, self.off_i]),
-            np.array([self.kc / f, self.c / f, self.off_x]),
-        )
-
-    @property
-    def units(self) -> Array:
-        """Of the eight coefficients, shape (8,)."""
-        a, b, f = self.size_a, self.size_b, self.f
-        return np.array([a, a, b, b, 1.0, f, f, 1.0])
+        whole = self.at / self.units
+        return whole[:5], whole[5:]
 
     def constants(self, dt: float, *, least_squares: bool) -> Array:
-        """Numbers that the compiled filters want.
-
-        `dt`: sampling period, s; `least_squares`: whether the regressors are their own instruments. Returns (27,).
-        """
-        in_loop = self.b + self.c > 0 and self.b * self.c > self.kb * self.kc
+        """Numbers that the compiled filters want, shape (27,); the regressors may be their own instruments."""
+        _, a, kb, b, _, kc, c, _ = self.at.tolist()
+        f = float(self.units[5])
+        in_loop = b + c > 0 and b * c > kb * kc
         # instruments have to be bounded: an unstable loop is opened, and a block that runs away is turned round
-        c, back = (self.c, self.kb) if in_loop else (abs(self.c), 0.0)
-        lags = [_lag(p, dt) for p in (self.a, self.b, self.f, c)]
-        loop = 1.0 / (1.0 - self.kc * lags[3][1] * back * lags[1][1])
-        hold = -expm1(-self.a * dt) / self.a
-        filters = [lags[0][0], hold, *lags[0][1:], *lags[1], *lags[2], *lags[3]]
-        here = [self.ka, self.a, self.kb, self.b, self.off_i, self.kc, self.c, self.off_x]
-        return np.array([*filters, *here, self.size_a, self.size_b, self.f, back, loop, float(least_squares)])
+        c, back = (c, kb) if in_loop else (abs(c), 0.0)
+        lags = [_lag(p, dt) for p in (a, b, f, c)]
+        loop = 1.0 / (1.0 - kc * lags[3][1] * back * lags[1][1])
+        filters = [lags[0][0], -expm1(-a * dt) / a, *lags[0][1:], *lags[1], *lags[2], *lags[3]]
+        return np.array([*filters, *self.at, *self.units[[0, 2, 5]], back, loop, float(least_squares)])
 
     def moved(self, theta: Array, sd: Array, dt: float) -> tuple[Linearisation, float]:
-        """Go to new estimates, as far as they are known well enough to filter with.
+        """Go to new estimates (8,), as far as their standard deviations let filter with them.
 
-        `theta`, `sd`: (8,), coefficients of both regressions, and standard deviations; `dt`: sampling period, s.
-        Returns weight that is left to what was linearised here: a step d of a pole p leaves an error of d²/(2 p).
+        Returns also what weight is left to what was linearised here: a step d of a pole p leaves an error of d²/(2 p).
         """
-        ka, a, kb, b, off_i, kc, c, off_x = (theta * self.units).tolist()
-        sd = sd * self.units
-        new, keep = replace(self, off_i=off_i, off_x=off_x), 1.0
-        for gain, pole, at, now, spread in (("ka", "a", self.a, a, sd[1]), ("kb", "b", self.b, b, sd[3])):
-            if spread < _ADOPTED * abs(now) and 0 < now * dt < 20:
-                step = max(1.0, 2 * abs(now - at) / at)
-                before, moved = getattr(self, gain), at + (now - at) / step
-                goal = ka if gain == "ka" else kb
-                new = replace(new, **{gain: before + (goal - before) / step, pole: moved})
-                keep = min(keep, _weight(moved - at, at, spread))
-        if sd[5] < _ADOPTED * abs(kc):
-            new = replace(new, kc=kc, c=c)
-        return new, keep
-
-
-def _weight(step: float, pole: float, sd: float) -> float:
-    return float(1.0 / (1.0 + (step * step / (2 * pole) / (_CURVED * sd)) ** 2))
+        now, spread = theta * self.units, sd * self.units
+        new, keep = self.at.copy(), 1.0
+        new[[4, 7]] = now[[4, 7]]
+        for k in (0, 2):  # gain and pole of the two blocks of the current
+            pole, goal = float(self.at[k + 1]), float(now[k + 1])
+            if spread[k + 1] < _ADOPTED * abs(goal) and 0 < goal * dt < 20:
+                new[k : k + 2] += (now[k : k + 2] - self.at[k : k + 2]) / max(1.0, 2 * abs(goal - pole) / pole)
+                left = (new[k + 1] - pole) ** 2 / (2 * pole) / (_CURVED * spread[k + 1])
+                keep = min(keep, float(1.0 / (1.0 + left**2)))
+        if spread[5] < _ADOPTED * abs(now[5]):
+            new[5:7] = now[5:7]
+        return replace(self, at=new), keep
 
 
 def _lag(pole: float, dt: float) -> tuple[float, float, float]:
