@@ -103,10 +103,16 @@ def _filters() -> Iterator[Job]:
     for peer, program in (("filterpy", "filterpy"), ("statsmodels, compiled", "statsmodels")):
         yield filter_job(name, lambda: KalmanFilter(model, start_covariance=P0), peer, program, plain)
     thesis = linear_state([[1.0]], [[1.0]], [[60.0 / RATE]], [[RATE]])
-    bucy = {"A": [[1.0]], "C": [[1.0]], "Q": [[60.0 / RATE]], "R": [[RATE]], "P0": [[RATE]]}
+    bucy = {
+        "A": [[1.0]],
+        "C": [[1.0]],
+        "Q": [[60.0 / RATE]],
+        "R": [[RATE]],
+        "P0": KalmanFilter(thesis).covariance.tolist(),
+    }
     yield filter_job(
         "Kalman-Bucy filter of the thesis, discrete",
-        lambda: KalmanFilter(thesis, start_covariance=[[RATE]]),
+        lambda: KalmanFilter(thesis),
         "filterpy", "filterpy", bucy,
     )  # fmt: skip
 
