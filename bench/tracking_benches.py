@@ -69,10 +69,11 @@ def preset_bench() -> TrackBench:
 @cache
 def _amplitude() -> float:
     """What `ambid scenario` chooses, once for all seeds."""
-    from ambid.simulate.scenarios import Bench
+    from ambid.simulate.rig_bench import Bench
+    from ambid.simulate.scenarios import amplitude_for, one_period
 
     b = Bench.of(preset("unstable-bearing"), None, None)
-    return b.largest(b.persistent(1), 1)
+    return amplitude_for(b, one_period(b, 1), 1)
 
 
 def second_bench() -> TrackBench:
@@ -110,7 +111,7 @@ def second_bench() -> TrackBench:
 
 
 def _variation(scenario: str, bench: Preset, at_s: float, seconds: float) -> Variation:
-    from ambid.simulate.scenarios import Bench
+    from ambid.simulate.rig_bench import Bench
     from ambid.simulate.scenarios import scenario as named
 
     found, b = named(scenario), Bench.of(bench, None, None)

@@ -16,7 +16,7 @@ from ambid.nonlinear.state_network import ONE_AXIS, Layout, StateNetwork, StateP
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate.bench import simulate_preset
+from ambid.simulate import simulate_preset
 from tests.nonlinear.systems import smooth
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,10 +16,9 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.arrays import Array
-    from ambid.physics.loop import Limits
-    from ambid.physics.nonlinear import OperatingPoint
     from ambid.physics.presets import Preset
     from ambid.simulate import Simulation
+    from ambid.simulate.rig_bench import Bench
 
 _ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
@@ -93,14 +91,18 @@ def command(
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(source) as outputs, progress("simulate"):
         outputs.claim(record, "-o", _ENDINGS)
-        respond, by_role, limits, point = _bench(preset, source, rate, seed, closed, nonlinear, position)
-        rate_hz = respond.keywords["rate_hz"]
+        bench = _bench(rig, rate, closed, nonlinear, position)
+        rate_hz = bench.rate_hz
         n = _samples(duration, rate_hz)
         shape = _repeat(
             lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
         )
-        peak = _largest(by_role, shape, limits, point) if amplitude is None else amplitude
-        done = respond(peak * shape)
+        if amplitude is None and bench.rig is not None and bench.rig.limits is None:
+            raise AmbidError(
+                "no amplitude is given, and the rig has no limits to find one from. Give --amplitude A in V"
+            )
+        peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
+        done = bench.simulate(peak * shape, seed=seed)
         if log_excitation:
             logged = Channel(name="excitation", unit="V", values=peak * shape)
             done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
@@ -120,46 +122,22 @@ def _refuse(of: str, given: Mapping[str, object]) -> None:
             raise AmbidError(f"{of} has no {name}. Leave {name} out")
 
 
-def _bench(
-    preset: Preset | None,
-    path: Path | None,
-    rate: float | None,
-    seed: int,
-    closed: bool | None,
-    nonlinear: bool,
-    position: float | None,
-) -> tuple[partial[Simulation], partial[Simulation], Limits | None, OperatingPoint | None]:
-    """Return what answers to an excitation, in columns and by role, with its limits and where it stands."""
+def _bench(rig: str, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
+    """Return the bench of a preset or a rig file, its rotor held at a position where one is given."""
     from ambid.rig import load_rig
-    from ambid.simulate import simulate_preset, simulate_rig
-    from ambid.simulate.rig_bench import parts_of_rig
+    from ambid.simulate.rig_bench import Bench
 
+    preset = preset_of(rig)
     if preset is not None:
         if position is not None and preset.plant is not None:
             preset = replace(preset, operating_point=preset.plant.equilibrium(position))
-        rate_hz = preset.rate_hz if rate is None else rate
-        respond = partial(simulate_preset, preset, seed=seed, rate_hz=rate_hz, closed=closed, nonlinear=nonlinear)
-        return respond, respond, preset.limits, preset.operating_point
-    assert path is not None
-    rig = load_rig(path)
+        return Bench.of(preset, rate, preset.usually_closed if closed is None else closed, nonlinear=nonlinear)
+    found = load_rig(Path(rig))
     if position is not None:
-        rig = replace(rig, operating_point={**rig.operating_point, "position": position})
-    known = rig.record.rate_hz if rate is None else rate
-    if known is None:
-        raise AmbidError(f"rig {path} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
-    respond = partial(simulate_rig, rig, rate_hz=known, seed=seed, closed=closed, nonlinear=nonlinear)
-    point = parts_of_rig(rig, closed, nonlinear=nonlinear)[2]
-    return respond, partial(respond, columns=False), rig.limits, point
-
-
-def _largest(
-    respond: Callable[[Array], Simulation], shape: Array, limits: Limits | None, point: OperatingPoint | None
-) -> float:
-    from ambid.simulate import largest_amplitude
-
-    if limits is None:
-        raise AmbidError("no amplitude is given, and the rig has no limits to find one from. Give --amplitude A in V")
-    return float(f"{largest_amplitude(respond, shape, limits=limits, operating_point=point, fraction=_FRACTION):.3g}")
+        found = replace(found, operating_point={**found.operating_point, "position": position})
+    if rate is None and found.record.rate_hz is None:
+        raise AmbidError(f"rig {Path(rig)} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
+    return Bench.of(found, rate, closed, nonlinear=nonlinear)
 
 
 def _samples(duration: float, rate_hz: float) -> int:

@@ -9,7 +9,6 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.simulate.bench import Simulation as Simulation
     from ambid.simulate.bench import simulate as simulate
-    from ambid.simulate.bench import simulate_preset as simulate_preset
     from ambid.simulate.levels import largest_amplitude as largest_amplitude
     from ambid.simulate.levels import noise_at_snr as noise_at_snr
     from ambid.simulate.lost_samples import Loss as Loss
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from ambid.simulate.plant import closed_loop_matrix as closed_loop_matrix
     from ambid.simulate.plant import closed_loop_poles as closed_loop_poles
     from ambid.simulate.rig_bench import plant_of_rig as plant_of_rig
+    from ambid.simulate.rig_bench import simulate_preset as simulate_preset
     from ambid.simulate.rig_bench import simulate_rig as simulate_rig
     from ambid.simulate.scenario_run import ScenarioBlock as ScenarioBlock
     from ambid.simulate.scenario_run import scenario_blocks as scenario_blocks

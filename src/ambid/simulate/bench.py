@@ -21,9 +21,7 @@ from numpy.typing import ArrayLike
 from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
-from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.plant import LinearPlant, Standing, closed_loop_poles, nonlinear_truth
 from ambid.simulate.variation import Pieces, Tables, Variation, check_variation
@@ -163,73 +161,6 @@ def simulate(
         operating_point=operating_point, start=start, substeps=substeps, current_offset=current_offset,
     )  # fmt: skip
     return join(running, [running.advance(u, setpoint)], seed)
-
-
-def simulate_preset(
-    preset: Preset,
-    excitation: ArrayLike,
-    *,
-    seed: int | np.random.Generator,
-    rate_hz: float | None = None,
-    closed: bool | None = None,
-    nonlinear: bool = False,
-    noise: Noise | None = None,
-    setpoint: ArrayLike | None = None,
-    substeps: int = 1,
-) -> Simulation:
-    """Simulate a named bench with its own loop, limits and noise.
-
-    Parameters
-    ----------
-    preset : Preset
-        See `ambid.physics.presets.preset`.
-    excitation : array_like, shape (n_samples,), in V
-        Added at the controller's output.
-    seed : int or numpy.random.Generator
-        Seed of the noise.
-    rate_hz : float, optional
-        Sampling rate in Hz; default the preset's, for which its loop is designed.
-    closed : bool, optional
-        Closed or open loop; default the preset's usual way.
-    nonlinear : bool
-        Simulate the nonlinear plant instead of the linear one.
-    noise : Noise, optional
-        Default the preset's.
-    setpoint : array_like, shape () or (n_samples,), in m, optional
-        Wanted position; default the operating point's.
-    substeps : int
-        Runge-Kutta steps in each sample (nonlinear only).
-
-    Returns
-    -------
-    Simulation
-        The record and what happened.
-
-    Raises
-    ------
-    ModelError
-        If the preset has no nonlinear plant, or as `simulate`.
-    """
-    plant: LinearPlant | NonlinearPlant | None = preset.plant
-    if not nonlinear:
-        plant = LinearPlant(model=model(preset.model), parameters=preset.parameters)
-    if plant is None:
-        raise ModelError(
-            f"preset {preset.name!r} has no nonlinear plant; it is linear only. Simulate it with nonlinear=False"
-        )
-    loop = preset.loop if (preset.usually_closed if closed is None else closed) else preset.loop.opened()
-    return simulate(
-        plant,
-        excitation,
-        rate_hz=preset.rate_hz if rate_hz is None else rate_hz,
-        seed=seed,
-        loop=loop,
-        limits=preset.limits,
-        noise=preset.noise if noise is None else noise,
-        operating_point=preset.operating_point,
-        setpoint=setpoint,
-        substeps=substeps,
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

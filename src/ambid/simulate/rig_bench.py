@@ -6,23 +6,25 @@ Magnet, gravity, eddy pole, stage and offsets are those that ``ambid identify --
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
-from ambid.errors import RigError
+from ambid.errors import ModelError, RigError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
-from ambid.physics.loop import Loop
+from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import IDEAL, PowerStage
+from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.bench import Simulation, simulate
+from ambid.simulate.levels import largest_amplitude
 from ambid.simulate.plant import LinearPlant
 from ambid.units import parse_unit
 
@@ -215,38 +217,141 @@ def simulate_rig(
     ModelError
         As `ambid.simulate.simulate`.
     """
-    plant, loop, point = parts_of_rig(rig, closed, nonlinear=nonlinear)
-    if isinstance(plant, NonlinearPlant) and substeps is None:
-        substeps = enough_steps(plant, point, rate_hz)
-    done = simulate(
-        plant,
-        excitation,
-        rate_hz=rate_hz,
-        seed=seed,
-        loop=loop,
-        limits=rig.limits,
-        noise=rig.noise,
-        operating_point=point,
-        setpoint=setpoint,
-        substeps=substeps or 1,
-        current_offset=current_offset(rig) if nonlinear else 0.0,
-    )
-    if not columns:
-        return done
-    wanted = np.broadcast_to(
-        np.asarray(point.position if setpoint is None else setpoint, dtype=np.float64), done.record.n_samples
-    )
-    return replace(done, record=as_columns(done.record, rig, wanted))
+    bench = Bench.of(rig, rate_hz, closed, nonlinear=nonlinear)
+    return bench.simulate(excitation, seed=seed, setpoint=setpoint, substeps=substeps, columns=columns)
 
 
-@overload
-def parts_of_rig(
-    rig: Rig, closed: bool | None, *, nonlinear: Literal[False] = False
-) -> tuple[LinearPlant, Loop | None, OperatingPoint]: ...
-@overload
-def parts_of_rig(
-    rig: Rig, closed: bool | None, *, nonlinear: bool
-) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]: ...
+def simulate_preset(
+    preset: Preset,
+    excitation: ArrayLike,
+    *,
+    seed: int | np.random.Generator,
+    rate_hz: float | None = None,
+    closed: bool | None = None,
+    nonlinear: bool = False,
+    noise: Noise | None = None,
+    setpoint: ArrayLike | None = None,
+    substeps: int = 1,
+) -> Simulation:
+    """Simulate a named bench with its own loop, limits and noise.
+
+    Parameters
+    ----------
+    preset : Preset
+        See `ambid.physics.presets.preset`.
+    excitation : array_like, shape (n_samples,), in V
+        Added at the controller's output.
+    seed : int or numpy.random.Generator
+        Seed of the noise.
+    rate_hz : float, optional
+        Sampling rate in Hz; default the preset's, for which its loop is designed.
+    closed : bool, optional
+        Closed or open loop; default the preset's usual way.
+    nonlinear : bool
+        Simulate the nonlinear plant instead of the linear one.
+    noise : Noise, optional
+        Default the preset's.
+    setpoint : array_like, shape () or (n_samples,), in m, optional
+        Wanted position; default the operating point's.
+    substeps : int
+        Runge-Kutta steps in each sample (nonlinear only).
+
+    Returns
+    -------
+    Simulation
+        The record and what happened.
+
+    Raises
+    ------
+    ModelError
+        If the preset has no nonlinear plant, or as `simulate`.
+    """
+    bench = Bench.of(preset, rate_hz, preset.usually_closed if closed is None else closed, nonlinear=nonlinear)
+    bench = bench if noise is None else replace(bench, noise=noise)
+    return bench.simulate(excitation, seed=seed, setpoint=setpoint, substeps=substeps)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """Plant, loop and what stands around them; `rig` is where the columns of a record are named, if there is one."""
+
+    name: str
+    plant: LinearPlant | NonlinearPlant
+    loop: Loop
+    limits: Limits
+    noise: Noise
+    point: OperatingPoint
+    rate_hz: float
+    rig: Rig | None = None
+
+    @classmethod
+    def of(cls, source: Preset | Rig, rate_hz: float | None, closed: bool | None, *, nonlinear: bool = False) -> Bench:
+        """Return the bench of a preset, closed unless `closed` is False, or of a rig as its records are taken."""
+        if isinstance(source, Preset):
+            plant: LinearPlant | NonlinearPlant | None = source.plant
+            if not nonlinear:
+                plant = LinearPlant(model=model(source.model), parameters=source.parameters)
+            if plant is None:
+                raise ModelError(
+                    f"preset {source.name!r} has no nonlinear plant; it is linear only. Simulate it with"
+                    " nonlinear=False"
+                )
+            loop = source.loop.opened() if closed is False else source.loop
+            return cls(
+                name=source.name, plant=plant, loop=loop, limits=source.limits, noise=source.noise,
+                point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
+            )  # fmt: skip
+        plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
+        rate = source.record.rate_hz if rate_hz is None else rate_hz
+        if rate is None:
+            raise RigError(
+                f"rig {source.name!r} names no rate; a simulation needs one. Give the rate, or record.rate_hz"
+            )
+        return cls(
+            name=source.name, plant=plant, loop=found or Loop(), limits=source.limits or Limits(),
+            noise=source.noise or Noise(), point=point, rate_hz=rate, rig=source,
+        )  # fmt: skip
+
+    @property
+    def linear(self) -> LinearPlant:
+        """The plant of a linear bench."""
+        assert isinstance(self.plant, LinearPlant)
+        return self.plant
+
+    def simulate(
+        self,
+        excitation: ArrayLike,
+        *,
+        seed: int | np.random.Generator,
+        setpoint: ArrayLike | None = None,
+        substeps: int | None = None,
+        columns: bool = True,
+    ) -> Simulation:
+        """Simulate the bench, a rig's in its own columns unless told otherwise."""
+        offset = 0.0
+        if self.rig is not None and isinstance(self.plant, NonlinearPlant):
+            substeps = enough_steps(self.plant, self.point, self.rate_hz) if substeps is None else substeps
+            offset = current_offset(self.rig)
+        done = simulate(
+            self.plant, excitation, rate_hz=self.rate_hz, seed=seed, loop=self.loop, limits=self.limits,
+            noise=self.noise, operating_point=self.point, setpoint=setpoint, substeps=substeps or 1,
+            current_offset=offset,
+        )  # fmt: skip
+        if self.rig is None or not columns:
+            return done
+        wanted = np.asarray(self.point.position if setpoint is None else setpoint, dtype=np.float64)
+        record = as_columns(done.record, self.rig, np.broadcast_to(wanted, done.record.n_samples))
+        return replace(done, record=record)
+
+    def largest(self, shape: Array, seed: int, fraction: float) -> float:
+        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits."""
+        found = largest_amplitude(
+            lambda u: self.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
+            operating_point=self.point, fraction=fraction,
+        )  # fmt: skip
+        return float(f"{found:.3g}")
+
+
 def parts_of_rig(
     rig: Rig, closed: bool | None, *, nonlinear: bool = False
 ) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]:

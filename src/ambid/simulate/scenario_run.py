@@ -17,8 +17,8 @@ from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulate.bench import TRUE, Simulation, Stretch, VaryingLoop, join
 from ambid.simulate.lost_samples import losses
-from ambid.simulate.rig_bench import as_columns
-from ambid.simulate.scenarios import Bench, Scenario, scenario
+from ambid.simulate.rig_bench import Bench, as_columns
+from ambid.simulate.scenarios import Scenario, amplitude_for, input_room, one_period, scenario
 
 if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
     from ambid.rig.rig import Rig
@@ -119,7 +119,7 @@ def simulate_scenario(
     done = join(run.running, stretches, seed)
     record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(run.settings())))
     if log_excitation:
-        unit = run.bench.plant.model.units[run.bench.plant.model.inputs[0]]
+        unit = run.bench.linear.model.units[run.bench.linear.model.inputs[0]]
         logged = Channel(name="excitation", unit=unit, values=np.concatenate(excitations))
         record = replace(record, channels=(*record.channels, logged))
     if run.bench.rig is not None:
@@ -200,7 +200,8 @@ class _Run:
         closed: bool | None,
     ) -> None:
         self.scenario = scenario(name) if isinstance(name, str) else name
-        self.bench = b = Bench.of(bench, rate_hz, closed)
+        always = closed is None and isinstance(bench, Preset)
+        self.bench = b = Bench.of(bench, rate_hz, True if always else closed)
         self.seed, self.duration_s = seed, self.scenario.duration_s if duration_s is None else duration_s
         if not (math.isfinite(b.rate_hz) and b.rate_hz > 0.0):
             raise ModelError(f"rate_hz is {b.rate_hz}; it must be positive. Correct it")
@@ -233,17 +234,17 @@ class _Run:
     def _prepare_excitation(self, amplitude: float | None) -> None:
         b = self.bench
         if self.scenario.excited:
-            shape = b.persistent(self.seed)
-            self.amplitude = b.largest(shape, self.seed) if amplitude is None else amplitude
+            shape = one_period(b, self.seed)
+            self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
             self._period = self.amplitude * shape
         if self.scenario.driven:
-            room = b.input_room
+            room = input_room(b)
             if not math.isfinite(room):
                 raise ModelError(
-                    f"bench {b.name!r} does not limit its {b.plant.model.inputs[0]}; nothing can saturate. Set"
+                    f"bench {b.name!r} does not limit its {b.linear.model.inputs[0]}; nothing can saturate. Set"
                     " loop.limits, or choose another scenario"
                 )
-            self._extra = self.size * room * b.fast(self.seed + 1)
+            self._extra = self.size * room * one_period(b, self.seed + 1, fast=True)
 
     @property
     def first_sample(self) -> int:
@@ -287,7 +288,7 @@ def _blocks(run: _Run, block: int) -> Iterator[ScenarioBlock]:
 
 
 def _signals(run: _Run, stretch: Stretch, excitation: Array) -> dict[str, Array]:
-    of = run.bench.plant.model
+    of = run.bench.linear.model
     found = {of.inputs[0]: stretch.command}
     found.update({o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)})
     found["excitation"] = excitation
