@@ -1,5 +1,7 @@
 """Monte Carlo: frequency response estimates are unbiased and scatter as their variances state."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -74,6 +76,12 @@ def local_with_reference(rng):
     return frf_local(u[200:], y[200:], 1.0, r=r[200:], free=12)
 
 
+@cache
+def runs(estimate):
+    rng = np.random.default_rng(7)
+    return [estimate(rng) for _ in range(RUNS)]
+
+
 @pytest.mark.parametrize(
     ("estimate", "plant"),
     [
@@ -91,8 +99,7 @@ def local_with_reference(rng):
     ids=lambda x: x.__name__ if callable(x) else "at",
 )
 def test_the_estimate_is_unbiased_and_its_variance_true(estimate, plant):
-    rng = np.random.default_rng(7)
-    found = [estimate(rng) for _ in range(RUNS)]
+    found = runs(estimate)
     truth = response(*plant, found[0].frequency_hz)[:, None, None]
     error = np.stack([f.G for f in found]) - truth
     variance = np.mean(np.abs(error - error.mean(axis=0)) ** 2, axis=0)
@@ -104,9 +111,8 @@ def test_the_estimate_is_unbiased_and_its_variance_true(estimate, plant):
 
 
 def test_variance_of_what_is_fitted_to_all_lines_is_foretold():
-    rng = np.random.default_rng(8)
     for estimate in (h1, local):
-        found = [estimate(rng) for _ in range(RUNS)]
+        found = runs(estimate)
         truth = response(B, A, found[0].frequency_hz)[:, None, None]
         weight = 1 / np.mean([f.sd**2 for f in found], axis=0)
         mean = np.array([np.sum(weight * (f.G - truth)) for f in found]) / np.sum(weight)
