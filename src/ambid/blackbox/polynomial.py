@@ -14,7 +14,6 @@ from ambid.blackbox.polynomial_predictor import (
     ScaledData,
     coefficient_units,
     fixed_places,
-    layout_of,
     liveliest_part,
     predictor,
     read_orders,
@@ -103,27 +102,20 @@ def estimate(
     `fixed`: known coefficients, by the names of `PolynomialModel.names`, in SI; `tick`: called before each look at the
     data; `at_rest`: the record begins at rest at zero.
     """
-    read = read_orders(name, data, orders)
+    given, free_delay = read_orders(name, data, orders, at_rest=at_rest)
     scaled = scale_data(name, data, at_rest=at_rest)
     with one_thread():
-        layouts = _layouts(name, read, scaled, 0 if data.open_loop else 1, tick)
+        layouts = [given] * data.n_outputs
+        if free_delay:
+            layouts = _layouts(name, given, scaled, 0 if data.open_loop else 1, tick)
         known = fixed_places(name, tuple(layouts), {} if fixed is None else fixed)
         layouts = [replace(x, fixed=tuple(k)) if k else x for x, k in zip(layouts, known, strict=True)]
         fits = [fit_output(name, x, scaled, o, known[o], tick) for o, x in enumerate(layouts)]
-        return polynomial_fit(name, data, scaled, layouts, fits, estimated_delay="nk" in read and read["nk"] is None)
+        return polynomial_fit(name, data, scaled, layouts, fits, estimated_delay=free_delay)
 
 
-def _layouts(
-    name: str,
-    read: Mapping[str, int | tuple[int, ...] | None],
-    scaled: ScaledData,
-    least: int,
-    tick: Callable[[], None] | None,
-) -> list[Layout]:
-    """Orders of every output, delays estimated where none were given."""
-    n_u, n_y = scaled.u.shape[0], scaled.y.shape[0]
-    if "nk" not in read or read["nk"] is not None:
-        return [layout_of(read, n_u, at_rest=scaled.at_rest)] * n_y
+def _layouts(name: str, given: Layout, scaled: ScaledData, least: int, tick: Callable[[], None] | None) -> list[Layout]:
+    """Layouts of all outputs with delays estimated."""
     piece = liveliest_part(scaled.u)
     part = replace(
         scaled,
@@ -133,11 +125,11 @@ def _layouts(
     )
     rows = part.y.shape[1]
     out: list[Layout] = []
-    for o in range(n_y):
+    for o in range(scaled.y.shape[0]):
         nk = long_delays(name, scaled.y[o], scaled.u, least, at_rest=scaled.at_rest)
-        layout = layout_of({**read, "nk": nk}, n_u, at_rest=part.at_rest)
+        layout = replace(given, nk=nk, at_rest=part.at_rest)
         loss = _loss(fit_output(name, layout, part, o, {}, tick))
-        for i in range(n_u):  # the structure itself decides between neighbours, where they clearly differ
+        for i in range(given.n_inputs):  # the structure itself decides between neighbours, where they clearly differ
             for k in (nk[i] - 1, nk[i] + 1):
                 near = replace(layout, nk=(*layout.nk[:i], k, *layout.nk[i + 1 :]))
                 if k >= least:

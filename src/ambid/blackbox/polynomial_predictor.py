@@ -34,8 +34,6 @@ from ambid.errors import EstimationError, nearest
 
 Key = tuple[str, int | None]
 
-_PER_INPUT = ("nb", "nk", "nf")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
@@ -150,49 +148,34 @@ def _free(layout: Layout) -> NDArray[np.int64]:
     return out
 
 
-def read_orders(name: str, data: IOData, orders: Orders) -> dict[str, int | tuple[int, ...] | None]:
-    """Check orders against structure and data; nk is None where it is to be estimated.
+def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = False) -> tuple[Layout, bool]:
+    """Check orders against structure and data; return the layout, and whether the delay is left open (nk is then 0).
 
     `name`: structure.
     """
-    known = structure(name).orders
+    known, n_u = structure(name).orders, data.n_inputs
     _check_inputs(name, data)
     check_order_names(name, orders, known, [key for key in known if key != "nk"])
-    found: dict[str, int | tuple[int, ...] | None] = {}
-    for key in known:
-        if key == "nk" and left_open(orders, key):
-            found[key] = None
-        elif key in _PER_INPUT:
-            found[key] = order_per_input(name, orders, key, 1 if key == "nb" else 0, data.n_inputs)
-        else:
-            found[key] = single_order(name, orders, key, 0)
-    if not any(found[key] for key in known if key != "nk"):
-        raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
-    return found
-
-
-def layout_of(orders: Mapping[str, int | tuple[int, ...] | None], n_inputs: int, *, at_rest: bool = False) -> Layout:
-    """Return the layout of checked orders.
-
-    `orders`: of `read_orders`, nk a number for each input by now.
-    """
+    free_delay = "nk" in known and left_open(orders, "nk")
 
     def one(key: str) -> int:
-        value = orders.get(key, 0)
-        return value if isinstance(value, int) else 0
+        return single_order(name, orders, key, 0) if key in known else 0
 
-    def each(key: str) -> tuple[int, ...]:
-        value = orders.get(key)
-        return value if isinstance(value, tuple) else (0,) * n_inputs
+    def each(key: str, least: int = 0) -> tuple[int, ...]:
+        return order_per_input(name, orders, key, least, n_u) if key in known else (0,) * n_u
 
-    return _layout(one("na"), each("nb"), one("nc"), one("nd"), each("nf"), each("nk"), at_rest)
-
-
-@lru_cache(maxsize=256)
-def _layout(
-    na: int, nb: tuple[int, ...], nc: int, nd: int, nf: tuple[int, ...], nk: tuple[int, ...], at_rest: bool
-) -> Layout:
-    return Layout(na=na, nb=nb, nc=nc, nd=nd, nf=nf, nk=nk, at_rest=at_rest)  # fixed: see `fixed_places`
+    layout = Layout(
+        na=one("na"),
+        nb=each("nb", 1),
+        nc=one("nc"),
+        nd=one("nd"),
+        nf=each("nf"),
+        nk=(0,) * n_u if free_delay else each("nk"),
+        at_rest=at_rest,
+    )
+    if not layout.free.size:
+        raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
+    return layout, free_delay
 
 
 def compact_orders(name: str, layout: Layout) -> UsedOrders:

@@ -19,7 +19,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.polynomial_model import PolynomialModel
-from ambid.blackbox.polynomial_predictor import compact_orders, layout_of, read_orders
+from ambid.blackbox.polynomial_predictor import compact_orders, read_orders
 from ambid.blackbox.response import Offsets
 from ambid.blackbox.structures import structure as structure_named
 from ambid.errors import EstimationError
@@ -106,10 +106,9 @@ class RecursivePolynomial:
         inputs = tuple(f"u{i}" for i in range(n_u)) if n_u != 1 else ("u",)
         units = dict.fromkeys((*inputs, "y"), "1")
         data = IOData(u=u, y=y, dt=dt, inputs=inputs, outputs=("y",), units=units)
-        read = read_orders(structure, data, orders)
-        if "nk" in read and read["nk"] is None:
+        layout, free_delay = read_orders(structure, data, orders)
+        if free_delay:
             raise EstimationError(f"{structure}: nk is not given; a delay is not looked for on-line. Give nk=1, say")
-        layout = layout_of(read, n_u)
         who = Identity(structure=structure, layout=layout, dt=dt, inputs=inputs, outputs=("y",), units=units)
         self._prepare(who, forgetting, open_loop=open_loop)
         need = 10 * (layout.n_theta + layout.first_row)
