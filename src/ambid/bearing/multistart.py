@@ -26,6 +26,7 @@ Delay = float | Literal["auto"]
 MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
 FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
+_REGRESSED = 1 << 17  # samples that start values are regressed from
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
 _KEPT = 6  # candidates scored on the whole record
@@ -121,7 +122,8 @@ def _scored(
 ) -> list[Candidate]:
     """Return the best candidates of all bands and delays, each at several noise levels."""
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
-    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u, centred.y]).T, strict=True))
+    part = busiest(centred.u, _REGRESSED)
+    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u[part], centred.y[part]]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
     found, work = [], None
     kept = _unlike(_coarse(model, centred, parameters, moments, delays))[:_KEPT]
@@ -132,7 +134,7 @@ def _scored(
             vector = at_first_sample(problem, _with_level(problem, candidate.vector, level))
             value, _ = evaluate(problem, vector, work)
             if np.isfinite(value):
-                found.append(Candidate(criterion=value, problem=problem, vector=vector))
+                found.append(Candidate(criterion=value, problem=problem, vector=vector, work=work))
     return found
 
 

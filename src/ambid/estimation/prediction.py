@@ -39,7 +39,7 @@ def simulation_error(fit: Fit) -> Array | None:
     A = predictor.A
     if np.max(np.abs(np.linalg.eigvals(A))) >= 1.0:
         return None
-    work, n = Workspace(fit.problem), A.shape[0]
+    n, work = A.shape[0], Workspace(fit.problem) if fit.work is None else fit.work.of(fit.problem)
     M = predictor.M.copy()
     M[:, :n] = A
     M[:, -1 - work.y.shape[1] : -1] = 0.0  # the gain is off: measurements do not correct the state

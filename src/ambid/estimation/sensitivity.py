@@ -35,12 +35,13 @@ class Workspace:
         n_samples, d = problem.y.shape[0], problem.delay
         at = np.arange(problem.skip, n_samples, problem.stride)
         self.y = np.ascontiguousarray(problem.y[at] / problem.scales.output)
-        # inputs after the last sample do not exist; they would act only after the last output
-        u = problem.u / problem.scales.input
-        lagged = [u[np.minimum(at - d - s, n_samples - 1)] for s in problem.lags]
-        n = len(problem.model.states)
-        self.w = np.hstack([np.zeros((at.size, n)), *lagged, self.y, np.ones((at.size, 1))])
+        n, (n_u, n_y) = len(problem.model.states), (problem.u.shape[1], problem.y.shape[1])
+        self.w = np.zeros((at.size, n + len(problem.lags) * n_u + n_y + 1))
         self.z = self.w[:, n:]
+        for j, s in enumerate(problem.lags):
+            # inputs after the last sample do not exist; they would act only after the last output
+            self.z[:, j * n_u : (j + 1) * n_u] = problem.u[np.minimum(at - d - s, n_samples - 1)] / problem.scales.input
+        self.z[:, -1 - n_y : -1], self.z[:, -1] = self.y, 1.0
         self.turn: tuple[Array, Array] | None = None
         self._problem = problem
         self._weight, self._weighted = np.zeros((0, 0)), self.y

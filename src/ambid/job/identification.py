@@ -120,7 +120,7 @@ def judge(
     from ambid.validate.residuals import fit_of
 
     problem = fit.problem
-    e = innovations(problem, fit.vector)
+    e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
     moved = physical.agreement(fit)
