@@ -407,17 +407,11 @@ class _Interrupt:
         if self._waiting:
             raise _Interrupted
 
-    def now(self) -> _Waiting:
-        """Return a context in which an interrupt acts at once."""
-        return _Waiting(self)
-
-
-class _Waiting:
-    def __init__(self, interrupt: _Interrupt) -> None:
-        self._interrupt = interrupt
-
-    def __enter__(self) -> None:
-        self._interrupt._waiting = True
-
-    def __exit__(self, *_: object) -> None:
-        self._interrupt._waiting = False
+    @contextmanager
+    def now(self) -> Iterator[None]:
+        """Let an interrupt act at once while the context lasts."""
+        self._waiting = True
+        try:
+            yield
+        finally:
+            self._waiting = False

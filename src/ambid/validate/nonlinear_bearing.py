@@ -14,12 +14,12 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
 from ambid.estimation.parts import Check
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
+from ambid.validate.second_record import conclude, consistency_check
 
 _ROLES = ("position", "current")
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
 _LAGS = (1, 2, 3, 5, 8, 13)
 _INPUT_LAGS = (1, 2, 3, 4, 6, 9, 14, 21)
-_RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _OUTSIDE = 0.1  # share of the samples beyond what the records covered that a check lets pass
 _WEIGHT = 0.1  # relative error of the force at rest that a check lets pass
 
@@ -200,7 +200,9 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
             p=test.p_input,
             detail=f"one-step errors against past voltages: p = {test.p_input:.2g}",
         ),
-        "innovations_consistent": _consistent(ratio, found.noise_of),
+        "innovations_consistent": consistency_check(
+            dict(zip(_ROLES, ratio.tolist(), strict=True)), "one-step errors", f"on {found.noise_of} "
+        ),
         "inside_range": _inside(estimate, record, outside),
         **_carries(estimate, record),
     }
@@ -214,22 +216,10 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
             }
             for j, role in enumerate(_ROLES)
         },
-        "checks": {n: {"passed": c.passed, "p": c.p, "detail": c.detail, **c.values} for n, c in checks.items()},
-        "passed": all(c.passed for c in checks.values()),
-        "samples": int(record.u.size),
+        **conclude(checks, int(record.u.size)),
         "outside": outside,
         "noise_of": found.noise_of,
     }
-
-
-def _consistent(ratio: Array, noise_of: str) -> Check:
-    worst = int(np.argmax(np.abs(np.log(ratio))))
-    return Check(
-        passed=bool(np.all((ratio > 1 / _RATIO) & (ratio < _RATIO))),
-        values={f"{role}_ratio": float(x) for role, x in zip(_ROLES, ratio, strict=True)},
-        detail=f"one-step errors of {_ROLES[worst]} are {ratio[worst]:.2f} times as large as on {noise_of} "
-        f"at identification (within a factor {_RATIO:g})",
-    )
 
 
 def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:

@@ -157,17 +157,12 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
     )
 
 
-def joint_score(slopes: Array, residuals: Array, regressors: Array) -> tuple[float, float, int]:
-    """Test whether regressors explain any of several residuals of unit variance.
+def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
+    """Return the triangle of a test whether regressors explain any of several residuals of unit variance.
 
     `slopes`: (n_used, n_outputs, n_directions); `residuals`: (n_used, n_outputs); `regressors`: (n_used,
-    n_regressors). Returns p, the statistic and its degrees of freedom.
+    n_regressors). Of part of the samples: not all have to be held at once.
     """
-    return score_of([joint_triangle(slopes, residuals, regressors)], slopes.shape[2])
-
-
-def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
-    """Return the triangle of some of the samples of `joint_score`, so that not all have to be held at once."""
     (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[1]
     rows = np.zeros((n, n_y, p + n_y * width + 1))
     rows[:, :, :p], rows[:, :, -1] = slopes, residuals
@@ -177,7 +172,7 @@ def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
 
 
 def score_of(triangles: Sequence[Array], n_directions: int) -> tuple[float, float, int]:
-    """Return what `joint_score` does, from the triangles of all samples."""
+    """Return p of a test, its statistic and its degrees of freedom, from the triangles of all samples."""
     L, rest, _ = _project(triangle_of([np.vstack(triangles)]), n_directions)
     _, z = _explain(L, rest @ L, _SAME)
     statistic = float(z @ z)

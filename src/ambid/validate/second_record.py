@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -166,10 +167,28 @@ def _judged(estimate: Estimate, signals: Signals) -> dict[str, object]:
             }
             for j, role in enumerate(roles)
         },
+        **conclude(checks, signals.y.shape[0]),
+    }
+
+
+def conclude(checks: Mapping[str, Check], samples: int) -> dict[str, object]:
+    """Return what every judgement on a second record ends with: ``checks``, ``passed`` and ``samples``."""
+    return {
         "checks": {name: {"passed": c.passed, "p": c.p, "detail": c.detail, **c.values} for name, c in checks.items()},
         "passed": all(c.passed for c in checks.values()),
-        "samples": signals.y.shape[0],
+        "samples": samples,
     }
+
+
+def consistency_check(ratios: Mapping[str, float], whose: str, where: str) -> Check:
+    """Check that innovations are as large as at identification, within a factor; `ratios` are given by output."""
+    worst = max(ratios, key=lambda role: abs(np.log(ratios[role])))
+    return Check(
+        passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
+        values={f"{role}_ratio": r for role, r in ratios.items()},
+        detail=f"{whose} of {worst} are {ratios[worst]:.2f} times as large as {where}at identification "
+        f"(within a factor {_RATIO:g})",
+    )
 
 
 def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[int, Array]:
@@ -181,15 +200,9 @@ def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[i
 
 def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
     e = run.innovations / run.fit.problem.scales.output
-    worst = max(ratios, key=lambda role: abs(np.log(ratios[role])))
     own, inputs = innovation_tests(run.fit, e)
     return {
         "residuals_white": residual_check(own, "innovations against their own past"),
         "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
-        "innovations_consistent": Check(
-            passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
-            values={f"{role}_ratio": r for role, r in ratios.items()},
-            detail=f"innovations of {worst} are {ratios[worst]:.2f} times as large as at identification "
-            f"(within a factor {_RATIO:g})",
-        ),
+        "innovations_consistent": consistency_check(ratios, "innovations", ""),
     }
