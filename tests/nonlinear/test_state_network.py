@@ -226,9 +226,11 @@ def test_anchored_network_gives_the_linearisation_that_physics_alone_misses(swun
     relative, in_sd = off(alone)
     assert np.max(np.abs(relative)) > 0.015
     assert np.max(np.abs(in_sd)) > 10
-    relative, in_sd = off(grey)
-    assert np.max(np.abs(relative)) < 0.005
-    assert np.max(np.abs(in_sd)) < 4.5
+    assert grey.model is not None
+    found = dict(zip(grey.model.names, grey.model.theta, strict=True))
+    assert max(abs(found[k] / v - 1) for k, v in linearised().items()) < 0.005
+    assert grey.sd is None  # they held in half of the cases
+    assert any("what its units cannot follow" in w for w in grey.warnings)
     # one-step errors fall to the sensors' noise
     np.testing.assert_allclose(np.sqrt(np.diag(grey.noise_covariance)), [1e-7, 2e-3], rtol=0.03)
     assert np.sqrt(alone.noise_covariance[1, 1]) > 1.05 * 2e-3

@@ -172,7 +172,7 @@ def test_starts_that_fit_as_well_with_other_weights_widen() -> None:
     worse = replace(other, noise=0.011 * np.eye(2))
     covariance = 0.01 * np.diag(layout.unit**2)
     extra, told = disagreement(one, [one, other, worse], covariance)
-    assert extra[0, 0] == pytest.approx(2.0 * (0.3 * layout.unit[0]) ** 2)
+    assert extra[0, 0] == pytest.approx((0.3 * layout.unit[0]) ** 2)
     assert np.count_nonzero(extra) == 1
     assert "a21 by 3.0" in told[0]
     assert disagreement(one, [one, worse], covariance)[1] == ()

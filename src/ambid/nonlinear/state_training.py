@@ -33,7 +33,6 @@ _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
 _FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
 _SUSPECT = 0.005  # .. and from which it is worth a warning, if it is more than chance
 _CHANCE = 1e-3
-_ALIKE = 2.0  # variance of what networks of one size miss over that by which they disagree: they miss much alike
 _AS_GOOD = 0.02  # logarithm of an output's error variance, by which a start may be worse: 1 % of the error
 
 
@@ -294,13 +293,20 @@ def estimate_spread(
     """Return the spread of trained weights, the first states counted; `rivals` are what other starts came to."""
     problem, v = state.problem(data), state.vector
     P, condition = information_inverse(problem.triangle(v)[:, :-1])
-    if how == "none" or P is None:
+    physical = state.layout.form == "one-axis" and state.layout.neurons > 0
+    if how == "none" or P is None or physical:
         reason = (
-            "no covariance was asked for, and so there are no standard deviations"
-            if how == "none"
-            else f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
+            f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
             "Fewer states or neurons, or more excitation"
         )
+        if physical:
+            reason = (
+                "no standard deviations: A and B are the slope that the network gives at the operating point, and what "
+                "its units cannot follow of the plant is not known; without it intervals of 95 % hold in half of the "
+                "cases. Compare fits with more neurons, or with a smaller swing, or say neurons = 0"
+            )
+        if how == "none":
+            reason = "no covariance was asked for, and so there are no standard deviations"
         return Spread(covariance=None, origin="", condition=condition, warnings=(reason,))
     origin = "laplace" if state.layout.neurons else "information"
     if how == "auto":
@@ -337,7 +343,6 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
     apart = np.array([(r.theta[:k] - state.theta[:k]) * unit for r in close])
     extra[:k, :k] = apart.T @ apart / (len(close) - 1.0)
     ratio = np.sqrt(np.diag(extra)[:k] / np.maximum(np.diag(covariance)[:k], 1e-300))
-    extra *= _ALIKE
     if not np.max(ratio) > 1.0:
         return extra, ()
     worst = int(np.argmax(ratio))
