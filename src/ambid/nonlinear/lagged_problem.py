@@ -61,7 +61,7 @@ class LaggedProblem:
     @property
     def n_errors(self) -> int:
         """Errors in all."""
-        return sum(r.y[self.counts(k)].size for k, r in enumerate(self.rows()))
+        return sum(y[self.function.lag :][self.counts(k)].size for k, (y, _) in enumerate(self.parts))
 
     def whole(self, v: Array) -> Array:
         """Return all parameters."""
@@ -77,11 +77,11 @@ class LaggedProblem:
 
     def _all_errors(self, theta: Array) -> Iterator[Array]:
         of = self.function
-        for rows, (y, u) in zip(self.rows(), self.parts, strict=True):
+        for k, (y, u) in enumerate(self.parts):
             if self.free:
-                yield rows.y - of.free_run(theta, y, u)[0][of.lag :]
+                yield (y - of.free_run(theta, y, u)[0])[of.lag :]
             else:
-                yield of.errors(theta, rows)
+                yield of.errors(theta, self.rows()[k])
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squared weighted errors and of the prior's rows; infinite where the model diverges."""
@@ -107,12 +107,11 @@ class LaggedProblem:
         at = of.regressors.own if self.free else of.regressors.noisy
         reach = int(of.regressors.back[at].max(initial=int(of.folded == 2)))
         for k, (y, u) in enumerate(self.parts):
-            rows = self.rows()[k]
             if self.free:
                 run, z = of.free_run(theta, y, u)
-                left, rows = rows.y - run[of.lag :], of.rows_of(z, y)
+                left, rows = (y - run)[of.lag :], of.rows_of(z, y)
             else:
-                predicted, rows = of.predict(theta, rows)
+                predicted, rows = of.predict(theta, self.rows()[k])
                 left = rows.y - predicted
             before: Array | None = None
             counts = self.counts(k)
