@@ -100,10 +100,10 @@ def physical_parameters(
     if not free:
         raise EstimationError("every parameter is fixed; nothing is left to find. Free at least one")
     with one_thread():
-        return _found(fit, model, parameters, free, delay, roles or {}, band_hz)
+        return _find(fit, model, parameters, free, delay, roles or {}, band_hz)
 
 
-def _found(
+def _find(
     fit: BlackBoxFit,
     model: LinearModel,
     parameters: Sequence[Parameter],
@@ -119,7 +119,7 @@ def _found(
             f"the {fit.structure} model has {target.rank} independent numbers for {len(free)} free parameters. Fix "
             "parameters, raise its order, or excite more"
         )
-    found = matched(target, model, parameters, delay)
+    found = match(target, model, parameters, delay)
     own = target.dt is None or target.rank <= len(free)
     return _result(fit, model, parameters, target, found, delay_how="given" if delay != "auto" or own else "estimated")
 
@@ -311,9 +311,7 @@ def spread(target: Target, found: Match) -> Spread:
     )
 
 
-def matched(
-    target: Target, model: LinearModel, parameters: Sequence[Parameter], delay: float | Literal["auto"]
-) -> Match:
+def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], delay: float | Literal["auto"]) -> Match:
     """Search from the best starts of all bands and delays; a delay is whole unless the response shows a fraction.
 
     `delay`: samples.

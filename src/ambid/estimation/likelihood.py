@@ -131,7 +131,7 @@ def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float
     return directions(np.vstack([at.J, J])).explain(np.concatenate([at.r, r]))
 
 
-def freed(fit: Fit, name: str) -> tuple[float, float]:
+def free_one(fit: Fit, name: str) -> tuple[float, float]:
     """Return what the data say of a parameter that was fixed, to second order.
 
     `name`: one of the problem's known parameters. Returns `statistic`: fall of the criterion that freeing it promises:

@@ -23,7 +23,7 @@ from ambid.bearing.linear import carry
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import Uncertainty, experiment_hint
 from ambid.estimation.criteria import chi_squared_tail
-from ambid.estimation.likelihood import Fit, freed, search, weight_of, workspace_near
+from ambid.estimation.likelihood import Fit, free_one, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.parts import Check
 from ambid.estimation.prediction import sparse_gain
@@ -234,7 +234,7 @@ def _fixed_agree(fit: Fit) -> Check:
     units = {p.name: p.unit for p in fit.problem.model.parameters}
     worst, detail = 1.0, "the record does not speak against any fixed value"
     for name, value in fit.problem.known.items():
-        statistic, there = freed(fit, name)
+        statistic, there = free_one(fit, name)
         p = chi_squared_tail(1, statistic)
         if p < min(worst, P_LEAST):
             detail = (
