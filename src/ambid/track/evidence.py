@@ -149,11 +149,6 @@ class Evidence:
         """Degrees of freedom of `rest`."""
         return max(self.n_samples * self.n_outputs - self.r.size, 0)
 
-    @property
-    def information(self) -> Array:
-        """J^T J, shape (p, p)."""
-        return np.asarray(self.J.T @ self.J)
-
     def residual(self, q: Array) -> Array:
         """Return r + J (q - at), shape (p,), unit covariance if `q` is the truth.
 
@@ -294,11 +289,6 @@ class EvidenceStream:
         self.sample, self._fresh = sample, True
         self._triangle[:] = 0.0
         self._counts[1:3] = 0
-
-    @property
-    def settling(self) -> int:
-        """Samples that are still needed to settle."""
-        return int(self._counts[3])
 
     @property
     def settling_samples(self) -> int:
