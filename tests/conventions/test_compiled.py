@@ -72,7 +72,7 @@ def test_a_first_compilation_is_announced_once_and_a_kernel_from_the_cache_works
 
 
 def test_what_a_kernel_takes_in_is_followed_through_files() -> None:
-    kernels = PACKAGE / "bearing" / "magnet" / "_kernels.py"
+    kernels = PACKAGE / "bearing" / "magnet_kernels.py"
     found = {shown(path) for path in _imported(kernels, set())}
     assert "src/ambid/physics/coenergy_law.py" in found
     assert sources_digest(kernels) != sources_digest(PACKAGE / "estimation" / "kernels.py")
