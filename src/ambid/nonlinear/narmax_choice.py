@@ -396,9 +396,10 @@ def prune_by_simulation(
         may = np.flatnonzero(_may_go(found, noise=False))
         if anew:
             may = may[np.argmin(loss[may], keepdims=True)]
-        trials = [_readjust(found, inverse, int(k)) for k in may]
         if anew:
-            trials = [_simulated(x, parts) for x in trials]
+            trials = [_simulated(found.without(int(k), np.delete(found.theta, k)), parts) for k in may]
+        else:
+            trials = [_readjust(found, inverse, int(k)) for k in may]
         values = [value(x) for x in trials]
         if not values or not min(values) < now:
             break
