@@ -291,6 +291,11 @@ class EvidenceStream:
         self._counts[1:3] = 0
 
     @property
+    def settling(self) -> int:
+        """Samples that are still needed to settle."""
+        return int(self._counts[3])
+
+    @property
     def settling_samples(self) -> int:
         """Samples that settling takes after a restart."""
         return int(self._lags.max()) + int(np.ceil(SETTLING * self.at.memory))
