@@ -7,8 +7,7 @@ import time
 import tty
 from contextlib import suppress
 
-from ambid.acquire.protocol.codec import message, unpack
-from ambid.acquire.protocol.framing import FrameDecoder, encode, frame
+from ambid.acquire.protocol.codec import FrameDecoder, encode, frame, message, unpack
 from ambid.acquire.protocol.table import table
 
 STATE = {e.name: e.value for e in table().enums["state"]}

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.acquire.device import Program
-from ambid.acquire.playing import MASKS
-from ambid.acquire.program import amplitude_counts, elements_of, expected, period_ticks, played, program
+from ambid.acquire.program import MASKS, amplitude_counts, elements_of, expected, period_ticks, played, program
 from ambid.errors import DeviceError
 from ambid.signals.excitations import crest_factor
 from tests.acquire.rigs import bench

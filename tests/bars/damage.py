@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.acquire.protocol.codec import message
-from ambid.acquire.protocol.framing import FrameDecoder, encode
+from ambid.acquire.protocol.codec import FrameDecoder, encode, message
 from ambid.acquire.protocol.table import table
 from tests.bars.host import Host, trajectory
 

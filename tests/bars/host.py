@@ -16,8 +16,7 @@ import ambid
 from ambid.acquire.devices.emulator import Emulator
 from ambid.acquire.devices.plant_file import write_plant_file
 from ambid.acquire.link.port import open_port
-from ambid.acquire.protocol.codec import message, unpack
-from ambid.acquire.protocol.framing import FrameDecoder, encode
+from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
 from ambid.acquire.protocol.table import table
 from ambid.acquire.settings import controller_settings
 from ambid.rig import load_rig

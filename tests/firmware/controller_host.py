@@ -6,8 +6,7 @@ import select
 import time
 import tty
 
-from ambid.acquire.protocol.codec import message, unpack
-from ambid.acquire.protocol.framing import FrameDecoder, encode
+from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
 from tests.firmware.native.console import GAINS, LIMITS
 
 LIMIT_S = 45.0  # of the wall clock; only ends a hang

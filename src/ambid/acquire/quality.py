@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.acquire.device import Column, DeviceInfo, Program
-from ambid.acquire.playing import period_ticks
+from ambid.acquire.program import period_ticks
 from ambid.arrays import Array
 from ambid.track.blocks import Frame
 

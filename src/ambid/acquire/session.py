@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ambid.acquire.device import Device, DeviceEvent, Mode, Program
-from ambid.acquire.playing import period_ticks
+from ambid.acquire.program import period_ticks
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block, Frame
 

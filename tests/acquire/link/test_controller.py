@@ -7,8 +7,7 @@ from contextlib import suppress
 import pytest
 
 from ambid.acquire.link.controller import Controller
-from ambid.acquire.protocol.codec import message
-from ambid.acquire.protocol.framing import encode
+from ambid.acquire.protocol.codec import encode, message
 from ambid.errors import DeviceError
 from tests.acquire.fake import STATE, FakeController, PipePort
 

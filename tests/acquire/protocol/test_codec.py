@@ -5,8 +5,17 @@ import struct
 
 import pytest
 
-from ambid.acquire.protocol.codec import Message, message, pack, refuse_other_version, unpack
-from ambid.acquire.protocol.framing import FrameCounters, FrameDecoder, encode, frame
+from ambid.acquire.protocol.codec import (
+    FrameCounters,
+    FrameDecoder,
+    Message,
+    encode,
+    frame,
+    message,
+    pack,
+    refuse_other_version,
+    unpack,
+)
 from ambid.acquire.protocol.table import table
 from ambid.errors import DeviceError
 from tests.acquire.protocol.vectors import random_message

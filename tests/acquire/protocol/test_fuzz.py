@@ -8,8 +8,7 @@ import random
 
 import pytest
 
-from ambid.acquire.protocol.codec import pack, unpack
-from ambid.acquire.protocol.framing import FrameDecoder, encode, frame
+from ambid.acquire.protocol.codec import FrameDecoder, encode, frame, pack, unpack
 from ambid.acquire.protocol.samples import SampleDecoder
 from ambid.acquire.protocol.table import table
 from tests.acquire.protocol.vectors import random_message, sample

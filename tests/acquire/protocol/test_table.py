@@ -7,10 +7,9 @@ from importlib import resources
 
 import pytest
 
-from ambid.acquire.protocol.c_header import c_header
-from ambid.acquire.protocol.page import protocol_page
 from ambid.acquire.protocol.table import read_table, table
 from tests.conventions.sources import ROOT
+from tools.protocol_header import c_header, complaints, protocol_page
 
 TEXT = resources.files("ambid.acquire.protocol").joinpath("messages.toml").read_text(encoding="utf-8")
 REMEDY = "run `python tools/protocol_header.py`"
@@ -90,8 +89,11 @@ WRONG = {
 @pytest.mark.parametrize(("old", "new", "says"), WRONG.values(), ids=WRONG.keys())
 def test_a_table_that_breaks_a_rule_is_refused(old, new, says):
     assert old in TEXT
-    with pytest.raises(ValueError, match=re.escape(says)):
-        read_table(TEXT.replace(old, new, 1))
+    assert any(says in line for line in complaints(read_table(TEXT.replace(old, new, 1))))
+
+
+def test_the_table_breaks_no_rule():
+    assert list(complaints(table())) == []
 
 
 def test_every_command_begins_with_its_number_and_some_things_never_change():

@@ -15,8 +15,7 @@ from types import MappingProxyType
 
 from ambid.acquire.link.port import Port, PortEnded
 from ambid.acquire.link.reader import Hearing, Listener
-from ambid.acquire.protocol.codec import Message, message
-from ambid.acquire.protocol.framing import FrameCounters, encode
+from ambid.acquire.protocol.codec import FrameCounters, Message, encode, message
 from ambid.acquire.protocol.table import table
 from ambid.errors import DeviceError
 

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.acquire.link.port import Port
-from ambid.acquire.protocol.codec import Message, unpack
-from ambid.acquire.protocol.framing import FrameCounters, FrameDecoder
+from ambid.acquire.protocol.codec import FrameCounters, FrameDecoder, Message, unpack
 from ambid.acquire.protocol.table import table
 from ambid.errors import DeviceError
 

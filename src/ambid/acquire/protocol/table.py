@@ -1,23 +1,20 @@
-"""The table of the wire protocol: ``messages.toml``, read and checked.
+"""The table of the wire protocol: ``messages.toml``.
 
-Everything that knows a message on either side (codec, C header, reference page) is made from this table.
+Codec, C header and reference page are made from this table, the latter two by ``tools/protocol_header.py``.
 """
 
 from __future__ import annotations
 
 import functools
-import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from types import MappingProxyType
 from typing import Any
 
 CRC_BYTES = 2
-_FORMATS = {"u8": "B", "u16": "H", "u32": "I", "i8": "b", "i16": "h", "i32": "i"}
-_SIDES = ("host", "controller")
-_NAME = re.compile(r"[a-z][a-z0-9_]*")
+FORMATS = {"u8": "B", "u16": "H", "u32": "I", "i8": "b", "i16": "h", "i32": "i"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +43,7 @@ class FieldType:
     @property
     def format(self) -> str:
         """Letter of `struct` for one element."""
-        return _FORMATS[self.kind]
+        return FORMATS[self.kind]
 
     @property
     def span(self) -> tuple[int, int]:
@@ -129,12 +126,12 @@ def table() -> Table:
 
 
 def read_table(text: str) -> Table:
-    """Read a protocol from its text and check it.
+    """Read a protocol from its text; ``tools/protocol_header.py`` checks it when header and page are made.
 
     `text`: as in ``messages.toml``.
     """
     raw = tomllib.loads(text)
-    made = Table(
+    return Table(
         version=raw["version"],
         baud=raw["baud"],
         largest=raw["largest"],
@@ -143,9 +140,6 @@ def read_table(text: str) -> Table:
         stream=tuple(StreamColumn(name=n, bit=v[0], kind=v[1], about=v[2]) for n, v in raw["stream"].items()),
         messages=MappingProxyType({n: _message(n, v) for n, v in raw["messages"].items()}),
     )
-    if complaints := list(_complaints(made)):
-        raise ValueError("; ".join(complaints))
-    return made
 
 
 def _entries(raw: Mapping[str, Any]) -> tuple[Entry, ...]:
@@ -158,48 +152,3 @@ def _message(name: str, raw: Mapping[str, Any]) -> MessageType:
         for n, kind, about in raw["fields"]
     )
     return MessageType(name=name, code=raw["code"], to=raw["to"], about=raw["about"], fields=fields)
-
-
-def _complaints(made: Table) -> Iterator[str]:
-    if not 0 < made.version < 256:
-        yield f"version {made.version} does not fit a byte"
-    if not 0 < made.largest <= 254:
-        yield f"largest = {made.largest}: a frame of COBS with one block per zero byte has at most 254 bytes"
-    for group, entries in [*made.enums.items(), *made.bits.items()]:
-        yield from _twice(f"group {group}", [e.value for e in entries])
-        most = 16 if group in made.bits else 256
-        yield from (f"{group}.{e.name}: {e.value} is out of range" for e in entries if not 0 <= e.value < most)
-    if [c.bit for c in made.stream] != list(range(len(made.stream))) or len(made.stream) > 8:
-        yield "stream: bits are to be 0, 1, ... in order, 8 at most"
-    yield from (f"stream.{c.name}: {c.kind} has not two bytes" for c in made.stream if c.kind not in ("u16", "i16"))
-    for side in _SIDES:
-        yield from _twice(f"codes to the {side}", [m.code for m in made.messages.values() if m.to == side])
-    for message in made.messages.values():
-        yield from _complaints_of_message(message, made.largest)
-    names = [*made.enums, *made.bits, *(c.name for c in made.stream), *made.messages]
-    names += [f.name for m in made.messages.values() for f in m.fields]
-    yield from (f"{name!r} is no name in both languages" for name in names if not _NAME.fullmatch(name))
-    texts = [e.about for entries in [*made.enums.values(), *made.bits.values()] for e in entries]
-    texts += [c.about for c in made.stream] + [m.about for m in made.messages.values()]
-    texts += [f.about for m in made.messages.values() for f in m.fields]
-    yield from (f"{text!r} would end a comment or a row" for text in texts if re.search(r"\*/|/\*|[|\n\\]", text))
-
-
-def _complaints_of_message(message: MessageType, largest: int) -> Iterator[str]:
-    where = f"message {message.name}"
-    if message.to not in _SIDES:
-        yield f"{where}: to = {message.to!r}; it is one of {', '.join(_SIDES)}"
-    if not 0 < message.code < 256:
-        yield f"{where}: code {message.code} is not within 1 to 255"
-    yield from _twice(where, [f.name for f in message.fields])
-    for field in message.fields:
-        if field.kind not in _FORMATS:
-            yield f"{where}: {field.name} has type {field.kind!r}; known are {', '.join(_FORMATS)}"
-        elif field.many and field is not message.fields[-1]:
-            yield f"{where}: {field.name} is the rest of the frame, but others follow"
-    if all(f.kind in _FORMATS for f in message.fields) and message.length + CRC_BYTES > largest:
-        yield f"{where}: {message.length + CRC_BYTES} bytes; the largest frame has {largest}"
-
-
-def _twice(where: str, values: list[Any]) -> Iterator[str]:
-    yield from (f"{where}: {value!r} stands twice" for value in sorted({v for v in values if values.count(v) > 1}))
