@@ -58,11 +58,10 @@ class Emulated:
     def __init__(self, request, tmp_path):
         request.getfixturevalue("bench_program")
         request.getfixturevalue("firmware_elf")
-        self.folder = tmp_path / "bench"
         self.made = []
 
     def make(self, rig=PROTOTYPE):
-        self.made.append(EmulatedDevice(rig, folder=self.folder))
+        self.made.append(EmulatedDevice(rig))
         return self.made[-1]
 
     def fault(self, device):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 import ambid
-from ambid.acquire.devices.emulator import Emulator
-from ambid.acquire.devices.plant_file import write_plant_file
+from ambid.acquire.devices.benches import plant_text
+from ambid.acquire.devices.emulated import Emulator
 from ambid.acquire.link.port import open_port
 from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
 from ambid.acquire.protocol.table import table
@@ -65,15 +65,17 @@ class Heard:
 class Host:
     """Emulator and line. A context.
 
-    Rig, script, seed and folder as `Emulator` has them; ``third``: third input as `write_plant_file` has it.
+    Rig, script, seed and folder as `Emulator` has them; ``third``: third input in V/m, V/A and V.
     """
 
-    def __init__(self, rig, folder, *, script=None, seed=0, trajectory=False, **plant):
+    def __init__(self, rig, folder, *, script=None, seed=0, trajectory=False, third=(0.0, 0.0, 2.5)):
         self.rig, self.settings = rig, controller_settings(rig)
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_plant_file(folder / "plant.txt", rig, **plant)
-        self.bench = Emulator(folder / "plant.txt", script=script, seed=seed, folder=folder, trajectory=trajectory)
+        wires = zip(("third_position_gain", "third_current_gain", "third_offset"), third, strict=True)
+        plant = [line for line in plant_text(rig).splitlines() if not line.startswith("third")]
+        plant += [f"{name} {value!r}" for name, value in wires]
+        self.bench = Emulator("\n".join(plant), script=script, seed=seed, folder=folder, trajectory=trajectory)
         self.heard, self.answers, self.told = Heard(), {}, deque()
         self.pings, self.ping_by_clock = True, True
         self.acked_at = None  # samples that had come when the last answer to a ping did

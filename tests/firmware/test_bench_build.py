@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from ambid.acquire.devices.emulator import INSTALL
+from ambid.acquire.devices.emulated import INSTALL
 from tests.firmware.conftest import BENCH, lacking
 
 FIRMWARE = BENCH.parent

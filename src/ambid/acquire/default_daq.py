@@ -35,6 +35,11 @@ def with_default_daq(rig: Rig) -> Rig:
     return _filled(rig)[0]
 
 
+def is_made_up(rig: Rig, full: Rig) -> bool:
+    """Return whether `with_default_daq` made a calibration up: its counts mean nothing to anybody else."""
+    return any(rig.channel(c.role).calibration is None and c.calibration is not None for c in full.channels)
+
+
 def default_daq_notes(rig: Rig) -> tuple[str, ...]:
     """Return what `with_default_daq` makes up for a rig, one line each.
 

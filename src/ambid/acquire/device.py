@@ -12,11 +12,14 @@ from dataclasses import dataclass, field
 from types import MappingProxyType, TracebackType
 from typing import Literal, Protocol, Self
 
+from ambid.errors import DeviceError
 from ambid.track.blocks import Frame
 
 Mode = Literal["sample", "drive", "levitate"]
 State = Literal["idle", "sampling", "driving", "levitating", "fault"]
 Kind = Literal["none", "step", "prbs", "table"]
+MODES: Mapping[Mode, State] = MappingProxyType({"sample": "sampling", "drive": "driving", "levitate": "levitating"})
+"""State that each mode brings about."""
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 
@@ -187,3 +190,9 @@ class Device(Protocol):
     def clear(self) -> None:
         """Leave the safe state after a fault whose cause is gone: idle, no more samples."""
         ...
+
+
+def check_mode(mode: str, where: str) -> None:
+    """Refuse a mode that no device has."""
+    if mode not in MODES:
+        raise DeviceError(f"{where} has no mode {mode!r}; there are {', '.join(MODES)}. Give one of them")

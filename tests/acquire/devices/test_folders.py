@@ -5,7 +5,7 @@ import tempfile
 
 import pytest
 
-from ambid.acquire.devices.plant_file import TemporaryFolder
+from ambid.acquire.devices.emulated import TemporaryFolder
 
 OLD = (1.0, 1.0)
 

@@ -62,12 +62,12 @@ def test_a_command_whose_answer_is_lost_is_sent_again_and_carried_out_once():
 
 def test_who_never_answers_is_given_up_with_a_remedy():
     board = FakeController()
-    with Session(board, tries=3) as s:
+    with Session(board) as s:
         s.controller.identify()
         board.mute = 10**9
         text = refused(s.controller.ask, "stop")
-        assert "did not answer 'stop', sent 3 times" in text
-        assert s.controller.resent == 2
+        assert "did not answer 'stop', sent 5 times" in text
+        assert s.controller.resent == 4
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_what_stands_behind_a_port_that_gives_no_identity(before, words):
     board.deaf = True
     port = PipePort(board)
     port.before = before
-    with Session(board, port, tries=3) as s:
+    with Session(board, port) as s:
         text = refused(s.controller.identify)
         assert all(w in text for w in words), text
 

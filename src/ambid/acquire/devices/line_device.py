@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType, TracebackType
 from typing import Literal, Self
 
-from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State
+from ambid.acquire.device import MODES, Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State, check_mode
 from ambid.acquire.devices.frames import ROOM
 from ambid.acquire.devices.stream import SampleStream
 from ambid.acquire.link.controller import Controller
@@ -21,7 +21,6 @@ from ambid.errors import DeviceError
 from ambid.rig.rig import Rig
 from ambid.track.blocks import Frame
 
-_MODES: dict[Mode, State] = {"sample": "sampling", "drive": "driving", "levitate": "levitating"}
 _NONE: Mapping[str, int] = MappingProxyType({})
 _TABLE_PART = 48  # elements in one message
 _TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv")  # of a status
@@ -126,8 +125,7 @@ class LineDevice(ABC):
 
     def start(self, mode: Mode) -> None:
         """As `Device.start`."""
-        if mode not in _MODES:
-            raise DeviceError(f"{self._where} has no mode {mode!r}; there are {', '.join(_MODES)}. Give one of them")
+        check_mode(mode, self._where)
         before = self.state
         if before == "idle":
             self._stream.begin()
@@ -137,7 +135,7 @@ class LineDevice(ABC):
             if before == "idle":
                 self._stream.finish(None)
             raise
-        self._stream.enter(_MODES[mode], unless_fault=True)  # it may have tripped in its first tick
+        self._stream.enter(MODES[mode], unless_fault=True)  # it may have tripped in its first tick
 
     def excite(self, program: Program | None) -> None:
         """As `Device.excite`."""
@@ -273,8 +271,8 @@ class LineDevice(ABC):
             samples=kept.samples - frames.overrun_samples,
             lost=kept.lost + frames.overrun_samples,
             damaged=self._damaged(c),
-            discarded_bytes=line.discarded_bytes + c.overrun_bytes - self._before[1],
-            overruns=frames.overruns + c.overruns,
+            discarded_bytes=line.discarded_bytes + c.reader.overrun_bytes - self._before[1],
+            overruns=frames.overruns + c.reader.overruns,
             resent=c.resent,
             controller=MappingProxyType(dict(self._status)),
             drift=drift.drift,

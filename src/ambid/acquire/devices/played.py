@@ -9,45 +9,46 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Literal, NoReturn, Self
 
-from ambid.acquire.device import Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State
-from ambid.acquire.devices.frames import ROOM
+from ambid.acquire.device import MODES, Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State, check_mode
+from ambid.acquire.devices.frames import FrameQueue
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block, Frame
 
 Pace = Literal["real", "fastest"]
 
 _BLOCKS_PER_SECOND = 100
-_MODES: dict[str, State] = {"sample": "sampling", "drive": "driving", "levitate": "levitating"}
+
+
+def check_pace(pace: str) -> None:
+    """Refuse a pace that no device has."""
+    if pace not in ("real", "fastest"):
+        raise DeviceError(f"pace is {pace!r}; a device goes in 'real' time or 'fastest'. Give one of them")
 
 
 class PlayedDevice(ABC):
     """A device without a line. See `ambid.acquire.device.Device` for what its methods promise.
 
-    `rate_hz`: samples in one second; `block_samples`: samples of a block at most; default those of 10 ms; `room`:
-    samples that wait at most.
+    `rate_hz`: samples in one second; `block_samples`: samples of a block at most; default those of 10 ms.
     """
 
-    def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None, room: int = ROOM) -> None:
-        if pace not in ("real", "fastest"):
-            raise DeviceError(f"pace is {pace!r}; a device goes in 'real' time or 'fastest'. Give one of them")
+    def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None) -> None:
+        check_pace(pace)
         size = max(1, round(rate_hz / _BLOCKS_PER_SECOND)) if block_samples is None else block_samples
         if size < 1:
             raise DeviceError(f"a block of {size} samples holds nothing; it has at least one. Correct block_samples")
-        self._rate, self._pace, self._size, self._room = rate_hz, pace, size, room
+        self._rate, self._pace, self._size = rate_hz, pace, size
         self._lock = threading.Condition(threading.RLock())
-        self._queue: deque[Frame] = deque()
-        self._held = 0
+        self._frames = FrameQueue()
         self._open = self._flowing = False
         self._state: State = "idle"
         self._next = 0  # number of the next sample
         self._began_s, self._began = 0.0, 0  # host time and number at which samples began to flow
         self._events: list[DeviceEvent] = []
-        self._samples = self._lost = self._overruns = 0
+        self._samples = self._lost = 0
 
     # What the two differ in.
     @property
@@ -114,10 +115,7 @@ class PlayedDevice(ABC):
         """As `Device.start`."""
         with self._lock:
             self._ready("start")
-            if mode not in _MODES:
-                raise DeviceError(
-                    f"{self._where} has no mode {mode!r}; there are {', '.join(_MODES)}. Give one of them"
-                )
+            check_mode(mode, self._where)
             if self._state == "fault":
                 self._refuse("start", "it does not start before clear. Remove the cause, then clear it")
             if self._state not in ("idle", "sampling") or (self._state == "sampling" and mode == "sample"):
@@ -125,7 +123,7 @@ class PlayedDevice(ABC):
             self._begin(mode)
             if not self._flowing:
                 self._flowing, self._began_s, self._began = True, time.perf_counter(), self._next
-            self._enter_state(_MODES[mode])
+            self._enter_state(MODES[mode])
 
     def excite(self, program: Program | None) -> None:
         """As `Device.excite`."""
@@ -139,15 +137,14 @@ class PlayedDevice(ABC):
         """As `Device.read`."""
         end = time.perf_counter() + timeout_s
         with self._lock:
-            if not self._open and not self._queue:
+            if not self._open and self._frames.ended:
                 self._ready("read")
             while True:
                 self._catch_up(partly=False)
-                if not self._queue and self._flowing and self._pace == "fastest":
+                if self._frames.ended and self._flowing and self._pace == "fastest":
                     self._make(self._size, time.perf_counter())
-                if self._queue:
-                    frame = self._queue.popleft()
-                    self._held -= len(frame.block.values)
+                frame = self._frames.take(0.0)
+                if frame is not None:
                     return frame
                 now = time.perf_counter()
                 if not self._flowing or now >= end:
@@ -159,7 +156,7 @@ class PlayedDevice(ABC):
         """Whether nothing more will come."""
         with self._lock:
             self._catch_up(partly=False)
-            return not self._flowing and not self._queue
+            return not self._flowing and self._frames.ended
 
     def events(self) -> Sequence[DeviceEvent]:
         """As `Device.events`."""
@@ -171,7 +168,7 @@ class PlayedDevice(ABC):
     def counters(self) -> Counters:
         """As `Device.counters`."""
         with self._lock:
-            return Counters(samples=self._samples, lost=self._lost, overruns=self._overruns)
+            return Counters(samples=self._samples, lost=self._lost, overruns=self._frames.overruns)
 
     def stop(self) -> None:
         """As `Device.stop`; those that are due can still be read."""
@@ -241,11 +238,10 @@ class PlayedDevice(ABC):
                 DeviceEvent(kind="lost", sample=self._next, what="gap in the numbers", count=block.first - self._next)
             )
         self._next = max(self._next, block.first + n)  # a torn record may run back
-        if self._held + n > self._room:
-            self._overruns += 1
+        if not self._frames.put(
+            Frame(block=block, arrived_s=self._due(self._next) if arrived_s is None else arrived_s)
+        ):
             self._lost += n
             self._events.append(DeviceEvent(kind="lost", sample=block.first, what="the host read too slowly", count=n))
             return
         self._samples += n
-        self._held += n
-        self._queue.append(Frame(block=block, arrived_s=self._due(self._next) if arrived_s is None else arrived_s))

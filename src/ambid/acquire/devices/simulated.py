@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquire.default_daq import with_default_daq
+from ambid.acquire.default_daq import is_made_up, with_default_daq
 from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.benches import Bench, bench_of
 from ambid.acquire.devices.played import Pace, PlayedDevice
@@ -68,9 +68,7 @@ class SimulatedDevice(PlayedDevice):
     ) -> None:
         self._bench = bench_of(rig, bench)
         self._rig = with_default_daq(rig)
-        self._si = any(
-            rig.channel(c.role).calibration is None and c.calibration is not None for c in self._rig.channels
-        )
+        self._si = is_made_up(rig, self._rig)
         self._settings = controller_settings(self._rig)
         super().__init__(self._settings.rate_hz, pace, block_samples)
         self._info = DeviceInfo(

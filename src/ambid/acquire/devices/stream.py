@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from ambid.acquire.device import DeviceEvent, State
 from ambid.acquire.devices.frames import FrameQueue
@@ -54,7 +55,7 @@ class SampleStream:
     def counters(self) -> SampleCounters:
         """What became of the samples."""
         with self._lock:
-            return self._decoder.counters
+            return replace(self._decoder.counters)
 
     def drift(self) -> Drift:
         """Return what is known of the clock."""

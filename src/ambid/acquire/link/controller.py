@@ -11,16 +11,20 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from types import MappingProxyType
 
 from ambid.acquire.link.port import Port, PortEnded
-from ambid.acquire.link.reader import Hearing, Listener
-from ambid.acquire.protocol.codec import FrameCounters, Message, encode, message
+from ambid.acquire.link.reader import Reader
+from ambid.acquire.protocol.codec import FrameDecoder, Message, encode, message, unpack
 from ambid.acquire.protocol.table import table
 from ambid.errors import DeviceError
 
 _ANSWERS = {"identify": "identity", "ask_status": "status", "self_test": "self_test_result"}
 _SLOW = {"self_test": 10.0}  # times as long as another command's answer: the program memory is summed up
+_LOOK_S = 0.2
+_PATIENCE_S = 10.0  # for a thread to end
+_TRIES = 5  # how often a command is sent
 _PING_S = 0.05  # of the host's clock, or
 _PING_SAMPLES_S = 0.025  # of samples received, whichever comes first
 _SILENT_S = 0.5  # without a sample: it is asked for its status
@@ -44,9 +48,10 @@ class Controller:
     time of arrival, from the listener's thread; `told`: given messages that nobody asked for, and statuses, from the
     listener's thread; `lost`: given the error, once, when the line is lost, from whichever thread sees it; `paused`:
     tells whether the controller's time stands still: then it is not pinged; `answer_s`: how long to wait for an answer
-    before a command is sent again, s; `tries`: how often a command is sent.
+    before a command is sent again, s.
 
-    `resent`: commands sent again; `odd`: sound frames that are no message.
+    `resent`: commands sent again; `odd`: sound frames that are no message; `counters`, `reader`: what came over the
+    line; `failure`: why it is lost, once it is.
     """
 
     def __init__(
@@ -58,13 +63,12 @@ class Controller:
         lost: Callable[[DeviceError], None],
         paused: Callable[[], bool] = lambda: False,
         answer_s: float = 0.3,
-        tries: int = 5,
     ) -> None:
         self._port, self._samples, self._told, self._lost = port, samples, told, lost
-        self._answer_s, self._tries, self._paused = answer_s, tries, paused
+        self._answer_s, self._paused = answer_s, paused
         self._id = 0
         self.resent = self.odd = 0
-        self._failure: DeviceError | None = None
+        self.failure: DeviceError | None = None
         self._other: DeviceError | None = None
         self._waiting: dict[int, _Waiting] = {}
         self._news = threading.Condition()
@@ -74,35 +78,18 @@ class Controller:
         self._unpinged, self._per_ping = 0, 0
         self._closing = False
         self._heard_s = time.monotonic()
-        hearing = Hearing(samples=self._heard_samples, message=self._heard, odd=self._odd, lost=self._line_lost)
-        self._listener = Listener(port, hearing)
+        self._decoder, self.reader = FrameDecoder(), Reader(port)
+        self.counters = self._decoder.counters
+        self._sample = table().messages["sample"].code
+        self._listener = threading.Thread(target=self._listen, name=f"listen {port.name}", daemon=True)
+        self._listener.start()
         self._pinger = threading.Thread(target=self._keep_alive, name=f"ping {port.name}", daemon=True)
         self._pinger.start()
-
-    @property
-    def counters(self) -> FrameCounters:
-        """What came over the line."""
-        return self._listener.counters
-
-    @property
-    def overruns(self) -> int:
-        """Reads that the host had no room for."""
-        return self._listener.overruns[0]
-
-    @property
-    def overrun_bytes(self) -> int:
-        """Bytes in them."""
-        return self._listener.overruns[1]
 
     @property
     def asking(self) -> bool:
         """Whether an answer is waited for."""
         return bool(self._waiting)
-
-    @property
-    def failure(self) -> DeviceError | None:
-        """Why the line is lost, once it is."""
-        return self._failure
 
     def identify(self) -> Message:
         """Ask who is there.
@@ -114,7 +101,7 @@ class Controller:
         except DeviceError:
             if self._other is not None:
                 raise self._other from None
-            if self._failure is not None:
+            if self.failure is not None:
                 raise
             raise DeviceError(self._nobody()) from None
 
@@ -134,10 +121,10 @@ class Controller:
             finally:
                 del self._waiting[number]
         if answer is None:
-            if self._failure is not None:
-                raise DeviceError(str(self._failure))
+            if self.failure is not None:
+                raise DeviceError(str(self.failure))
             raise DeviceError(
-                f"{self._port.name}: the controller did not answer {name!r}, sent {self._tries} times; each command is"
+                f"{self._port.name}: the controller did not answer {name!r}, sent {_TRIES} times; each command is"
                 f" answered. Look at cable and supply, and open the port again; {_LOST}"
             )
         if answer.name == "ack" and answer["code"]:
@@ -159,8 +146,10 @@ class Controller:
             self._closing = True
             self._due.notify_all()
         if self._pinger is not threading.current_thread():
-            self._pinger.join(10.0)
-        self._listener.close()
+            self._pinger.join(_PATIENCE_S)
+        self.reader.close()
+        if self._listener is not threading.current_thread():
+            self._listener.join(_PATIENCE_S)
         self._port.close()
 
     def _next_id(self) -> int:
@@ -169,7 +158,7 @@ class Controller:
 
     def _answered(self, data: bytes, waiting: _Waiting) -> Message | None:
         limit = self._answer_s * _SLOW.get(waiting.name, 1.0)
-        for attempt in range(self._tries):
+        for attempt in range(_TRIES):
             if attempt:
                 self.resent += 1
             self._send(data)
@@ -181,10 +170,10 @@ class Controller:
 
     def _over(self, waiting: _Waiting) -> bool:
         """Whether no answer will come: the line is lost, or what was to be identified is something else."""
-        return self._failure is not None or (waiting.name == "identify" and self._other is not None)
+        return self.failure is not None or (waiting.name == "identify" and self._other is not None)
 
     def _send(self, data: bytes) -> None:
-        if self._failure is not None:
+        if self.failure is not None:
             return
         try:
             with self._writing:
@@ -194,12 +183,12 @@ class Controller:
 
     def _keep_alive(self) -> None:
         with self._due:  # whoever is not known yet is not talked at
-            self._due.wait_for(lambda: self._per_ping or self._closing or self._failure is not None)
+            self._due.wait_for(lambda: self._per_ping or self._closing or self.failure is not None)
         due = time.monotonic() + _PING_S
         while True:
             with self._due:
                 self._due.wait_for(self._ping_is_due, max(0.0, due - time.monotonic()))
-                if self._closing or self._failure is not None:
+                if self._closing or self.failure is not None:
                     return
                 self._unpinged = 0
                 silent = time.monotonic() - self._heard_s > _SILENT_S
@@ -210,7 +199,31 @@ class Controller:
 
     def _ping_is_due(self) -> bool:
         enough = 0 < self._per_ping <= self._unpinged
-        return enough or self._closing or self._failure is not None
+        return enough or self._closing or self.failure is not None
+
+    def _listen(self) -> None:
+        try:
+            while not self.reader.over:
+                for chunk in self.reader.take(_LOOK_S):
+                    self._take(self._decoder.feed(chunk.data), chunk.arrived_s)
+            failure = self.reader.failure
+        except Exception as defect:  # nobody hears the controller any more: it must not be pinged on
+            failure = OSError(f"a defect of ambid, {type(defect).__name__}: {defect}")
+        if failure is not None:
+            self._line_lost(failure)
+
+    def _take(self, payloads: list[bytes], arrived_s: float) -> None:
+        for sampled, together in groupby(payloads, lambda payload: payload[0] == self._sample):
+            if sampled:
+                self._heard_samples(list(together), arrived_s)
+                continue
+            for payload in together:
+                try:
+                    what = unpack(payload)
+                except DeviceError as failure:
+                    self._odd(failure)
+                else:
+                    self._heard(what)
 
     def _heard_samples(self, payloads: list[bytes], arrived_s: float) -> None:
         with self._due:
@@ -238,9 +251,9 @@ class Controller:
 
     def _line_lost(self, failure: OSError) -> None:
         with self._news:
-            if self._failure is not None or self._closing:
+            if self.failure is not None or self._closing:
                 return
-            self._failure = DeviceError(
+            self.failure = DeviceError(
                 str(failure)
                 if isinstance(failure, PortEnded)
                 else f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port"
@@ -249,11 +262,11 @@ class Controller:
             self._news.notify_all()
         with self._due:
             self._due.notify_all()
-        self._lost(self._failure)
+        self._lost(self.failure)
 
     def _nobody(self) -> str:
         """Say what may stand behind a port that gives no identity."""
-        seen, name = self._listener.counters, self._port.name
+        seen, name = self.counters, self._port.name
         if seen.frames:
             return (
                 f"port {name}: sound frames come, but no answer to 'identify'; the controller does not hear the host."

@@ -150,7 +150,7 @@ def _head(kind: MessageType) -> struct.Struct:
     return struct.Struct("<B" + "".join(f.format for f in kind.fixed))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class FrameCounters:
     """What a decoder has seen. Every byte fed is in `kept_bytes`, `discarded_bytes`, `empty`, or still pending."""
 
@@ -203,19 +203,7 @@ class FrameDecoder:
         self._longest = table().largest + 1  # on the line, without its 0x00
         self._tail = b""
         self._inside_overlong = False
-        self._frames = self._kept = self._discarded = self._empty = 0
-        self._damage = {"crc": 0, "length": 0, "code": 0, "cobs": 0, "overlong": 0}
-
-    @property
-    def counters(self) -> FrameCounters:
-        """What was seen so far."""
-        return FrameCounters(
-            frames=self._frames,
-            kept_bytes=self._kept,
-            discarded_bytes=self._discarded,
-            empty=self._empty,
-            **self._damage,
-        )
+        self.counters = FrameCounters()
 
     @property
     def pending(self) -> int:
@@ -235,37 +223,37 @@ class FrameDecoder:
         found: list[bytes] = []
         for run in runs:
             if not run:
-                self._empty += 1
+                self.counters.empty += 1
                 continue
             payload = self._open(run)
             if payload is None:
-                self._discarded += len(run) + 1
+                self.counters.discarded_bytes += len(run) + 1
             else:
-                self._kept += len(run) + 1
+                self.counters.kept_bytes += len(run) + 1
                 found.append(payload)
         if len(tail) > self._longest:
             self._inside_overlong = True
-            self._damage["overlong"] += 1
-            self._discarded += len(tail)
+            self.counters.overlong += 1
+            self.counters.discarded_bytes += len(tail)
             tail = b""
         self._tail = tail
-        self._frames += len(found)
+        self.counters.frames += len(found)
         return found
 
     def _leave_overlong(self, runs: list[bytes], tail: bytes) -> bytes:
         """Discard what still belongs to a run that was too long; return what is left of the tail."""
         if runs:
             self._inside_overlong = False
-            self._discarded += len(runs.pop(0)) + 1
+            self.counters.discarded_bytes += len(runs.pop(0)) + 1
             return tail
-        self._discarded += len(tail)
+        self.counters.discarded_bytes += len(tail)
         return b""
 
     def _open(self, run: bytes) -> bytes | None:
         """Undo COBS and check; None, counted, for a damaged run. Called for every frame: kept flat for speed."""
         end = len(run)
         if end > self._longest:
-            self._damage["overlong"] += 1
+            self.counters.overlong += 1
             return None
         body = bytearray(run)
         at = 0
@@ -274,14 +262,14 @@ class FrameDecoder:
             body[at] = 0
             at += step
         if at != end:
-            self._damage["cobs"] += 1
+            self.counters.cobs += 1
             return None
         payload = bytes(body[1:-CRC_BYTES])
         if not payload:
-            self._damage["length"] += 1
+            self.counters.length += 1
             return None
         if crc_hqx(payload, 0) != body[-2] | body[-1] << 8:
-            self._damage["crc"] += 1
+            self.counters.crc += 1
             return None
         if len(payload) not in self._lengths.get(payload[0], ()) and not self._allowed(payload):
             return None
@@ -291,10 +279,10 @@ class FrameDecoder:
         """Judge a frame with sound CRC that has not a length of its code."""
         kind = self._kinds.get(payload[0])
         if kind is None:
-            self._damage["code"] += 1
+            self.counters.code += 1
             return False
         # Another version's identity may be longer or shorter; it must get through, so that its version can be named.
         other_version = kind.name == "identity" and len(payload) > 2 and payload[2] != table().version
         if not other_version:
-            self._damage["length"] += 1
+            self.counters.length += 1
         return other_version

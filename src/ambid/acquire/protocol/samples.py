@@ -44,7 +44,7 @@ class Samples:
         return [slice(a, b) for a, b in zip([0, *cuts], [*cuts, len(self.ticks)], strict=True)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class SampleCounters:
     """What became of the frames of samples, since the decoder was made."""
 
@@ -85,22 +85,10 @@ class SampleDecoder:
             for cause in table().enums["cause"]:
                 self._known[state.value | cause.value << 4] = True
         self._rate = rate_hz or math.nan
-        self._given = self._lost = self._gaps = self._damaged = self._misnumbered = self._repeated = 0
+        self.counters = SampleCounters()
         self._held = b""  # one sample whose number jumped, until the next one speaks for it
         self._held_s: float | None = None  # and when it arrived
         self.restart()
-
-    @property
-    def counters(self) -> SampleCounters:
-        """What was counted so far."""
-        return SampleCounters(
-            samples=self._given,
-            lost=self._lost,
-            gaps=self._gaps,
-            damaged=self._damaged,
-            misnumbered=self._misnumbered,
-            repeated=self._repeated,
-        )
 
     @property
     def next_tick(self) -> int | None:
@@ -113,7 +101,7 @@ class SampleDecoder:
         `first`: number of its first sample; None: any, of a stream joined on its way.
         """
         self._last = None if first is None else first - 1
-        self._misnumbered += bool(self._held)
+        self.counters.misnumbered += bool(self._held)
         self._held = b""
         self._zero_s = math.inf  # earliest time, by the host's clock, that tick 0 can have had
         self._zero_at = 0.0
@@ -138,8 +126,8 @@ class SampleDecoder:
         if not 0 < missing < _STATUS_WRAP // 2:
             return rest
         gap = (self._last + 1, missing)
-        self._lost += missing
-        self._gaps += 1
+        self.counters.lost += missing
+        self.counters.gaps += 1
         self._last += missing
         return replace(rest, gaps=(*rest.gaps, gap))
 
@@ -154,7 +142,7 @@ class SampleDecoder:
         keep = numbers >= 0
         if not keep.all():
             raw, numbers = raw[keep], numbers[keep]
-        self._given += len(raw)
+        self.counters.samples += len(raw)
         if len(raw):
             self._note_time(arrived_s)
         values = raw["values"].astype(np.float64)
@@ -169,12 +157,12 @@ class SampleDecoder:
         size = self._layout.itemsize
         frames = list(payloads)
         sound = [p for p in frames if len(p) == size and p[0] == self._code]
-        self._damaged += len(frames) - len(sound)
+        self.counters.damaged += len(frames) - len(sound)
         return np.frombuffer(b"".join(sound), dtype=self._layout)
 
     def _sound(self, raw: NDArray[np.void]) -> NDArray[np.bool_]:
         sound: NDArray[np.bool_] = self._known[raw["state"]]
-        self._damaged += len(raw) - int(np.count_nonzero(sound))
+        self.counters.damaged += len(raw) - int(np.count_nonzero(sound))
         return sound
 
     def _number(
@@ -193,19 +181,19 @@ class SampleDecoder:
             short = (tick - last) % _WRAP
             step = short if short == 1 else short + _WRAP * self._wraps(last + short, arrived_s)
             if step == 0:
-                self._repeated += 1
+                self.counters.repeated += 1
                 begin, step = begin + 1, 1
             elif step > 1 and end - begin == 1 and not (final and end == len(ticks)):
                 if end == len(ticks):
                     self._held, self._held_s = raw[begin:].tobytes(), arrived_s
                     continue
                 if 0 < (int(ticks[end]) - last) % _WRAP < short:
-                    self._misnumbered += 1
+                    self.counters.misnumbered += 1
                     continue
             if step > 1:
                 gaps.append((last + 1, step - 1))
-                self._lost += step - 1
-                self._gaps += 1
+                self.counters.lost += step - 1
+                self.counters.gaps += 1
             numbers[begin:end] = last + step + np.arange(end - begin)
             self._last = last + step + end - begin - 1
         return numbers, gaps
