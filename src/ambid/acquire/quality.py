@@ -175,19 +175,19 @@ class ColumnQuality:
     name: str  # as the device has it
     role: str
     unit: str
-    mean: float  # in `unit`; NaN without samples
-    sd: float
-    rms: float
-    least: float  # extremes, in `unit`
-    most: float
-    saturated: float  # share of the samples at an end of the column's span, 0 to 1
-    used: float | None  # share of the span between the extremes; None where the span is not known
+    mean: float = math.nan  # in `unit`; NaN without samples
+    sd: float = math.nan
+    rms: float = math.nan
+    least: float = math.nan  # extremes, in `unit`
+    most: float = math.nan
+    saturated: float = 0.0  # share of the samples at an end of the column's span, 0 to 1
+    used: float | None = None  # share of the span between the extremes; None where the span is not known
     # what the excitation makes of it and what it does not, in `unit`. By differences the noise is an upper bound.
-    signal_sd: float
-    noise_sd: float
-    snr_db: float | None  # signal over noise, dB; infinite without noise, None where nothing moves
-    noise_by: Literal["periods", "differences"]  # how the noise was told from the signal
-    still_s: float  # longest time for which the value did not change, s of the device's clock
+    signal_sd: float = math.nan
+    noise_sd: float = math.nan
+    snr_db: float | None = None  # signal over noise, dB; infinite without noise, None where nothing moves
+    noise_by: Literal["periods", "differences"] = "differences"  # how the noise was told from the signal
+    still_s: float = 0.0  # longest time for which the value did not change, s of the device's clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,15 +226,12 @@ class Quality:
         self._whole = False  # whether the sample before the next one was there, and sound
         self._lost = self._gaps = self._repeated = self._damaged = 0
 
+    @np.errstate(all="ignore")  # what is too large for sums makes them no number: the verdict says so
     def add(self, frame: Frame) -> None:
         """Take the next block.
 
         `frame`: values of shape (n_samples, n_columns), in the device's units.
         """
-        with np.errstate(all="ignore"):  # what is too large for sums makes them no number: the verdict says so
-            self._add(frame)
-
-    def _add(self, frame: Frame) -> None:
         first, x = frame.block.first, frame.block.values
         if self._first is None:
             self._first = self._next = first
@@ -260,15 +257,9 @@ class Quality:
             self._take(first + begin, x[begin:end])
         self._whole = bool(sound[-1])
 
+    @np.errstate(all="ignore")
     def report(self) -> QualityReport:
-        """Return how good the stream is so far.
-
-        Returns with what is not good enough, in words.
-        """
-        with np.errstate(all="ignore"):
-            return self._report()
-
-    def _report(self) -> QualityReport:
+        """Return how good the stream is so far, with what is not good enough in words."""
         measured, sd = self._rate.slope()
         made = QualityReport(
             samples=self._moments.count,
@@ -301,7 +292,7 @@ class Quality:
     def _columns(self) -> tuple[ColumnQuality, ...]:
         m = self._moments
         if m.count == 0:
-            return tuple(_empty(c.name, c.role, c.unit) for c in self._info.columns)
+            return tuple(ColumnQuality(name=c.name, role=c.role, unit=c.unit) for c in self._info.columns)
         by: Literal["periods", "differences"] = "differences"
         noise = np.minimum(self._differences.variance, m.variance)
         signal = m.variance - noise
@@ -341,27 +332,6 @@ def _decibels(signal: float, noise: float) -> float | None:
     if signal <= 0.0:
         return None
     return math.inf if noise <= 0.0 else 10.0 * math.log10(signal / noise)
-
-
-def _empty(name: str, role: str, unit: str) -> ColumnQuality:
-    nan = math.nan
-    return ColumnQuality(
-        name=name,
-        role=role,
-        unit=unit,
-        mean=nan,
-        sd=nan,
-        rms=nan,
-        least=nan,
-        most=nan,
-        saturated=0.0,
-        used=None,
-        signal_sd=nan,
-        noise_sd=nan,
-        snr_db=None,
-        noise_by="differences",
-        still_s=0.0,
-    )
 
 
 def verdict(report: QualityReport, info: DeviceInfo) -> tuple[str, ...]:
