@@ -48,12 +48,6 @@ def test_values_take_the_narrowest_type_that_keeps_every_bit(values, name):
     assert len(payload) == values.size * layout.TYPES[name][1].itemsize
 
 
-def test_a_declared_type_is_taken_where_it_keeps_every_bit():
-    assert packed_values(np.ones((2, 2)), "float64")[0] == layout.TYPES["float64"][0]
-    assert packed_values(np.ones((2, 2)), "int32")[0] == layout.TYPES["int32"][0]
-    assert packed_values(np.full((2, 2), 0.1), "int16")[0] == layout.TYPES["float64"][0]
-
-
 def test_values_that_do_not_lie_row_by_row_come_back_in_place():
     values = np.asfortranarray(np.arange(12.0).reshape(4, 3))[::2]
     head, data = framed(values)

@@ -251,11 +251,10 @@ def test_a_disk_without_room_is_refused_before(tmp_path, monkeypatch):
 
 
 def test_numbers_that_go_back_are_stored_and_told(tmp_path):
-    told = []
-    with Recorder(tmp_path / "run.h5", header(), on_event=told.append) as recorder:
+    with Recorder(tmp_path / "run.h5", header()) as recorder:
         for k in (0, 1, 2, 1, 2, 3):
             recorder.append(block(k))
-    assert [(e.kind, e.sample) for e in told] == [("note", ROWS)]
+    assert [(e.kind, e.sample) for e in recorder.result.survey.events] == [("note", ROWS)]
     assert recorder.result.survey.misplaced == 2 * ROWS
     assert same_bits(columns_of(tmp_path / "run.h5"), values_at(0, 4 * ROWS))
     assert len(contents(recorder.journal)[0]) == 6  # kept: it holds more than the record

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
 
 from ambid.acquire.recorder.disk import REMOVED, JournalFile, disk_error, free_bytes
 from ambid.acquire.recorder.layout import (
@@ -16,11 +16,10 @@ from ambid.acquire.recorder.layout import (
     CLOSE,
     EVENT,
     HEADER,
-    NO_SAMPLE,
     Event,
     Head,
     JournalHeader,
-    event_json,
+    event_frame,
     frame_bytes,
     json_bytes,
     preamble,
@@ -34,16 +33,8 @@ _HEADER_AGAIN = 16 << 10  # the same at first, four times as many each time: no 
 _NOTHING_LOST = "What is on the disk stays in the journal"
 
 
-class Item(NamedTuple):
-    """A frame that has no number yet."""
-
-    kind: int
-    first: int
-    time_s: float
-    n_samples: int
-    n_columns: int
-    dtype: int
-    payload: bytes
+Item = tuple[Head, bytes]
+"""A frame that has no number yet, and its payload."""
 
 
 class WriteQueue:
@@ -56,7 +47,7 @@ class WriteQueue:
         self._samples = 0  # in the queue, or being written
         self._events = 0
         self._gap: list[int] | None = None  # first sample, samples and blocks that found no room since the last put
-        self.blocks = self.overruns = self.lost_samples = self.lost_events = 0
+        self.blocks = self.lost_samples = self.lost_events = 0
 
     def has_room(self, n: int) -> bool:
         """Whether `n` samples more fit; a block longer than the queue fits an empty one."""
@@ -65,7 +56,6 @@ class WriteQueue:
     def overrun(self, first: int, n: int) -> None:
         """Count a block that found no room."""
         with self._lock:
-            self.overruns += 1
             self.lost_samples += n
             if self._gap is None:
                 self._gap = [first, 0, 0]
@@ -81,13 +71,13 @@ class WriteQueue:
         """Add a frame, after the mark of what was lost before it."""
         with self._lock:
             self._mark_gap()
-            if item.kind == EVENT:
+            if item[0].kind == EVENT:
                 if self._events >= _EVENTS:
                     self.lost_events += 1
                     return
                 self._events += 1
             else:
-                self._samples += item.n_samples
+                self._samples += item[0].n_samples
                 self.blocks += 1
             self._items.append(item)
 
@@ -112,8 +102,7 @@ class WriteQueue:
         first, samples, blocks = self._gap
         self._gap = None
         what = f"{blocks} blocks found no room in the queue: the disk was too slow"
-        event = Event(kind="lost", what=what, sample=first, count=samples)
-        self._items.append(Item(EVENT, first, float("nan"), 0, 0, 0, event_json(event)))
+        self._items.append(event_frame(Event(kind="lost", what=what, sample=first, count=samples)))
 
 
 class JournalWriter:
@@ -215,12 +204,12 @@ class JournalWriter:
 
     def _write(self, items: list[Item]) -> None:
         """Write a batch in one piece; after a failure count what is not stored."""
-        samples = sum(item.n_samples for item in items)
+        samples = sum(head.n_samples for head, _ in items)
         if self.failed is not None:
             self.lost_samples += samples
         elif items:
             before = self._open.size
-            frames = [self._frame_of(item) for item in items]
+            frames = [self._frame(*item) for item in items]
             if before - self._header_at > self._header_every:
                 self._header_at, self._header_every = before, min(4 * self._header_every, _HEADER_EVERY)
                 frames.append(self._header_frame())
@@ -234,11 +223,11 @@ class JournalWriter:
     def _broken(self, failure: OSError, items: list[Item], frames: list[bytes], before: int) -> None:
         """Acknowledge what was written whole before the disk failed, and count the rest."""
         end = before
-        for item, frame in zip(items, frames, strict=False):
+        for (head, _), frame in zip(items, frames, strict=False):
             end += len(frame)
-            if item.kind == BLOCK and end > self._open.size:
+            if head.kind == BLOCK and end > self._open.size:
                 self._block -= 1
-                self.lost_samples += item.n_samples
+                self.lost_samples += head.n_samples
         self._unsynced = True
         self._sync()
         self._fail(disk_error(f"{self._open.path} cannot be written", failure, _NOTHING_LOST))
@@ -274,7 +263,7 @@ class JournalWriter:
             "lost_events": self._queue.lost_events,
         }
         try:
-            self._open.write(self._frame(CLOSE, json_bytes(totals)))
+            self._open.write(self._frame(Head(kind=CLOSE), json_bytes(totals)))
             self._unsynced = True
         except OSError as failure:
             self._broken(failure, [], [], self._open.size)
@@ -329,20 +318,15 @@ class JournalWriter:
         except Exception as failure:
             self._fault = self._fault or failure
 
-    def _frame_of(self, item: Item) -> bytes:
-        head = Head(
-            kind=item.kind, journal=self._journal, frame=self._frames, block=self._block, length=len(item.payload),
-            first=item.first, time_s=item.time_s, n_samples=item.n_samples, n_columns=item.n_columns, dtype=item.dtype,
-        )  # fmt: skip
+    def _frame(self, head: Head, payload: bytes) -> bytes:
+        """Number a frame and put it together."""
+        head = replace(head, journal=self._journal, frame=self._frames, block=self._block, length=len(payload))
         self._frames += 1
-        self._block += item.kind == BLOCK
-        return frame_bytes(head, item.payload)
-
-    def _frame(self, kind: int, payload: bytes) -> bytes:
-        return self._frame_of(Item(kind, NO_SAMPLE, float("nan"), 0, 0, 0, payload))
+        self._block += head.kind == BLOCK
+        return frame_bytes(head, payload)
 
     def _header_frame(self) -> bytes:
-        return self._frame(HEADER, self._header)
+        return self._frame(Head(kind=HEADER), self._header)
 
     @property
     def _open(self) -> JournalFile:

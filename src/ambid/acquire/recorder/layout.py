@@ -135,23 +135,6 @@ def json_bytes(value: object) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
 
-def event_json(event: Event) -> bytes:
-    """Write an event.
-
-    Returns UTF-8.
-    """
-    return json_bytes(asdict(event))
-
-
-def event_of(text: bytes) -> Event:
-    """Read an event.
-
-    `text`: that `event_json` wrote.
-    """
-    found = json.loads(text)
-    return Event(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
-
-
 def journal_path(path: Path) -> Path:
     """Return where the journal of a record lies.
 
@@ -201,10 +184,10 @@ class Head:
     """Head of a frame."""
 
     kind: int  # `HEADER`, `BLOCK`, `EVENT` or `CLOSE`
-    journal: int  # number of the journal that it belongs to
-    frame: int  # running number of the frame
-    block: int  # blocks before it: the running number of a block
-    length: int  # bytes of the payload
+    journal: int = 0  # number of the journal that it belongs to
+    frame: int = 0  # running number of the frame
+    block: int = 0  # blocks before it: the running number of a block
+    length: int = 0  # bytes of the payload
     first: int = NO_SAMPLE  # number of the first sample; `NO_SAMPLE` where there is none
     time_s: float = float("nan")  # of the first sample by the acquisition's clock, s
     n_samples: int = 0  # rows and columns of a block
@@ -215,6 +198,20 @@ class Head:
     def size(self) -> int:
         """Bytes of the whole frame."""
         return OVERHEAD + self.length
+
+
+def event_frame(event: Event) -> tuple[Head, bytes]:
+    """Return the frame of an event, not numbered yet, and its payload."""
+    return Head(kind=EVENT, first=NO_SAMPLE if event.sample is None else event.sample), json_bytes(asdict(event))
+
+
+def event_of(text: bytes) -> Event:
+    """Read an event.
+
+    `text`: payload of `event_frame`.
+    """
+    found = json.loads(text)
+    return Event(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
 
 
 def preamble() -> bytes:
@@ -283,17 +280,16 @@ def is_whole(data: bytes, head: Head) -> bool:
     return crc32(memoryview(data)[:end]) == int(_CRC.unpack_from(data, end)[0])
 
 
-def packed_values(values: NDArray[np.float64], declared: str | None = None) -> tuple[int, bytes]:
+def packed_values(values: NDArray[np.float64]) -> tuple[int, bytes]:
     """Write values in the narrowest type that gives every bit of them back.
 
-    `values`: (n_samples, n_columns), float64, anything, NaN and signed zeros included; `declared`: type to be tried
-    first, e.g. ``"float64"`` to have them as they are. Returns `code`: of the type; `payload`: row by row.
+    `values`: (n_samples, n_columns), float64, anything, NaN and signed zeros included. Returns code of the type, and
+    the payload row by row.
     """
     plain = np.ascontiguousarray(values, dtype="<f8")
     bits = plain.tobytes()
     with np.errstate(invalid="ignore", over="ignore"):
-        names = ([declared] if declared else []) + _candidates(float(plain.flat[0]) if plain.size else 0.0)
-        for name in names:
+        for name in _candidates(float(plain.flat[0]) if plain.size else 0.0):
             code, dtype = TYPES[name]
             narrow = plain.astype(dtype)
             if narrow.astype("<f8").tobytes() == bits:

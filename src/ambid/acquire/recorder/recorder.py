@@ -15,17 +15,16 @@ from typing import Any, Self
 import numpy as np
 
 from ambid.acquire.device import DeviceEvent
-from ambid.acquire.recorder._writer import Item, JournalWriter, WriteQueue
+from ambid.acquire.recorder._writer import JournalWriter, WriteQueue
 from ambid.acquire.recorder.convert import Recorded, check_target, recorded_from
 from ambid.acquire.recorder.disk import JournalFile, disk_error, free_bytes
 from ambid.acquire.recorder.layout import (
     BLOCK,
-    EVENT,
     LARGEST,
-    NO_SAMPLE,
     Event,
+    Head,
     JournalHeader,
-    event_json,
+    event_frame,
     journal_path,
     packed_values,
 )
@@ -45,7 +44,7 @@ class Recorder:
     `on_trouble`: takes a `DeviceError` as soon as something is wrong, in whichever thread sees it; `open_file`: makes
     the file from its path.
 
-    `path`: the record to be, and its journal; `journal`: the record to be, and its journal; `result`: what became of
+    `path`, `journal`: the record to be, and its journal; `result`: what became of
     it, once closed; None before, and where nothing was recorded.
     """
 
@@ -58,18 +57,15 @@ class Recorder:
         write_s: float = 0.05,
         queue_s: float = 10.0,
         seconds: float | None = None,
-        dtype: str | None = None,
         force: bool = False,
         on_acknowledged: Callable[[int], object] | None = None,
         on_trouble: Callable[[DeviceError], object] | None = None,
-        on_event: Callable[[Event], object] | None = None,
         open_file: Callable[[Path], JournalFile] = JournalFile,
     ) -> None:
         self.path = Path(path)
         self.journal = journal_path(self.path)
         self.result: Recorded | None = None
-        self._header, self._dtype, self._force, self._seconds = header, dtype, force, seconds
-        self._open_file, self._on_event = open_file, on_event
+        self._header, self._force, self._seconds, self._open_file = header, force, seconds, open_file
         self._queue = WriteQueue(max(1, round(queue_s * header.rate_hz)))
         self._writer = JournalWriter(
             self._queue, header, sync_s=sync_s, write_s=min(write_s, sync_s), least_free=self._reserve(),
@@ -101,11 +97,6 @@ class Recorder:
         return self._queue.blocks
 
     @property
-    def overruns(self) -> int:
-        """Number of blocks that found no room because the disk was too slow."""
-        return self._queue.overruns
-
-    @property
     def lost_samples(self) -> int:
         """Samples that were appended and are not in the journal: no room, or after the disk had failed."""
         return self._queue.lost_samples + self._writer.lost_samples
@@ -125,29 +116,29 @@ class Recorder:
         if n == 0:
             return True
         if self._next is not None and block.first < self._next:
-            self._own_event("note", f"numbers of samples went back from {self._next} to {block.first}", block.first)
+            what = f"numbers of samples went back from {self._next} to {block.first}"
+            self.event(Event(kind="note", what=what, sample=int(block.first)))
         self._next = block.first + n
         if self._writer.failed or self._closed:
             self._queue.count_lost(n)
             return False
         if not self._queue.has_room(n):
             self._queue.overrun(block.first, n)
-            self._tell(
-                Event(kind="lost", what="no room in the queue: the disk is too slow", sample=block.first, count=n)
-            )
             self._writer.trouble("slow", f"the disk of {self.journal} is too slow: samples are lost from number"
                                  f" {block.first} on. They are counted; end what else uses the disk")  # fmt: skip
             return False
         self._writer.over("slow")
-        code, payload = packed_values(values, self._dtype)
-        self._queue.put(Item(BLOCK, int(block.first), float(block.time_s), n, values.shape[1], code, payload))
+        code, payload = packed_values(values)
+        head = Head(
+            kind=BLOCK, first=int(block.first), time_s=float(block.time_s), n_samples=n, n_columns=values.shape[1],
+            dtype=code,
+        )  # fmt: skip
+        self._queue.put((head, payload))
         return True
 
     def event(self, event: Event | DeviceEvent) -> None:
         """Put something that happened into the journal, in its place between the blocks."""
-        own = event if isinstance(event, Event) else Event.of(event)
-        sample = NO_SAMPLE if own.sample is None else own.sample
-        self._queue.put(Item(EVENT, sample, float("nan"), 0, 0, 0, event_json(own)))
+        self._queue.put(event_frame(event if isinstance(event, Event) else Event.of(event)))
 
     def flush(self, timeout_s: float = 60.0) -> bool:
         """Wait until everything that was taken is on the disk.
@@ -198,15 +189,6 @@ class Recorder:
         if not isinstance(block.first, int | np.integer) or not -(2**62) < block.first < 2**62:
             raise DeviceError(f"a block begins at sample {block.first}; numbers of samples are whole and below 2^62")
         return values
-
-    def _own_event(self, kind: str, what: str, sample: int) -> None:
-        event = Event(kind=kind, what=what, sample=int(sample))
-        self.event(event)
-        self._tell(event)
-
-    def _tell(self, event: Event) -> None:
-        if self._on_event is not None:
-            self._on_event(event)
 
     def _bytes_per_s(self) -> float:
         """Bytes of a second, as far as can be told before: counts take two a value."""
