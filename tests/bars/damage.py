@@ -88,9 +88,9 @@ class Attacker(Host):
         if state == "levitating":
             return
         self.ask("clear" if state == "fault" else "stop")
-        self.ask("configure", **self.settings.configure())
-        self.ask("limits", **self.settings.limits())
-        self.ask("gains", **self.settings.gains())
+        self.ask("configure", **self.settings.fields("configure"))
+        self.ask("limits", **self.settings.fields("limits"))
+        self.ask("gains", **self.settings.fields("gains"))
         self.start()
 
 
@@ -132,7 +132,9 @@ def senseless(rig, folder, rng, n):
             asked = _any_command(rng, 1)
             fields = {k: v for k, v in asked.fields.items() if k != "id"}
             if asked.name == "gains" and rng.random() < 0.7:  # some that are taken, most of which let the rotor down
-                fields = {k: max(0, round(v * rng.uniform(-0.2, 1.5))) for k, v in host.settings.gains().items()}
+                fields = {
+                    k: max(0, round(v * rng.uniform(-0.2, 1.5))) for k, v in host.settings.fields("gains").items()
+                }
             host.ask(asked.name, expect=None, values=asked.values, **fields)
             host.lift()
         return _survived(host, folder)
@@ -186,7 +188,7 @@ def _survived(host, folder):
     edges = [e["t"] for e in host.bench.events("enable")]
     duty, t = rows[:, 5], rows[:, 0]
     aloft = rows[(t > edges[0] + 0.45) & (t < edges[1])]
-    limits = host.settings.limits()
+    limits = host.settings.fields("limits")
     return Survived(
         sent=sent, counted=status["rx_errors"] - host.before["rx_errors"], expected=expected,
         carried_out=sound, rx_lost=status["rx_lost"] - host.before["rx_lost"],

@@ -133,11 +133,11 @@ class Host:
     def prepare(self, *, stream=None, period=None):
         """Identify, and tell the settings of the rig."""
         self.ask("identify")
-        wanted = self.settings.configure() | ({} if stream is None else {"stream": stream})
+        wanted = self.settings.fields("configure") | ({} if stream is None else {"stream": stream})
         self.stream = wanted["stream"]
         self.ask("configure", **(wanted | ({} if period is None else {"period": period})))
-        self.ask("limits", **self.settings.limits())
-        self.ask("gains", **self.settings.gains())
+        self.ask("limits", **self.settings.fields("limits"))
+        self.ask("gains", **self.settings.fields("gains"))
 
     def start(self, mode=_LEVITATE):
         self.heard = Heard()

@@ -122,7 +122,7 @@ def _stays(host, what):
         wrong.append(f"causes {[table().name('cause', c) for c in set(causes[first:].tolist())]}")
     # Where an interrupt found the accident, the tick under way had ordered its pulse width already.
     duty = host.column("duty")
-    if (duty[first + 1 :] != host.settings.limits()["duty_off"]).any():
+    if (duty[first + 1 :] != host.settings.fields("limits")["duty_off"]).any():
         wrong.append("the pulse width is not duty_off")
     host.ask("clear")
     status = host.ask("ask_status")

@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Damage, Recorded, Recorder, Survey, journal_path
+from ambid.acquire.recorder import Recorded, Recorder, journal_path
+from ambid.acquire.recorder.reader import Damage, Survey
 from ambid.cli.recover import _lacks
 from ambid.record import read_record
 from tests.acquire.recorder.signals import ROWS, block, header, same_bits, values_at

@@ -78,9 +78,9 @@ def test_the_controller_takes_what_is_made_from_a_rig(console, name):
     s = controller_settings(with_default_daq(of_preset(name)))
     lines = console(
         [
-            command("configure", 1, **s.configure()),
-            command("limits", 2, **s.limits()),
-            command("gains", 3, **s.gains()),
+            command("configure", 1, **s.fields("configure")),
+            command("limits", 2, **s.fields("limits")),
+            command("gains", 3, **s.fields("gains")),
         ]
     )
     assert [code(line) for line in lines] == [(0, 0)] * 3
@@ -88,7 +88,7 @@ def test_the_controller_takes_what_is_made_from_a_rig(console, name):
 
 def test_the_controller_takes_the_fastest_rate_that_the_line_allows(console):
     s = controller_settings(bench(("rate_hz = 2000.0", 'rate_hz = 4000.0\nthird = "hall"')))
-    assert code(console([command("configure", 1, **s.configure())])[0]) == (0, 0)
+    assert code(console([command("configure", 1, **s.fields("configure"))])[0]) == (0, 0)
 
 
 def test_the_law_in_counts_is_the_loop_in_si(console):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ambid.acquire.default_daq import default_daq_notes, with_default_daq
 from ambid.acquire.device import Column
+from ambid.acquire.protocol.table import table
 from ambid.acquire.scales import (
     ADC_TOP,
     BYTE_BITS,
@@ -39,26 +39,11 @@ from ambid.physics.loop import Loop
 from ambid.physics.models import model
 from ambid.rig.rig import Daq, Rig
 
-__all__ = [
-    "STREAM",
-    "ControllerSettings",
-    "columns",
-    "controller_settings",
-    "default_daq_notes",
-    "in_si",
-    "realised",
-    "rest_of",
-    "with_default_daq",
-]
-
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
 """Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
 
 _FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
 _FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state, CRC, COBS, end
-_CONFIGURE = ("period", "stream")
-_LIMITS = ("position_low", "position_high", "current_low", "current_high", "duty_low", "duty_high", "duty_off")
-_GAINS = ("kp", "ki", "kd", "pole", "kc", "setpoint", "current_rest", "duty_bias")
 STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
 """Roles of what a sample may carry, in the order of the bits of the stream mask and of a block's columns."""
 
@@ -102,17 +87,9 @@ class ControllerSettings:
         """True where any gain acts: without one there is nothing to levitate with."""
         return any((self.kp, self.ki, self.kd, self.kc))
 
-    def configure(self) -> dict[str, int]:
-        """Return the fields of the message ``configure``, without its number."""
-        return {name: getattr(self, name) for name in _CONFIGURE}
-
-    def limits(self) -> dict[str, int]:
-        """Return the fields of the message ``limits``, without its number."""
-        return {name: getattr(self, name) for name in (*_LIMITS, "host_ms", "lift_ms")}
-
-    def gains(self) -> dict[str, int]:
-        """Return the fields of the message ``gains``, without its number."""
-        return {name: getattr(self, name) for name in _GAINS}
+    def fields(self, message: str) -> dict[str, int]:
+        """Return the fields of the message ``configure``, ``limits`` or ``gains``, without its number."""
+        return {f.name: getattr(self, f.name) for f in table().messages[message].fixed if f.name != "id"}
 
 
 def controller_settings(rig: Rig) -> ControllerSettings:

@@ -57,9 +57,10 @@ def open_bench(
 
 def _notes(port: str, rig: Rig, bench: Preset | Rig | None) -> tuple[str, ...]:
     """What is made up for a rig, and what its controller will do only roughly."""
+    from ambid.acquire.default_daq import default_daq_notes, with_default_daq
     from ambid.acquire.devices.benches import bench_parameters
     from ambid.acquire.review import review
-    from ambid.acquire.settings import controller_settings, default_daq_notes, with_default_daq
+    from ambid.acquire.settings import controller_settings
 
     if port.startswith("replay:"):
         return ()

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import JournalHeader, Recorder, _writer, journal_path
+from ambid.acquire.recorder import JournalHeader, Recorder, journal_path
+from ambid.acquire.recorder import recorder as recorder_module
 from ambid.acquire.recorder.layout import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE, json_bytes
 from ambid.errors import DeviceError
 from ambid.record import read_record
@@ -212,9 +213,9 @@ def test_a_folder_that_becomes_read_only_is_told_while_recording(tmp_path, monke
 
 def test_a_disk_that_is_nearly_full_is_told_once(tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(_writer, "_LOOK_S", 0.0)
-    monkeypatch.setattr(_writer, "free_bytes", lambda folder: 1 << 20)
+    monkeypatch.setattr(recorder_module, "_LOOK_S", 0.0)
     with Recorder(tmp_path / "run.h5", header(), on_trouble=told.append) as recorder:
+        monkeypatch.setattr(recorder_module, "free_bytes", lambda folder: 1 << 20)
         for k in range(5):
             recorder.append(block(k))
             assert recorder.flush()

@@ -6,7 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Event, JournalReader, Recorder, _writer, layout
+from ambid.acquire.recorder import Event, JournalReader, Recorder, layout
+from ambid.acquire.recorder import recorder as recorder_module
 from ambid.acquire.recorder.layout import HEADER, Head, frame_bytes, json_bytes, preamble
 from ambid.errors import DeviceError
 from ambid.track.blocks import Block
@@ -112,7 +113,7 @@ def test_a_frame_of_another_journal_is_no_part_of_this_one(tmp_path, data):
 
 
 def test_the_header_comes_again_so_that_damage_at_the_beginning_costs_no_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(_writer, "_HEADER_EVERY", 100)
+    monkeypatch.setattr(recorder_module, "_HEADER_EVERY", 100)
     with Recorder(tmp_path / "source.h5", header(), write_s=1e-3) as recorder:
         for k in range(BLOCKS):
             recorder.append(block(k))

@@ -22,17 +22,8 @@ OVER_CURRENT, OUT_OF_GAP = 3, 4
 NONE, STEP, PRBS, TABLE = 0, 1, 2, 3
 
 # Places in `settings`.
-KP, KI, KD, POLE, KC, SETPOINT, REST, BIAS = 0, 1, 2, 3, 4, 5, 6, 7
-POSITION_LOW, POSITION_HIGH, CURRENT_LOW, CURRENT_HIGH, DUTY_LOW, DUTY_HIGH, DUTY_OFF, LIFT = (
-    8,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-)
+KP, KI, KD, POLE, KC, SETPOINT, REST, BIAS = range(8)
+POSITION_LOW, POSITION_HIGH, CURRENT_LOW, CURRENT_HIGH, DUTY_LOW, DUTY_HIGH, DUTY_OFF, LIFT = range(8, 16)
 KIND, AMPLITUDE, HOLD, LENGTH, CYCLES, TOP, TOP_DUTY = 16, 17, 18, 19, 20, 21, 22
 SETTLED = 23  # ticks inside its limits after which the position counts
 N_SETTINGS = 24
