@@ -45,7 +45,7 @@ class Fit:
     evaluations: int
     start_s: float = 0.0  # time that finding start values took before this search, s
     work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
-    # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue.rescued`
+    # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue`
     global_search: Mapping[str, object] | None = None
 
 
