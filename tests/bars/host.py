@@ -15,7 +15,7 @@ import numpy as np
 import ambid
 from ambid.acquire.devices.benches import plant_text
 from ambid.acquire.devices.emulated import Emulator
-from ambid.acquire.link.port import open_port
+from ambid.acquire.devices.port import open_port
 from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
 from ambid.acquire.protocol.table import table
 from ambid.acquire.settings import controller_settings

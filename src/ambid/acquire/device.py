@@ -61,13 +61,13 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceEvent:
-    """Something that a device told beside its samples."""
+    """Something that a device told beside its samples, or that stands among them in a recording."""
 
-    # a fault with its safe state, another change of state, samples that never came, frames whose check value was
-    # wrong, or the state of the line
-    kind: Literal["fault", "state", "lost", "damaged", "link"]
-    sample: int | None  # number of the sample at which it happened, where that is known
+    # ``fault`` (with its safe state), ``state`` (another change of state), ``lost`` (samples that never came),
+    # ``damaged`` (frames whose check value was wrong), ``link`` (the line); in a recording ``excitation``, ``note`` too
+    kind: str
     what: str  # for a fault the cause (enum ``cause``), for a state its name; else one line for a person
+    sample: int | None = None  # number of the sample at which it happened, where that is known
     count: int = 0  # samples or frames concerned
 
 

@@ -10,7 +10,7 @@ from typing import TypedDict, Unpack
 
 from ambid.acquire.device import Counters, Device, DeviceEvent, DeviceInfo
 from ambid.acquire.quality import Quality, QualityReport
-from ambid.acquire.recorder import Event, JournalHeader, Recorded, Recorder
+from ambid.acquire.recorder import JournalHeader, Recorded, Recorder
 from ambid.acquire.session import Course, RunReport, Tap, run
 from ambid.errors import DeviceError
 from ambid.rig import Rig
@@ -119,7 +119,7 @@ def recording(
     try:
         with recorder:
             if course.program is not None:
-                recorder.event(Event(kind="excitation", what=str(course.program)))
+                recorder.event(DeviceEvent(kind="excitation", what=str(course.program)))
             yield Recording(recorder, device, course, listeners, troubles)
     except DeviceError as failure:
         if recorder.result is None:

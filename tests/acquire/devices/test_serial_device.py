@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ambid.acquire.devices.line_device import SerialDevice
-from ambid.acquire.link.reader import ClockDrift
+from ambid.acquire.devices.line_device import ClockDrift, SerialDevice
 from ambid.errors import DeviceError, RigError
 from ambid.rig import default_rig, load_rig
 from tests.acquire.fake import FakeController, PtyBoard
@@ -188,7 +187,8 @@ def test_a_start_that_is_refused_leaves_it_idle(board):
 
 
 def test_a_reader_who_is_too_slow_loses_counted_blocks(board):
-    with device_on(board, room=500) as device:
+    with device_on(board) as device:
+        device._stream.frames.room = 500
         device.start("sample")
         until(lambda: device.counters().overruns >= 3)
         found = read(device, 400)

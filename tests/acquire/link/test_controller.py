@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from ambid.acquire.link.controller import Controller
+from ambid.acquire.devices.controller import Controller
 from ambid.acquire.protocol.codec import encode, message
 from ambid.errors import DeviceError
 from tests.acquire.fake import STATE, FakeController, PipePort
@@ -161,7 +161,7 @@ def test_a_defect_in_who_listens_is_told_and_ends_the_pings():
 
 def test_a_ping_takes_no_number_from_the_commands(monkeypatch):
     """Else the 255th number after a command is its own again, and what has it is taken for the same command."""
-    monkeypatch.setattr("ambid.acquire.link.controller._PING_S", 0.001)
+    monkeypatch.setattr("ambid.acquire.devices.controller._PING_S", 0.001)
     board, numbers = FakeController(), []
     with Session(board) as s:
         s.controller.identify()

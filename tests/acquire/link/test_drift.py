@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.acquire.link.reader import ClockDrift
+from ambid.acquire.devices.line_device import ClockDrift
 
 
 def learned(drift, *, seconds=60.0, rate=2000.0, step=20, seed=0, mean=2e-3, stall=None, grows=None):

@@ -6,8 +6,8 @@ import os
 import pytest
 import serial
 
-from ambid.acquire.link import port as ports
-from ambid.acquire.link.port import candidate_ports, open_port
+from ambid.acquire.devices import port as ports
+from ambid.acquire.devices.port import candidate_ports, open_port
 from ambid.errors import DeviceError
 from tests.acquire.fake import FakeController, PtyBoard
 

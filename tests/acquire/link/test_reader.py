@@ -3,7 +3,7 @@
 import threading
 import time
 
-from ambid.acquire.link.reader import Reader
+from ambid.acquire.devices.controller import Reader
 
 HANG_S = 60.0
 

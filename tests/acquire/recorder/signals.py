@@ -6,8 +6,8 @@ import threading
 
 import numpy as np
 
-from ambid.acquire.device import Column
-from ambid.acquire.recorder import Event, JournalHeader, JournalReader
+from ambid.acquire.device import Column, DeviceEvent
+from ambid.acquire.recorder import JournalHeader, JournalReader
 from ambid.acquire.recorder.disk import JournalFile
 from ambid.track.blocks import Block
 
@@ -46,7 +46,7 @@ def contents(path):
     with JournalReader.open(path) as reader:
         items = list(reader.items())
         blocks = [i for i in items if isinstance(i, Block)]
-        return blocks, [i for i in items if isinstance(i, Event)], reader.damage
+        return blocks, [i for i in items if isinstance(i, DeviceEvent)], reader.damage
 
 
 class FullDisk(JournalFile):

@@ -6,7 +6,8 @@ import os
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Event, JournalReader, Recorder, layout
+from ambid.acquire.device import DeviceEvent
+from ambid.acquire.recorder import JournalReader, Recorder, layout
 from ambid.acquire.recorder import recorder as recorder_module
 from ambid.acquire.recorder.layout import HEADER, Head, frame_bytes, json_bytes, preamble
 from ambid.errors import DeviceError
@@ -21,7 +22,7 @@ def journal_bytes(folder, blocks=BLOCKS, events=(), name="source.h5"):
         for k in range(blocks):
             recorder.append(block(k))
             if k in events:
-                recorder.event(Event(kind="note", what=f"after {k}"))
+                recorder.event(DeviceEvent(kind="note", what=f"after {k}"))
         recorder.flush()
         return recorder.journal.read_bytes()
 

@@ -10,7 +10,6 @@ import pytest
 
 from ambid.acquire.device import Column, DeviceEvent, DeviceInfo
 from ambid.acquire.recorder import (
-    Event,
     JournalHeader,
     JournalReader,
     Recorder,
@@ -90,7 +89,7 @@ def test_header_and_events_are_beside_the_record(tmp_path):
     with Recorder(tmp_path / "run.h5", JournalHeader.of(info, "schema = 1\n")) as recorder:
         recorder.append(Block(first=0, time_s=0.0, values=np.full((ROWS, 1), 1e-4)))
         recorder.event(DeviceEvent(kind="fault", sample=12, what="over_current"))
-        recorder.event(Event(kind="excitation", what="prbs", sample=13))
+        recorder.event(DeviceEvent(kind="excitation", what="prbs", sample=13))
     found, events = read_acquisition(tmp_path / "run.h5")
     assert found.columns == columns
     assert found.rig == "schema = 1\n"

@@ -26,7 +26,7 @@ from ambid.acquire.default_daq import is_made_up, with_default_daq
 from ambid.acquire.devices.benches import plant_text
 from ambid.acquire.devices.line_device import LineDevice
 from ambid.acquire.devices.played import Pace, check_pace
-from ambid.acquire.link.port import Port, PortEnded, open_port
+from ambid.acquire.devices.port import Port, PortEnded, open_port
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig

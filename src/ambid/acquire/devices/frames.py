@@ -18,13 +18,11 @@ ROOM = 4_000_000
 class FrameQueue:
     """A queue of frames with an end, and perhaps a reason for it.
 
-    `room`: samples that wait at most.
-
-    `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
+    `room`: samples that wait at most; `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
     """
 
-    def __init__(self, room: int = ROOM) -> None:
-        self._room, self._held = room, 0
+    def __init__(self) -> None:
+        self.room, self._held = ROOM, 0
         self._frames: deque[Frame] = deque()
         self._changed = threading.Condition()
         self._ended = True
@@ -43,7 +41,7 @@ class FrameQueue:
         """
         n = len(frame.block.values)
         with self._changed:
-            if self._held + n > self._room:
+            if self._held + n > self.room:
                 self.overruns += 1
                 self.overrun_samples += n
                 return False

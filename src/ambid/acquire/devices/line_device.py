@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType, TracebackType
 from typing import Literal, Self
 
+import numpy as np
+
 from ambid.acquire.device import MODES, Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State, check_mode
-from ambid.acquire.devices.frames import ROOM, FrameQueue
-from ambid.acquire.link.controller import Controller
-from ambid.acquire.link.port import Port, open_port
-from ambid.acquire.link.reader import ClockDrift, Drift
+from ambid.acquire.devices.controller import Controller
+from ambid.acquire.devices.frames import FrameQueue
+from ambid.acquire.devices.port import Port, open_port
 from ambid.acquire.program import counts_of
 from ambid.acquire.protocol.codec import Message
 from ambid.acquire.protocol.samples import SampleCounters, SampleDecoder, Samples
@@ -28,25 +30,108 @@ from ambid.track.blocks import Block, Frame
 _NONE: Mapping[str, int] = MappingProxyType({})
 _TABLE_PART = 48  # elements in one message
 _TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv")  # of a status
+_WINDOW_S = 0.25  # at first; doubled whenever the windows are full
+_WINDOWS = 512
+_LEAST = 40  # windows before anything is said: a latency that grows at first looks like a drift, known very well
+_FITTED = 7  # windows that a line is drawn through, at least
+_OUTLIER = 4.0  # robust standard deviations above the line: a stall of the host
+_ROUNDS = 6
 _FLOWING: tuple[State, ...] = ("sampling", "driving", "levitating")
 _STATES: tuple[State, ...] = ("idle", "sampling", "driving", "levitating", "fault")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drift:
+    """What is known of a clock."""
+
+    drift: float = math.nan  # relative; positive if the controller's clock is fast, NaN while unknown
+    drift_sd: float = math.nan  # its standard deviation
+    offset_s: float = math.nan  # host time at which sample 0 was there, by `time.perf_counter`, s
+
+
+class ClockDrift:
+    """Learns from arrivals in constant memory.
+
+    `rate_hz`: samples in a second by the controller's clock.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period = 1.0 / rate_hz
+        self._width = _WINDOW_S
+        self._lowest: dict[int, tuple[float, float]] = {}  # window -> time of the earliest, how late it was
+        self._origin: float | None = None
+
+    def learn(self, number: int, arrived_s: float) -> None:
+        """Take in one arrival.
+
+        `number`: sample number; `arrived_s`: when it was there by the host's clock, s.
+        """
+        if self._origin is None:
+            self._origin = arrived_s - number * self._period
+        t = number * self._period
+        late, window = arrived_s - self._origin - t, int(t / self._width)
+        kept = self._lowest.get(window)
+        if kept is None or late < kept[1]:
+            self._lowest[window] = (t, late)
+        if len(self._lowest) > _WINDOWS:
+            self._halve()
+
+    def estimate(self) -> Drift:
+        """Return what is known by now."""
+        if self._origin is None or len(self._lowest) < _LEAST:
+            return Drift()
+        # The newest window may not be full yet: its minimum would lie too high.
+        t, late = np.array([self._lowest[w] for w in sorted(self._lowest)[:-1]]).T
+        keep = np.ones(t.size, dtype=bool)
+        slope = level = 0.0
+        for _ in range(_ROUNDS):
+            slope, level = np.polyfit(t[keep], late[keep], 1)
+            rest = late - level - slope * t
+            middle = np.median(rest[keep])
+            spread = 1.4826 * np.median(np.abs(rest[keep] - middle))
+            now = rest <= middle + _OUTLIER * max(spread, 1e-7)
+            if now.sum() < _FITTED or (now == keep).all():
+                break
+            keep = now
+        return self._told(t[keep], late[keep], float(slope), float(level))
+
+    def _told(self, t: np.ndarray, late: np.ndarray, slope: float, level: float) -> Drift:
+        """Return the line with its standard deviation, which neighbours that are late together make wider."""
+        assert self._origin is not None
+        rest = late - level - slope * t
+        n = t.size
+        variance = float(rest @ rest) / max(n - 2, 1)
+        together = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), 1e-300)
+        wider = (1.0 + max(together, 0.0)) / (1.0 - min(max(together, 0.0), 0.95))
+        sd = math.sqrt(wider * variance / max(float(((t - t.mean()) ** 2).sum()), 1e-300))
+        # Late by `slope` seconds in each second of the controller: 1 / (1 + d) = 1 + slope.
+        return Drift(drift=1.0 / (1.0 + slope) - 1.0, drift_sd=sd, offset_s=self._origin + level)
+
+    def _halve(self) -> None:
+        self._width *= 2.0
+        merged: dict[int, tuple[float, float]] = {}
+        for window, (t, late) in self._lowest.items():
+            kept = merged.get(window // 2)
+            if kept is None or late < kept[1]:
+                merged[window // 2] = (t, late)
+        self._lowest = merged
 
 
 class SampleStream:
     """Turns frames of samples into blocks and events. `heard` and `told` are called from the listener's thread.
 
     `mask`: stream mask; `real`: whether the controller's time runs with the host's; else no drift is estimated;
-    `convert`: from counts, shape (n_samples, n_columns), to what blocks hold; `room`: samples that wait at most.
+    `convert`: from counts, shape (n_samples, n_columns), to what blocks hold.
 
     `frames`: what is read; `live`: whether what the controller tells is of this session; `ending`: whether it was asked
     to stop.
     """
 
-    def __init__(self, mask: int, rate_hz: float, *, real: bool, convert: Callable[[Array], Array], room: int) -> None:
+    def __init__(self, mask: int, rate_hz: float, *, real: bool, convert: Callable[[Array], Array]) -> None:
         self._rate, self._real, self._convert = rate_hz, real, convert
         self._decoder = SampleDecoder(mask, rate_hz=rate_hz if real else None)
         self._lock = threading.RLock()
-        self.frames = FrameQueue(room)
+        self.frames = FrameQueue()
         self._base = self._next = 0  # number of tick 0 of this run, and of the next sample
         self._state: State = "idle"
         self._latched = False  # a fault that was told
@@ -202,7 +287,7 @@ class LineDevice(ABC):
 
     `rig`: with ``[daq]`` and calibrations from counts; `where`: the port's name, for whoever asks before it is open;
     `si`: columns in SI instead of in counts; `real`: whether the controller's time runs with the host's; `answer_s`:
-    how long to wait for an answer before a command is sent again, s; `room`: samples that wait at most.
+    how long to wait for an answer before a command is sent again, s.
     """
 
     def __init__(
@@ -214,13 +299,11 @@ class LineDevice(ABC):
         si: bool = False,
         real: bool = True,
         answer_s: float = 0.3,
-        room: int = ROOM,
     ) -> None:
         self._rig, self._si, self._real, self._answer_s = rig, si, real, answer_s
         self._settings = controller_settings(rig)
         rate = self._settings.rate_hz
         self._info = DeviceInfo(kind=kind, port=where, rate_hz=rate, columns=columns(rig, self._settings, si=si))
-        self._room = room
         self._stream = self._new_stream()
         self._controller: Controller | None = None
         self._status: dict[str, float] = {}
@@ -392,9 +475,7 @@ class LineDevice(ABC):
             raise
 
     def _new_stream(self) -> SampleStream:
-        return SampleStream(
-            self._settings.stream, self._settings.rate_hz, real=self._real, convert=self._converted, room=self._room
-        )
+        return SampleStream(self._settings.stream, self._settings.rate_hz, real=self._real, convert=self._converted)
 
     def _converted(self, counts: Array) -> Array:
         return in_si(self._rig, self._settings, counts) if self._si else counts
@@ -470,25 +551,14 @@ class SerialDevice(LineDevice):
     Blocks hold counts. ``Block.time_s`` is sample number over rate, by the controller's clock; its drift against the
     host's is in the counters.
 
-    `port`: such as ``/dev/ttyACM0`` or ``COM3``; `rig`: with ``[daq]`` and calibrations from counts; `baud`: bits per
-    second; default daq.baud; `answer_s`: how long to wait for an answer before a command is sent again, s; `room`:
-    samples that wait for a reader at most.
+    `port`: such as ``/dev/ttyACM0`` or ``COM3``; `rig`: with ``[daq]`` and calibrations from counts; `answer_s`: how
+    long to wait for an answer before a command is sent again, s.
     """
 
-    def __init__(
-        self,
-        port: str,
-        rig: Rig,
-        *,
-        baud: int | None = None,
-        boot_s: float | None = None,
-        real: bool = True,
-        answer_s: float = 0.3,
-        room: int = ROOM,
-    ) -> None:
-        super().__init__(rig, kind="serial", where=port, real=real, answer_s=answer_s, room=room)
+    def __init__(self, port: str, rig: Rig, *, answer_s: float = 0.3) -> None:
+        super().__init__(rig, kind="serial", where=port, answer_s=answer_s)
         assert rig.daq is not None  # else the settings were refused
-        self._port, self._baud, self._boot_s = port, baud or rig.daq.baud, boot_s
+        self._port, self._baud = port, rig.daq.baud
 
     def _open(self) -> Port:
-        return open_port(self._port, baud=self._baud, boot_s=self._boot_s)
+        return open_port(self._port, baud=self._baud)

@@ -35,7 +35,7 @@ class PlayedDevice(ABC):
     `rate_hz`: samples in one second; `block_samples`: samples of a block at most; default those of 10 ms.
     """
 
-    def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None) -> None:
+    def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None = None) -> None:
         check_pace(pace)
         size = max(1, round(rate_hz / _BLOCKS_PER_SECOND)) if block_samples is None else block_samples
         if size < 1:

@@ -29,11 +29,10 @@ class ReplayDevice(PlayedDevice):
     Each start out of idle plays it from its first row on; numbers count on. ``Block.time_s`` is what the record says,
     counted from the first row.
 
-    `path`: ``.csv``, ``.csv.gz``, ``.h5``; `rig`: its columns are played first, then all others of the record;
-    `block_samples`: samples of a block at most; default those of 10 ms.
+    `path`: ``.csv``, ``.csv.gz``, ``.h5``; `rig`: its columns are played first, then all others of the record.
     """
 
-    def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real", block_samples: int | None = None) -> None:
+    def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real") -> None:
         rows = read_rows(path, rate_hz=rig.record.rate_hz)
         record = rows.record
         missing = [c.column for c in rig.channels if c.column not in record.names]
@@ -43,7 +42,7 @@ class ReplayDevice(PlayedDevice):
                 " Correct the rig, or take another record"
             )
         _check_units(record, rig, f"record {path}")
-        super().__init__(record.rate_hz, pace, block_samples)
+        super().__init__(record.rate_hz, pace)
         roles = {c.column: c.role for c in rig.channels}
         others = {name: name if name == "excitation" else "extra" for name in record.names if name not in roles}
         try:

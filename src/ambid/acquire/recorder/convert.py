@@ -16,8 +16,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ambid.acquire.device import DeviceEvent
 from ambid.acquire.recorder.disk import sync_folder
-from ambid.acquire.recorder.layout import Event, JournalHeader
+from ambid.acquire.recorder.layout import JournalHeader
 from ambid.acquire.recorder.reader import JournalReader, Survey, survey
 from ambid.arrays import Array
 from ambid.errors import DeviceError, RecordError
@@ -123,7 +124,7 @@ def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
     return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
 
 
-def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[Event, ...]]:
+def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[DeviceEvent, ...]]:
     """Read what a recorded HDF5 file holds beside its record.
 
     Parameters
@@ -135,7 +136,7 @@ def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[Event, ...]
     -------
     header : JournalHeader
         Device, columns with their roles, text of the rig.
-    events : tuple of Event
+    events : tuple of DeviceEvent
         In their order.
 
     Raises
@@ -150,7 +151,7 @@ def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[Event, ...]
             found = json.loads(file["acquisition"].asstr()[()])
     except (OSError, KeyError, ValueError) as failure:
         raise DeviceError(f"{path} holds no acquisition ({failure}). Name a file that a recorder wrote") from None
-    return JournalHeader.from_json(found["header"]), tuple(Event(**e) for e in found["events"])
+    return JournalHeader.from_json(found["header"]), tuple(DeviceEvent(**e) for e in found["events"])
 
 
 def _texts(header: JournalHeader, found: Survey) -> dict[str, str]:

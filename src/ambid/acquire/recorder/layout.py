@@ -111,22 +111,6 @@ def _check_unit(column: Column) -> None:
                           f" Give it in [{unit.si}]")  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Event:
-    """Something that happened while samples were recorded."""
-
-    # as `DeviceEvent` has it (``fault``, ``state``, ``lost``, ``damaged``, ``link``), or ``excitation``, ``note``
-    kind: str
-    what: str  # cause, state, or one line for a person
-    sample: int | None = None  # number of the sample at which it happened, where that is known
-    count: int = 0  # samples or frames concerned
-
-    @classmethod
-    def of(cls, told: DeviceEvent) -> Self:
-        """Take over what a device told."""
-        return cls(kind=told.kind, what=told.what, sample=told.sample, count=told.count)
-
-
 def json_bytes(value: object) -> bytes:
     """Write a header or an event.
 
@@ -200,18 +184,18 @@ class Head:
         return OVERHEAD + self.length
 
 
-def event_frame(event: Event) -> tuple[Head, bytes]:
+def event_frame(event: DeviceEvent) -> tuple[Head, bytes]:
     """Return the frame of an event, not numbered yet, and its payload."""
     return Head(kind=EVENT, first=NO_SAMPLE if event.sample is None else event.sample), json_bytes(asdict(event))
 
 
-def event_of(text: bytes) -> Event:
+def event_of(text: bytes) -> DeviceEvent:
     """Read an event.
 
     `text`: payload of `event_frame`.
     """
     found = json.loads(text)
-    return Event(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
+    return DeviceEvent(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
 
 
 def preamble() -> bytes:

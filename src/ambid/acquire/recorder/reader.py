@@ -16,12 +16,12 @@ from typing import Self
 
 import numpy as np
 
+from ambid.acquire.device import DeviceEvent
 from ambid.acquire.recorder import layout
 from ambid.acquire.recorder.disk import lock
 from ambid.acquire.recorder.layout import (
     HEAD_SIZE,
     SYNC,
-    Event,
     Head,
     JournalHeader,
     event_of,
@@ -98,7 +98,7 @@ class JournalReader:
             os.close(self._fd)
             self._fd = -1
 
-    def items(self) -> Iterator[Block | Event]:
+    def items(self) -> Iterator[Block | DeviceEvent]:
         """Read from the beginning; `damage` is complete once the last item was taken.
 
         Returns in the order in which they were written.
@@ -167,7 +167,7 @@ class JournalReader:
             at = found
 
 
-def _item(head: Head, data: bytes) -> Iterator[Block | Event]:
+def _item(head: Head, data: bytes) -> Iterator[Block | DeviceEvent]:
     if head.kind == layout.BLOCK:
         yield Block(first=head.first, time_s=head.time_s, values=unpacked_values(_payload(head, data), head))
     elif head.kind == layout.EVENT:
@@ -247,7 +247,7 @@ class Survey:
     misplaced: int = 0  # rows whose numbers were there before
     # largest difference between a block's time and that of its number at the rate of the header, s
     stamp_error_s: float = 0.0
-    events: list[Event] = field(default_factory=list)
+    events: list[DeviceEvent] = field(default_factory=list)
     damage: Damage = field(default_factory=Damage)
 
     @property
@@ -261,7 +261,7 @@ def survey(reader: JournalReader) -> Survey:
     found = Survey()
     rate = reader.header.rate_hz
     for item in reader.items():
-        if isinstance(item, Event):
+        if isinstance(item, DeviceEvent):
             found.events.append(item)
             continue
         n = len(item.values)

@@ -29,7 +29,6 @@ from ambid.acquire.recorder.layout import (
     EVENT,
     HEADER,
     LARGEST,
-    Event,
     Head,
     JournalHeader,
     event_frame,
@@ -121,7 +120,7 @@ class WriteQueue:
         first, samples, blocks = self._gap
         self._gap = None
         what = f"{blocks} blocks found no room in the queue: the disk was too slow"
-        self._items.append(event_frame(Event(kind="lost", what=what, sample=first, count=samples)))
+        self._items.append(event_frame(DeviceEvent(kind="lost", what=what, sample=first, count=samples)))
 
 
 class JournalWriter:
@@ -435,7 +434,7 @@ class Recorder:
             return True
         if self._next is not None and block.first < self._next:
             what = f"numbers of samples went back from {self._next} to {block.first}"
-            self.event(Event(kind="note", what=what, sample=int(block.first)))
+            self.event(DeviceEvent(kind="note", what=what, sample=int(block.first)))
         self._next = block.first + n
         if self._writer.failed or self._closed:
             self._queue.count_lost(n)
@@ -454,9 +453,9 @@ class Recorder:
         self._queue.put((head, payload))
         return True
 
-    def event(self, event: Event | DeviceEvent) -> None:
+    def event(self, event: DeviceEvent) -> None:
         """Put something that happened into the journal, in its place between the blocks."""
-        self._queue.put(event_frame(event if isinstance(event, Event) else Event.of(event)))
+        self._queue.put(event_frame(event))
 
     def flush(self, timeout_s: float = 60.0) -> bool:
         """Wait until everything that was taken is on the disk.

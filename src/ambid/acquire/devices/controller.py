@@ -3,23 +3,27 @@
 A command has a number. Without an answer in time it is sent again with the same number, which the controller answers
 again without carrying it out twice. Pings go out from a thread of their own, whatever the rest of the program does, and
 under a number of their own: else a command after 254 of them would have that of the last one, and be taken for it.
+
+Bytes and their time of arrival are taken by a thread that does nothing else, into a queue of limited size: a consumer
+that is late never holds the port up. What finds no room is dropped whole, and counted.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from types import MappingProxyType
 
-from ambid.acquire.link.port import Port, PortEnded
-from ambid.acquire.link.reader import Reader
+from ambid.acquire.devices.port import Port, PortEnded
 from ambid.acquire.protocol.codec import FrameDecoder, Message, encode, message, unpack
 from ambid.acquire.protocol.table import table
 from ambid.errors import DeviceError
 
+_ROOM = 1 << 24  # bytes: almost three minutes at 1 Mbaud
 _ANSWERS = {"identify": "identity", "ask_status": "status", "self_test": "self_test_result"}
 _SLOW = {"self_test": 10.0}  # times as long as another command's answer: the program memory is summed up
 _LOOK_S = 0.2
@@ -31,6 +35,86 @@ _SILENT_S = 0.5  # without a sample: it is asked for its status
 _LAST_ID, _PING_ID = 254, 255  # of a command, of every ping
 _NONE: Mapping[str, int] = MappingProxyType({})
 _LOST = "the controller goes to its safe state by itself"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chunk:
+    """Bytes that came together."""
+
+    data: bytes
+    arrived_s: float  # when they were there, by `time.perf_counter`, s
+
+
+class Reader:
+    """Reads a port until it is closed or lost.
+
+    `port`: nobody else may read from it; `room`: bytes that wait at most.
+
+    `overruns`: reads dropped for want of room; `overrun_bytes`: bytes in them; `failure`: why the line is lost.
+    """
+
+    def __init__(self, port: Port, *, room: int = _ROOM) -> None:
+        self._port, self._room = port, room
+        self._chunks: deque[Chunk] = deque()
+        self._held = 0
+        self.overruns = self.overrun_bytes = 0
+        self.failure: OSError | None = None
+        self._stopping = False
+        self._over = False
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name=f"read {port.name}", daemon=True)
+        self._thread.start()
+
+    def take(self, timeout_s: float) -> list[Chunk]:
+        """Take all that has come.
+
+        `timeout_s`: how long to wait for something, s. Returns empty if nothing came.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self._chunks or self._over, timeout_s)
+            found = list(self._chunks)
+            self._chunks.clear()
+            self._held = 0
+        return found
+
+    @property
+    def over(self) -> bool:
+        """True once nothing more will come and all was taken."""
+        with self._news:
+            return self._over and not self._chunks
+
+    def close(self) -> None:
+        """Stop reading; again is harmless. The port stays open."""
+        self._stopping = True
+        if self._thread is not threading.current_thread():
+            self._thread.join(_PATIENCE_S)
+
+    def _run(self) -> None:
+        failure: OSError | None = None
+        try:
+            while not self._stopping:
+                data = self._port.read()
+                if data:
+                    self._put(data, time.perf_counter())
+        except OSError as lost:
+            failure = lost
+        except Exception as defect:  # else nobody would learn that nothing is read any more
+            failure = OSError(f"{type(defect).__name__}: {defect}")
+        finally:
+            with self._news:
+                self.failure = None if self._stopping else failure
+                self._over = True
+                self._news.notify_all()
+
+    def _put(self, data: bytes, arrived_s: float) -> None:
+        with self._news:
+            if self._held + len(data) > self._room:
+                self.overruns += 1
+                self.overrun_bytes += len(data)
+                return
+            self._chunks.append(Chunk(data=data, arrived_s=arrived_s))
+            self._held += len(data)
+            self._news.notify_all()
 
 
 @dataclass(slots=True)
