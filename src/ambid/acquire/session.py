@@ -109,7 +109,6 @@ class _Run:
         self._device, self._taps, self._on_event = device, taps, on_event
         self._wanted = max(1, round(course.seconds * rate_hz))
         self._settling = round(course.settle_s * rate_hz)
-        self._origin: int | None = None  # number of the first sample that came at all
         self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
         self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
         self._unheard = 0
@@ -134,10 +133,12 @@ class _Run:
 
     def settle(self, stopped: Callable[[], bool]) -> None:
         """Let the first samples pass."""
-        if self._settling:
-            for block in self._frames(stopped):
-                if block.block.first + len(block.block.values) >= self._start(block.block) + self._settling:
-                    return
+        settled = None
+        for frame in self._frames(stopped) if self._settling else ():
+            block = frame.block
+            settled = block.first + self._settling if settled is None else settled
+            if block.first + len(block.values) >= settled:
+                return
 
     def listen(self, stopped: Callable[[], bool]) -> None:
         """Pass blocks on until all wanted samples are there."""
@@ -211,11 +212,6 @@ class _Run:
             interrupted=self._interrupted,
             events=tuple(self._events),
         )
-
-    def _start(self, block: Block) -> int:
-        if self._origin is None:
-            self._origin = block.first
-        return self._origin
 
     def _frames(self, stopped: Callable[[], bool]) -> Iterator[Frame]:
         """Blocks as they come, until a fault, a wish to end, or the device's own end."""
