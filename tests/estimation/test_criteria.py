@@ -14,3 +14,7 @@ def test_the_tail_of_chi_squared_is_that_of_scipy(degrees):
         assert chi_squared_tail(degrees, x) == pytest.approx(chi2.sf(x, degrees), rel=1e-9, abs=1e-300), x
     assert chi_squared_tail(degrees, 0.0) == 1.0
     assert chi_squared_tail(degrees, np.inf) == 0.0
+
+
+def test_a_statistic_that_is_no_number_passes_no_test():
+    assert not chi_squared_tail(3, float("nan")) >= 1e-3

@@ -7,6 +7,7 @@ import pytest
 
 from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import search
+from ambid.estimation.prediction import sparse_gain
 from ambid.estimation.sensitivity import innovations
 from ambid.physics.models import model
 from ambid.record import Channel, Record
@@ -137,3 +138,13 @@ def test_lowest_power_is_found(low):
     t = np.arange(8000) / 1000.0
     u = np.sin(2 * np.pi * low * t) + np.sin(2 * np.pi * 300 * t + 1)
     assert lowest_power_hz(u[:, None] + 7.0, 1000.0) == pytest.approx(low, abs=0.13)
+
+
+def test_agreement_does_without_a_refit_whose_gain_is_not_found(monkeypatch):
+    def none(fit, stride):
+        if stride == 4:
+            raise np.linalg.LinAlgError("the Riccati equation has no stabilising solution")
+        return sparse_gain(fit, stride)
+
+    monkeypatch.setattr("ambid.validate.physical.sparse_gain", none)
+    assert agreement(fitted(60, n=3000)).strides == (2,)

@@ -102,9 +102,11 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
 
 def chi_squared_tail(degrees: int, x: float) -> float:
     """Return the probability that chi-squared with that many degrees of freedom exceeds `x`: a finite sum, all of one
-    sign (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5).
+    sign (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5). A statistic that is no number has no probability: NaN.
     """
     half, shift = 0.5 * x, 0.5 * (degrees % 2)
+    if half != half:  # 1 would pass every test
+        return half
     if not 0.0 < half < inf:
         return 0.0 if half == inf else 1.0
     terms = (exp((j + shift) * log(half) - half - lgamma(j + shift + 1.0)) for j in range(degrees // 2))

@@ -198,7 +198,10 @@ def agreement(fit: Fit) -> Agreement:
     shifts, spreads, strides = [], [], []
     own = directions(np.vstack([fit.J, fit.J_prior])).inverse()[:n, :n]
     for stride in _STRIDES:
-        sparse = replace(problem, stride=stride, noise="given", gain=sparse_gain(fit, stride))
+        try:
+            sparse = replace(problem, stride=stride, noise="given", gain=sparse_gain(fit, stride))
+        except np.linalg.LinAlgError:  # no gain that stabilises is found: a refit less, not a job without an estimate
+            continue
         start = carry(fit, sparse)
         again = search(sparse, start, steps=60, work=workspace_near(fit, sparse))
         if again.status != "converged":
