@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
@@ -295,6 +294,8 @@ def point_weight(spread: Array, frequency: Indices, channel: Indices, omega: Arr
     `frequency`: (n_points,), place of each point in `omega`; `channel`: (n_points,), which way from input to output it
     belongs to; `omega`: (n_frequencies,), rad/s, rising. Returns (n_points,), one over the unit of `spread` squared.
     """
+    from scipy.optimize import nnls  # a quarter of a second
+
     n, rank = spread.shape[0] // 2, spread.shape[1]
     places = [np.linspace(scale[0], scale[-1], _HATS) for scale in (np.log(omega), omega)]
     each = np.vstack(

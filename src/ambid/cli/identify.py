@@ -77,7 +77,6 @@ def command(
     """
     from ambid.job import identification as job
     from ambid.report.estimate_text import estimate_text
-    from ambid.report.figures import overview
 
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
@@ -97,6 +96,8 @@ def command(
             )
             stop.torn()
             if plot or report:
+                from ambid.report.figures import overview  # much is loaded for it
+
                 evidence = job.evidence_of(estimate, used)
                 outputs.draw(plot, lambda: overview(evidence), show)
                 if report:
