@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import io
 import os
 import sys
@@ -14,6 +15,7 @@ from typing import NoReturn, TextIO
 from ambid.cli.interrupts import INTERRUPTED, interrupts
 
 BROKEN_PIPE = 141
+_GARBAGE = 100_000  # new objects after which garbage is collected
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -28,13 +30,19 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     # first imported, which is later.
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in every installed package
+    # The libraries make some hundred thousand objects that stay to the end: looking through them again and again for
+    # garbage takes a tenth of a short command's time.
+    gc.set_threshold(_GARBAGE, 50, 100)
     if not sys.warnoptions:
         # Warnings of numerical libraries speak to programmers; what concerns the user is said in results and errors.
         warnings.simplefilter("ignore")
     _hold_standard_files()
     if sys.stderr is not None:
         sys.stderr = _BestEffort.of(sys.stderr)
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    code = run(sys.argv[1:] if arguments is None else arguments)
+    gc.freeze()  # what is left goes with the process
+    sys.exit(code)
 
 
 def _hold_standard_files() -> None:
