@@ -99,26 +99,25 @@ def test_gravity_and_a_gap_are_only_an_operating_point():
     assert found.values["k_i"] / found.values["m"] == pytest.approx(-2 * 9.81 / 0.95, rel=0.1)
 
 
-def test_fixed_and_prior_parameters():
+def test_fixed_and_prior_parameters(estimate):
     m = BEARING.parameters["m"]
     fixed = identify(record(), with_parameter(default_rig(), m=Parameter(name="m", unit="kg", role="fixed", value=m)))
     assert fixed.parameter("m").value == m
     assert fixed.parameter("m").sd == 0
     assert fixed.parameter("m").identifiable
     assert "m" not in fixed.covariance_names
-    free = identify(record())
-    sd = free.parameter("m").sd
+    sd = estimate.parameter("m").sd
     # a prior as good as the data halves the variance, and says that half came from the data
-    prior = Parameter(name="m", unit="kg", role="prior", value=free.values["m"] + sd, sd=sd)
+    prior = Parameter(name="m", unit="kg", role="prior", value=estimate.values["m"] + sd, sd=sd)
     both = identify(record(), with_parameter(default_rig(), m=prior)).parameter("m")
-    assert both.value == pytest.approx(free.values["m"] + 0.5 * sd, abs=0.08 * sd)
+    assert both.value == pytest.approx(estimate.values["m"] + 0.5 * sd, abs=0.08 * sd)
     assert both.sd == pytest.approx(sd / np.sqrt(2), rel=0.05)
     assert both.data_share == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_prior_against_the_data_does_not_pass_unnoticed():
+def test_a_prior_against_the_data_does_not_pass_unnoticed(estimate):
     # ten standard deviations of the data away, and held as tightly as they hold: one of the two is wrong
-    free = identify(record()).parameter("R")
+    free = estimate.parameter("R")
     prior = Parameter(name="R", unit="ohm", role="prior", value=free.value + 14 * free.sd, sd=free.sd)
     found = identify(record(), with_parameter(default_rig(), R=prior))
     assert not found.passed
@@ -172,10 +171,10 @@ def test_ratios_to_the_mass_are_said_to_be_ratios():
     assert any("common factor" in w for w in found.warnings)
 
 
-def test_equal_records_give_equal_estimates():
-    a, b = (identify(record()) for _ in range(2))
-    assert a.values == b.values
-    np.testing.assert_array_equal(a.covariance, b.covariance)
+def test_equal_records_give_equal_estimates(estimate):
+    again = identify(record())
+    assert again.values == estimate.values
+    np.testing.assert_array_equal(again.covariance, estimate.covariance)
 
 
 def renamed(rec, **roles):
@@ -222,12 +221,12 @@ def test_a_damaged_record_is_refused_or_fails_a_check(kind):
     assert found.warnings
 
 
-def test_a_sensor_turned_round_turns_the_signs_that_hang_on_it():
+def test_a_sensor_turned_round_turns_the_signs_that_hang_on_it(estimate):
     rec = record()
     turned = replace(rec, channels=(*rec.channels[:2], Channel(name="position", unit="m", values=-rec["position"])))
-    one, other = identify(rec), identify(turned)
+    other = identify(turned)
     for name, sign in (("m", 1), ("k_x", 1), ("k_i", -1), ("R", 1), ("L", 1)):
-        p = one.parameter(name)
+        p = estimate.parameter(name)
         assert other.values[name] == pytest.approx(sign * p.value, abs=0.05 * p.sd)
 
 

@@ -1,19 +1,15 @@
-"""One run of a Monte Carlo experiment, and many of them on two processes."""
+"""One run of a Monte Carlo experiment, and many of them."""
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing import get_context
-from unittest import mock
 
 import numpy as np
 
 from ambid.bearing.linear import greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import weight_of
+from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.validate.physical import innovation_tests
@@ -71,7 +67,6 @@ def one_run(seed: int, *, n: int, auto: bool) -> Outcome:
 
 
 def many(n_runs: int, **settings: object) -> list[Outcome]:
-    """Run on two processes, each with one thread of linear algebra: more would get into each other's way."""
-    one = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    with mock.patch.dict(os.environ, one), ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(partial(one_run, **settings), range(n_runs), chunksize=5))
+    """Run one after another, with one thread of linear algebra: other files of tests keep the other cores busy."""
+    with one_thread():
+        return [one_run(seed, **settings) for seed in range(n_runs)]
