@@ -185,11 +185,11 @@ def renamed(rec, **roles):
 
 
 def damaged(kind):
-    rec = record()
-    if kind == "swapped":
-        return renamed(rec, voltage="voltage", current="position", position="current")
+    if kind == "swapped":  # short: a hopeless record is searched globally
+        return renamed(record(n=1500), voltage="voltage", current="position", position="current")
     if kind == "voltage is the current":
-        return renamed(rec, voltage="current", current="voltage", position="position")
+        return renamed(record(n=1500), voltage="current", current="voltage", position="position")
+    rec = record()
     if kind == "position upside down in the second half":
         x = rec["position"].copy()
         x[2000:] *= -1

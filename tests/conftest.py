@@ -1,0 +1,57 @@
+"""The files that take longest begin first, so that on two processes (``-n 2 --dist loadfile``) none is left at the end.
+
+The pages of the documentation use most compiled kernels. They begin beside Monte Carlo experiments, which use few: what
+the files after them need is compiled by then, and not by both processes.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+import pytest
+
+LONGEST = (
+    "examples/test_pages.py",
+    "statistical/test_polynomial.py",
+    "statistical/test_monte_carlo.py",
+    "statistical/test_sspem.py",
+    "statistical/test_subspace.py",
+    "recursive/test_fusion_false_alarms.py",
+    "real/test_nonlinear_maglev.py",
+    "recursive/test_conformance.py",
+    "cli/test_acquire.py",
+    "statistical/test_recursive_polynomial.py",
+    "statistical/test_blackbox_validation.py",
+    "bearing/test_physical.py",
+    "nonlinear/test_hybrid.py",
+    "cli/test_bad_input.py",
+    "job/test_track.py",
+    "job/test_track_estimator.py",
+    "bars/test_acquisition_line.py",
+    "blackbox/instrumental/test_in_loop.py",
+    "statistical/test_frf.py",
+    "statistical/test_tracking.py",
+    "statistical/test_joint.py",
+    "statistical/test_nonlinear_bearing.py",
+    "statistical/test_recursive.py",
+    "examples/test_examples.py",
+    "test_job.py",
+    "recursive/test_fusion_filter.py",
+    "cli/test_identify_nonlinear.py",
+    "real/test_track_maglev.py",
+    "bars/test_acquisition_parameters.py",
+    "bars/test_acquisition_damage.py",
+    "job/test_commission.py",
+    "conventions/test_compiled.py",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config.option, "loadscopereorder"):  # else the files with most tests would begin first
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    files = [list(of_file) for _, of_file in groupby(items, key=lambda item: item.path)]
+    files.sort(key=lambda of_file: next((k for k, n in enumerate(LONGEST) if str(of_file[0].path).endswith(n)), 99))
+    items[:] = [item for of_file in files for item in of_file]
