@@ -344,6 +344,7 @@ class Predictor:
         """Yield rows (n_columns, m), how many of their samples count, and whether the impulses still ring."""
         from ambid.blackbox.polynomial_kernels import block_rows
 
+        y, u = np.require(y, requirements=["C", "W"]), np.require(u, requirements=["C", "W"])  # one kernel for all
         m = min(m, y.size)
         s = np.zeros((self.n_signals, self.pad + m), dtype=coef.dtype)
         w = np.empty((self.columns.shape[0], m), dtype=coef.dtype)

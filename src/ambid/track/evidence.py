@@ -104,6 +104,7 @@ def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forc
             type(inputs) is np.ndarray and type(outputs) is np.ndarray
             and inputs.dtype == np.float64 and outputs.dtype == np.float64
             and inputs.shape == (n_u,) and outputs.shape == (n_y,)
+            and inputs.flags.writeable and outputs.flags.writeable
         ):  # fmt: skip
             return Samples(
                 u=np.ascontiguousarray(inputs).reshape(1, n_u), y=np.ascontiguousarray(outputs).reshape(1, n_y)
@@ -123,7 +124,7 @@ def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forc
 
 def _columns(values: ArrayLike, n: int) -> Array | None:
     """Return a block of n columns; None where the shape is neither that nor one sample."""
-    a = np.ascontiguousarray(values, dtype=np.float64)
+    a = np.require(values, np.float64, ["C", "W"])  # for what cannot be written the kernel would be compiled again
     if np.ndim(values) < 2 and (n == 1 or a.size == n):
         return a.reshape(-1, n)
     return a if np.ndim(values) == 2 and a.shape[1] == n else None
