@@ -341,9 +341,9 @@ class LineDevice(ABC):
             port = self._open()
             self._controller = Controller(
                 port,
-                samples=self._heard,
+                samples=self._stream.heard,
                 told=self._told,
-                lost=self._lost,
+                lost=self._stream.fail,
                 paused=self._paused,
                 answer_s=self._answer_s,
             )
@@ -480,16 +480,10 @@ class LineDevice(ABC):
     def _converted(self, counts: Array) -> Array:
         return in_si(self._rig, self._settings, counts) if self._si else counts
 
-    def _heard(self, payloads: list[bytes], arrived_s: float) -> None:
-        self._stream.heard(payloads, arrived_s)
-
     def _told(self, what: Message) -> None:
         if what.name == "status":
             self._status = {name: float(what[name]) for name in _TOLD}
         self._stream.told(what)
-
-    def _lost(self, failure: DeviceError) -> None:
-        self._stream.fail(failure)
 
     def _prepare(self, controller: Controller, where: str) -> None:
         """Identify, bring to idle whatever was before, and tell it the settings."""
