@@ -2,13 +2,14 @@
 
 Minimises the sum of e^H C^-1 e with e = G - N/D exp(-j omega tau) by Levenberg-Marquardt with the exact Jacobian, from
 iterated linear fits (Sanathanan and Koerner 1963; Pintelon and Schoukens 2012, ch. 9) that begin with D = 1 and with
-lightly damped poles over the band, the start of vector fitting (Gustavsen and Semlyen 1999). N and D are searched in
+poles spread over the band, as vector fitting does (Gustavsen and Semlyen 1999). N and D are searched in
 polynomials that are orthogonal on the lines (Forsythe 1957; Rolain et al. 1995; Brubeck, Nakatsukasa and Trefethen
 2021), with one common factor left free, so that the search is well-conditioned at any order.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -53,7 +54,8 @@ def orthogonal_polynomials(points: Complex, weight: Array, degree: int) -> tuple
 
 MAX_DELAY = 6  # samples, searched when the delay is "auto"
 _STARTING = 40  # iterated linear fits from each start
-_RACE = 3  # starts from which the likelihood is searched
+_RACE = 5  # starts from which the likelihood is searched
+_DAMPING = (0.01, 0.1)  # of the poles that a start spreads over the band
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,11 +203,12 @@ def _starts(form: _Form, lag: float) -> list[tuple[float, _Form, Array, float]]:
     factor = form.extra * np.exp(-1j * form.lines.omega * lag)
     G = form.lines.G.reshape(form.lines.n_lines, -1) / factor[:, None]
     w = weight * np.abs(factor)[:, None]
-    for damped in (True, False):
+    spread = [(damping, place) for damping in _DAMPING for place in (np.geomspace, np.linspace)]
+    for how in (*spread, None):
         dens = [np.ones(form.lines.n_lines, dtype=np.complex128) for _ in form.nf]
-        for g, n in enumerate(form.nf if damped else ()):
-            if n:
-                poles = _spread_poles(form.lines.omega, n, form.size, form.dt)
+        for g, n in enumerate(form.nf if how else ()):
+            if how and n:
+                poles = _spread_poles(form.lines.omega, n, form.size, form.dt, *how)
                 dens[g] = np.prod(form.variable[:, None] - poles, axis=1)
         scored = _iterate(form, G, w, dens, lag)
         if scored is not None:
@@ -213,12 +216,14 @@ def _starts(form: _Form, lag: float) -> list[tuple[float, _Form, Array, float]]:
     return out
 
 
-def _spread_poles(omega: Array, n_poles: int, size: float, dt: float | None) -> Complex:
+def _spread_poles(
+    omega: Array, n_poles: int, size: float, dt: float | None, damping: float, place: Callable[..., Array]
+) -> Complex:
     """Lightly damped pairs over the band, and one real pole where their number is odd."""
     used = omega[omega > 0]
-    centres = np.geomspace(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
+    centres = place(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
     centres = np.asarray(centres)[: n_poles // 2]
-    pairs = np.stack([centres * (-0.01 + 1j), centres * (-0.01 - 1j)], axis=1).ravel()
+    pairs = np.stack([centres * (-damping + 1j), centres * (-damping - 1j)], axis=1).ravel()
     s = np.concatenate([pairs, [-np.sqrt(used[0] * used[-1])] * (n_poles % 2)]).astype(np.complex128)
     return np.asarray(s / size if dt is None else np.exp(s * dt))
 
