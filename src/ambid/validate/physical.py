@@ -23,11 +23,11 @@ from ambid.bearing.linear import carry
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import Uncertainty, experiment_hint
 from ambid.estimation.criteria import chi_squared_tail
-from ambid.estimation.likelihood import Fit, free_one, search, weight_of, workspace_near
+from ambid.estimation.likelihood import Fit, free_one, prior_rows, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.parts import Check
 from ambid.estimation.prediction import sparse_gain
-from ambid.estimation.sensitivity import Products, Workspace, products
+from ambid.estimation.sensitivity import Products, Workspace, linearise, products
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import find_dropouts, find_outliers, find_saturation
@@ -42,6 +42,7 @@ _SAME = 1e-6  # length left of a column below which it counts as held by the oth
 _STRIDES = (2, 4)
 _MOST = 4.0  # shift in its standard deviations that chance allows
 _FAR = 3.3  # standard deviations between a prior and the record
+_MISSED = 0.05  # part of a sample in which a delay may go unseen and move a parameter out of its interval
 _SIZES = {"m": (1e-5, 1e5), "k_x": (0.0, 1e11), "k_i": (0.0, 1e6), "R": (1e-4, 1e5), "L": (1e-7, 1e3), "c": (0.0, 1e8)}
 
 
@@ -222,12 +223,13 @@ def agreement(fit: Fit) -> Agreement:
 def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
     """Check what was taken for known.
 
-    Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``long_enough``.
+    Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``delay_shown``, ``long_enough``.
     """
     return {
         "fixed_agree": _fixed_agree(fit),
         "priors_agree": _priors_agree(fit),
         "delay_in_range": _delay_in_range(fit, delay_how),
+        "delay_shown": _delay_shown(fit, delay_how),
         "long_enough": _long_enough(known),
     }
 
@@ -278,6 +280,42 @@ def _delay_in_range(fit: Fit, how: Literal["estimated", "given"]) -> Check:
     inside = how == "given" or total < 2 * MAX_DELAY
     doubt = "" if inside else ". That is long for a bench: check the columns, or give channels.<input>.delay"
     return Check(passed=inside, values={"samples": total}, detail=f"the input acts {total:.3g} samples late{doubt}")
+
+
+def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
+    """Could a fraction of a sample of delay that the search takes for none move a parameter out of its interval?
+
+    Freed at the fit, the delay has the standard deviation s, and each s moves a parameter by t of its own (those at a
+    held delay). The search frees it where the criterion falls by log n, which is beyond s sqrt(log n) on average:
+    fractions from 1.96 s / t to there go unseen, and the interval misses.
+    """
+    problem, n = fit.problem, fit.problem.n_physical
+    if how == "given":
+        return Check(passed=True, detail="the delay was given: the other numbers are right if it is")
+    if problem.fractional:
+        return Check(passed=True, detail="the delay was estimated as a real number and counts in the intervals")
+    free = replace(problem, fractional=True, lag=0.0)
+    vector = carry(fit, free)
+    at = linearise(free, vector, weight_of(fit.covariance), workspace_near(fit, free))
+    if at is None:
+        return Check(passed=False, detail="the delay could not be freed at the estimate: give channels.<input>.delay")
+    found = directions(np.vstack([at.J, prior_rows(free, vector)[1]])).inverse()
+    s, own = float(np.sqrt(found[n, n])), np.diag(found)[:n]
+    along = found[:n, n] / s
+    t = np.abs(along) / np.sqrt(np.maximum(own - along**2, _BLIND * own))
+    worst = int(np.argmax(t))
+    unseen = min(s * float(np.sqrt(np.log(problem.n_used))), 1.0)
+    shift = float(t[worst]) * unseen / s
+    missed = unseen * max(1.0 - 1.96 / max(shift, 1.96), 0.0)
+    name, passed = problem.estimated[worst], missed < _MISSED
+    return Check(
+        passed=passed,
+        values={"unseen_samples": unseen, "shift_sd": shift, "missed": missed},
+        detail="a delay by a fraction of a sample would show before it moves a parameter out of its interval"
+        if passed
+        else f"the record cannot tell {name} from a delay of up to {unseen:.2g} samples more, which would move it by "
+        f"up to {shift:.2g} sd. Sample faster, excite more at high frequencies, or give channels.<input>.delay",
+    )
 
 
 def _long_enough(known: Uncertainty) -> Check:
