@@ -7,7 +7,9 @@ Astrom 1980), exact in state and covariance. Its gradient and Fisher information
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -238,28 +240,37 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
     prior, J_prior = prior_rows(problem, vector)
     total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], list[Array]()
     stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
-    for r, record in enumerate(problem.records):
-        n = record.u.size
-        found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
-        own, blocks, columns = np.zeros((-(-n // stretch), problem.size)), list[Array](), np.zeros(0, dtype=np.int64)
-        for part in sweep(problem, vector, r, found, slopes=True):
-            if part is None or not np.all(np.isfinite(part.rows)):
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:  # the kernel leaves Python's lock
+        for one in threads.map(lambda r: _of_record(problem, vector, r, stretch), range(len(problem.records))):
+            if one is None:
                 return None
-            columns, m = part.columns, part.rows.shape[0]
-            for b in range(part.first // stretch, (part.first + m - 1) // stretch + 1):
-                rows = part.rows[max(b * stretch - part.first, 0) : (b + 1) * stretch - part.first]
-                rows = rows.reshape(-1, rows.shape[2])
-                own[b, columns] += rows[:, :-1].T @ rows[:, -1]
-            blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
-        total += _sum(found)
-        scores += [*own]
-        if blocks:
-            short = triangle_of([np.vstack(blocks)])
-            triangle = np.zeros((columns.size + 1, problem.size + 1))
-            triangle[: short.shape[0], np.append(columns, problem.size)] = short
-            parts.append(triangle)
+            total += one[0]
+            scores += [*one[1]]
+            parts += one[2]
     whole = triangle_of([np.vstack(parts)])
     return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
+
+
+def _of_record(problem: BearingProblem, vector: Array, r: int, stretch: int) -> tuple[float, Array, list[Array]] | None:
+    """What a record adds to the criterion, the scores of stretches, and the triangle; None without a predictor."""
+    n = problem.records[r].u.size
+    found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    own, blocks, columns = np.zeros((-(-n // stretch), problem.size)), list[Array](), np.zeros(0, dtype=np.int64)
+    for part in sweep(problem, vector, r, found, slopes=True):
+        if part is None or not np.all(np.isfinite(part.rows)):
+            return None
+        columns, m = part.columns, part.rows.shape[0]
+        for b in range(part.first // stretch, (part.first + m - 1) // stretch + 1):
+            rows = part.rows[max(b * stretch - part.first, 0) : (b + 1) * stretch - part.first]
+            rows = rows.reshape(-1, rows.shape[2])
+            own[b, columns] += rows[:, :-1].T @ rows[:, -1]
+        blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
+    if not blocks:
+        return _sum(found), own, []
+    short = triangle_of([np.vstack(blocks)])
+    triangle = np.zeros((columns.size + 1, problem.size + 1))
+    triangle[: short.shape[0], np.append(columns, problem.size)] = short
+    return _sum(found), own, [triangle]
 
 
 def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:

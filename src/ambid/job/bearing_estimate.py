@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import numpy as np
@@ -33,7 +35,8 @@ def judge_bearing(
     gives the delay. Returns without validation, timings and rig.
     """
     problem, names = fit.problem, _names(fit)
-    tests = [whiteness(fit, r) for r in range(len(problem.records))]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
+        tests = list(threads.map(lambda r: whiteness(fit, r), range(len(problem.records))))
     residuals = _residuals(tests, names)
     robust = not all(c.passed for c in residuals.values()) or known.inflation > _INFLATION or fit.status != "converged"
     parameters = _parameters(fit, known, robust=robust)
