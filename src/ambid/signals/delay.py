@@ -33,6 +33,7 @@ def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
         for start in range(first, n, _ROWS):
             rows = np.column_stack([x[start - lag : min(start + _ROWS, n) - lag] for x, lag in columns])
             R = np.asarray(np.linalg.qr(np.vstack([R, rows]), mode="r"))
+        R[n - first :] = 0.0  # but for rounding, where there are fewer rows than columns
         return R
     from scipy.linalg.lapack import dtpqrt
 
@@ -42,6 +43,7 @@ def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
         for k, (x, lag) in enumerate(columns):
             block[:, k] = x[start - lag : stop - lag]
         R, _, _, _ = dtpqrt(0, min(_PANEL, width), R, block, overwrite_a=1, overwrite_b=1)
+    R[n - first :] = 0.0
     return np.triu(R)
 
 
