@@ -1,6 +1,7 @@
 """The grey-box estimator from no start values: simulated truth comes back, delays are found, nonsense is refused."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,13 @@ from ambid.physics.parameters import Parameter
 from tests.bearing.benches import parameters, problem_of, run
 
 N = 6000
+
+
+@cache
+def plain(n, seed, fixed=("c",)):
+    """A bearing's record and the fit to it, all but `fixed` free and the delay given."""
+    bench = run("bearing", n, seed)
+    return bench, greybox(bench.model, bench.signals, parameters(bench, fixed=fixed), delay=1)
 
 
 def judged(fit, bench):
@@ -88,8 +96,7 @@ def test_a_given_delay_is_kept(delay):
 
 
 def test_a_wrong_given_delay_spoils_the_likelihood():
-    bench = run("bearing", 4000, 14, delay=1.0)
-    right = greybox(bench.model, bench.signals, parameters(bench, fixed=("c",)), delay=1)
+    bench, right = plain(4000, 14)
     wrong = greybox(bench.model, bench.signals, parameters(bench, fixed=("c",)), delay=0)
     assert wrong.criterion > right.criterion + 100
 
@@ -157,27 +164,26 @@ def test_fixed_stays_and_a_prior_pulls():
 
 
 def test_the_users_start_values_do_no_harm():
-    bench = run("bearing", 3000, 19)
-    plain = greybox(bench.model, bench.signals, parameters(bench, fixed=("c",)), delay=1)
+    bench, usual = plain(3000, 19)
     good = greybox(bench.model, bench.signals, parameters(bench, fixed=("c",), start=bench.truth), delay=1)
     far = {k: 7.0 * v for k, v in bench.truth.items()}
     bad = greybox(bench.model, bench.signals, parameters(bench, fixed=("c",), start=far), delay=1)
     for other in (good, bad):
         assert other.status == "converged"
-        assert other.criterion == pytest.approx(plain.criterion, abs=0.05)
+        assert other.criterion == pytest.approx(usual.criterion, abs=0.05)
 
 
 @pytest.mark.parametrize("name", ["k_x", "k_i", "c"])
 def test_zero_is_a_value_like_any_other(name):
     # a prior about zero that says nearly nothing, and a start value of zero, end where none ends
-    bench = run("bearing", 3000, 19)
-    ps = parameters(bench, fixed=() if name == "c" else ("c",))
-    plain = greybox(bench.model, bench.signals, ps, delay=1)
+    fixed = () if name == "c" else ("c",)
+    bench, usual = plain(3000, 19, fixed)
+    ps = parameters(bench, fixed=fixed)
     vague = 1e3 * max(abs(bench.truth[name]), 1.0)
     for given in ({"role": "prior", "value": 0.0, "sd": vague}, {"value": 0.0}):
         fit = greybox(bench.model, bench.signals, [replace(p, **given) if p.name == name else p for p in ps], delay=1)
         assert fit.status == "converged"
-        assert fit.criterion == pytest.approx(plain.criterion, abs=0.1)
+        assert fit.criterion == pytest.approx(usual.criterion, abs=0.1)
         assert max(judged(fit, bench)[2].values()) < 3.5
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -30,14 +31,19 @@ def fitted(s: NonlinearStructure, *records: IOData, **options: object) -> Nonlin
     return s.estimator(records, dict(SETTINGS.get(s.name, {})), **options)
 
 
-_FITS: dict[str, NonlinearFit] = {}
+@cache
+def _usual(name: str) -> tuple[NonlinearFit, tuple[tuple[str, float | None], ...]]:
+    heard: list[tuple[str, float | None]] = []
+
+    def listen(stage: str, done: float | None = None) -> None:
+        heard.append((stage, done))
+
+    return fitted(nonlinear_structure(name), smooth(), tick=listen), tuple(heard)
 
 
 def usual(s: NonlinearStructure) -> NonlinearFit:
     """The fit to the usual record, made once."""
-    if s.name not in _FITS:
-        _FITS[s.name] = fitted(s, smooth())
-    return _FITS[s.name]
+    return _usual(s.name)[0]
 
 
 def model_of(s: NonlinearStructure) -> NonlinearModel:
@@ -292,16 +298,8 @@ def test_numbers_that_run_away_end_in_failed_or_in_a_finite_model(s: NonlinearSt
 
 @every
 def test_interruption_gives_the_best_so_far(s: NonlinearStructure) -> None:
-    stages: list[str] = []
-    shares: list[float] = []
-
-    def listen(stage: str, done: float | None = None) -> None:
-        stages.append(stage)
-        if done is not None:
-            shares.append(done)
-
-    fitted(s, smooth(), tick=listen)
-    assert stages
+    stages, dones = zip(*_usual(s.name)[1], strict=True)
+    shares = [x for x in dones if x is not None]
     assert all(isinstance(x, str) and x for x in stages)
     assert shares  # from which the time left is told
     assert all(0.0 <= x <= 1.0 for x in shares)

@@ -78,16 +78,6 @@ def test_offset_of_a_hundred_times_the_signal(name: str) -> None:
     np.testing.assert_allclose(other.offsets.y - one.offsets.y, 100 * np.std(data.y), rtol=1e-9)
 
 
-def test_two_runs_are_equal_and_inputs_unchanged() -> None:
-    data = SYSTEMS["bj"].data(6, 700)
-    u, y = data.u.copy(), data.y.copy()
-    one, other = SYSTEMS["bj"].fit(data), SYSTEMS["bj"].fit(data)
-    np.testing.assert_array_equal(one.model.theta, other.model.theta)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
-    np.testing.assert_array_equal(data.u, u)
-    np.testing.assert_array_equal(data.y, y)
-
-
 def test_a_short_record_of_a_slow_pole_that_begins_off_rest() -> None:
     rng = np.random.default_rng(7)
     poles, gains = [], []
