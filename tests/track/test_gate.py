@@ -283,3 +283,11 @@ def test_what_is_given_is_copied():
     q[0], P[0, 0] = 9.0, 9.0
     assert gate.accepted.values[0] == 0.0
     assert gate.accepted.covariance[0, 0] == 1.0
+
+
+def test_what_is_no_covariance_refuses():
+    from ambid.track.gate import _squared_length
+
+    d = np.array([1.0, -1.0])
+    assert _squared_length(d, np.array([[2.0, 0.0], [0.0, 2.0]])) == pytest.approx(1.0)
+    assert _squared_length(d, np.array([[1.0, 2.0], [2.0, 1.0]])) == np.inf  # an eigenvalue of -1

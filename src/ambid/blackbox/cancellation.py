@@ -164,8 +164,8 @@ def _idle_order(fit: BlackBoxFit) -> tuple[list[str], float | None]:
         return [], None
     S = fit.covariance[np.ix_(last, last)]
     c = model.theta[last]
-    p_value = float(chdtrc(len(last), float(c @ np.linalg.lstsq(S, c, rcond=1e-12)[0])))
-    return ([model.names[k] for k in last] if p_value > _P_LEAST else []), p_value
+    p_value = float(chdtrc(len(last), max(float(c @ np.linalg.lstsq(S, c, rcond=1e-12)[0]), 0.0)))
+    return ([] if p_value <= _P_LEAST else [model.names[k] for k in last]), p_value  # NaN shows nothing either
 
 
 def _shown(root: complex) -> str:

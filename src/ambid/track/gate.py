@@ -296,7 +296,7 @@ class Gate:
 
 
 def _squared_length(d: Array, covariance: Array) -> float:
-    """Return d^T covariance^-1 d; infinite where d moves a number without variance."""
+    """Return d^T covariance^-1 d; infinite where d moves a number without variance or no covariance is given."""
     known = covariance.diagonal() <= 0.0
     if known.any():
         if d[known].any():
@@ -304,5 +304,5 @@ def _squared_length(d: Array, covariance: Array) -> float:
         d, covariance = d[~known], covariance[np.ix_(~known, ~known)]
     A = covariance.copy(order="F")
     A.ravel("K")[:: d.size + 1] *= 1.0 + _REGULAR
-    _, solved, _ = dposv(A, d, overwrite_a=True)
-    return float(d @ solved)
+    _, solved, failed = dposv(A, d, overwrite_a=True)
+    return math.inf if failed else float(d @ solved)
