@@ -4,6 +4,7 @@ import ast
 
 import pytest
 
+from tests.conftest import LONGEST
 from tests.conventions.hygiene_rules import complaints_of_tests, machine_paths
 from tests.conventions.sources import PACKAGE, ROOT, files_of_tests, package_files, parsed, project_files, shown
 
@@ -30,6 +31,10 @@ def test_the_tools_bring_the_same_versions_as_the_product():
         return {line.split()[0] for line in lines if line[:1].isalnum()}
 
     assert pins("base.txt") <= pins("dev.txt")
+
+
+def test_the_tests_that_begin_first_are_there():
+    assert not [name for name in LONGEST if not (ROOT / "tests" / name).is_file()]
 
 
 def test_no_file_names_a_place_on_somebodys_machine():
