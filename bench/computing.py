@@ -102,7 +102,7 @@ def identification_lines(case: Case) -> Iterator[Line]:
     )
     estimate, found = identify(record), scipy_baseline.fit(case.start, *given)
     truth = case.simulation.truth
-    sd = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    sd = np.linalg.norm(np.linalg.pinv(found.jac), axis=1)  # a level of noise may have come to nothing
     accuracy: dict[str, dict[str, float]] = {}
     for j, name in enumerate(case.problem.estimated):
         ours, other = estimate.parameter(name), float(found.x[j] * case.problem.magnitude[j])
