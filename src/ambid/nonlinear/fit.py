@@ -25,7 +25,7 @@ class NonlinearModel(Protocol):
     Attributes
     ----------
     kind : str
-        Under which `identify.nonlinear.model_file` writes and finds it.
+        Under which `nonlinear.fit_file` writes and finds it.
     dt : float
         Sampling interval in s.
     n_inputs, n_outputs : int
@@ -137,7 +137,7 @@ class NonlinearModel(Protocol):
         ...
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `nonlinear.model_file` needs to read it back; numbers survive bit by bit."""
+        """Return all that `nonlinear.fit_file` needs to read it back; numbers survive bit by bit."""
         ...
 
 

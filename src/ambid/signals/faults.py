@@ -72,7 +72,9 @@ class Dropouts:
         )
 
 
-def find_dropouts(record: Record, name: str, *, false_alarm: float = 1e-4) -> Dropouts:
+def find_dropouts(
+    record: Record, name: str, *, false_alarm: float = 1e-4, saturation: Saturation | None = None
+) -> Dropouts:
     """Find stretches in which a channel stands still or falls to zero; nothing is replaced (see `replace_samples`).
 
     Parameters
@@ -84,6 +86,8 @@ def find_dropouts(record: Record, name: str, *, false_alarm: float = 1e-4) -> Dr
     false_alarm : float
         Probability that a whole record without drop-outs gives one, if repeated samples came by chance at the
         rate at which they come in this record. Steps and PRBS, which hold their levels all the time, therefore pass.
+    saturation : Saturation, optional
+        What `find_saturation` found in this channel, where that is known already: it sorts the whole channel.
 
     Returns
     -------
@@ -101,7 +105,7 @@ def find_dropouts(record: Record, name: str, *, false_alarm: float = 1e-4) -> Dr
         raise RecordError(f"find_dropouts got false_alarm {false_alarm}; it must lie between 0 and 1. Give e.g. 1e-4")
     shortest = longest_chance_run(x, false_alarm) + 1
     starts, lengths = equal_runs(x)
-    saturation = find_saturation(record, name)
+    saturation = find_saturation(record, name) if saturation is None else saturation
     limits = [limit.value for limit in (saturation.lower, saturation.upper) if limit]
     still = _stands_still(x, starts, lengths, shortest) & ~np.isin(x[starts], limits)
     marked = still | _falls_to_zero(x, starts)

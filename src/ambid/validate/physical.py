@@ -30,7 +30,7 @@ from ambid.estimation.prediction import sparse_gain
 from ambid.estimation.sensitivity import Products, Workspace, linearise, products
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
-from ambid.signals.faults import find_dropouts, find_outliers, find_saturation
+from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
 from ambid.validate.residuals import P_LEAST, ResidualTest, residual_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -338,11 +338,12 @@ def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: boo
     theta = fit.problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
     wrong = implausible(fit.problem.model, theta, sd)
+    limits = {c.name: find_saturation(record, c.name) for c in record.channels}
     return {
         "identifiable": _identifiable(fit, known, theta, robust=robust),
         "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical and the coil is passive"),
-        "within_limits": _within_limits(record),
-        "signals_sound": _signals_sound(record, fit.problem.model.outputs),
+        "within_limits": _within_limits(limits),
+        "signals_sound": _signals_sound(record, fit.problem.model.outputs, limits),
     }
 
 
@@ -400,8 +401,7 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
     return found
 
 
-def _within_limits(record: Record) -> Check:
-    found = {c.name: find_saturation(record, c.name) for c in record.channels}
+def _within_limits(found: Mapping[str, Saturation]) -> Check:
     bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
     detail = "; ".join(str(s) for s in bad.values())
     return Check(
@@ -411,9 +411,13 @@ def _within_limits(record: Record) -> Check:
     )
 
 
-def _signals_sound(record: Record, outputs: tuple[str, ...]) -> Check:
+def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str, Saturation]) -> Check:
     """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
-    found = [(role, find(record, role)) for role in outputs for find in (find_outliers, find_dropouts)]
+    found = [
+        (role, fault)
+        for role in outputs
+        for fault in (find_outliers(record, role), find_dropouts(record, role, saturation=limits[role]))
+    ]
     some = [f"{role}: {f}" for role, f in found if f.count]
     few = max(f.count for _, f in found) <= _ERRONEOUS * record.n_samples
     return Check(
