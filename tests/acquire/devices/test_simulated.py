@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambid.acquire.device import Program
-from ambid.acquire.devices import _kernels
+from ambid.acquire.devices import _kernels, played
 from ambid.acquire.devices.simulated import SimulatedDevice
 from ambid.acquire.protocol.table import table
 from ambid.errors import AmbidError, DeviceError
@@ -89,6 +89,32 @@ def test_in_real_time_samples_are_there_when_they_are_due():
             assert device.read(60.0) is not None
         c = device.counters()
         assert c.lost == c.overruns == 0
+
+
+def test_in_real_time_blocks_are_whole_but_for_a_command_and_the_end(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(played.time, "perf_counter", lambda: now[0])
+
+    def look(device, steps):
+        """Ask every 0.7 ms what happened, as a run does after every read; return the sizes of what came."""
+        found = []
+        for _ in range(steps):
+            now[0] += 7e-4
+            device.events()
+            assert device.state == "levitating"
+            frame = device.read(0.0)
+            found += [] if frame is None else [len(frame.block.values)]
+        return found
+
+    with SimulatedDevice(PROTOTYPE, pace="real") as device:
+        device.start("levitate")
+        assert look(device, 105) == [20] * 7  # 147 samples are due
+        device.excite(None)
+        assert look(device, 35) == [7, 20, 20]
+        device.stop()
+        assert len(device.read(0.0).block.values) == 9
+        assert device.ended
+        assert device.counters().samples == 196
 
 
 def test_a_rig_without_instruments_has_si_columns():

@@ -1,7 +1,8 @@
 """What a simulated bench and a replayed record share: there is no line, and blocks are made when somebody asks.
 
-As fast as possible, a block is made whenever one is read. In real time, every call first makes what is due by now, so
-that a command acts between two samples as it would on a bench; what nobody reads waits, and without room is counted.
+As fast as possible, a block is made whenever one is read. In real time, every call first makes the blocks that are due
+by now, and a command also the part of one, so that it acts between two samples as it would on a bench; what nobody
+reads waits, and without room is counted.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class PlayedDevice(ABC):
     def state(self) -> State:
         """The state now."""
         with self._lock:
-            self._catch_up(partly=True)
+            self._catch_up(partly=False)
             return self._state
 
     def __enter__(self) -> Self:
@@ -161,7 +162,7 @@ class PlayedDevice(ABC):
     def events(self) -> Sequence[DeviceEvent]:
         """As `Device.events`."""
         with self._lock:
-            self._catch_up(partly=True)
+            self._catch_up(partly=False)
             found, self._events = tuple(self._events), []
             return found
 
