@@ -1,9 +1,10 @@
 """Impulse responses by regularised least squares, their running sum, and by correlation.
 
-A prior of fading, smooth responses takes the place of an order; its sizes come from the marginal likelihood (Pillonetto
-and De Nicolao 2010; Chen, Ohlsson and Ljung 2012). In open loop the taps are estimated directly (`rfir`); where a
-controller may be at work, past outputs of all channels stand beside past inputs (a long regularised autoregression,
-consistent under feedback; Pillonetto, Chiuso and De Nicolao 2011), and the impulse response follows from both.
+A prior of fading, smooth responses (the stable spline of order one, "TC") takes the place of an order; its sizes come
+from the marginal likelihood (Pillonetto and De Nicolao 2010; Chen, Ohlsson and Ljung 2012). In open loop the taps are
+estimated directly (`rfir`); where a controller may be at work, past outputs of all channels stand beside past inputs (a
+long regularised autoregression, consistent under feedback; Pillonetto, Chiuso and De Nicolao 2011), and the impulse
+response follows from both.
 
 All that the data say stands in the triangle of [1 Phi y], taken once, by pieces; every evaluation is then a QR of that
 size (Chen and Ljung 2013). The noise variance is profiled out; the gradient is exact. Correlation analysis is that of
@@ -15,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,46 +33,18 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.signals.delay import lagged_triangle
 
-Kernel = Literal["tc", "dc", "ss"]
 
-SHAPES: dict[Kernel, int] = {"tc": 1, "dc": 2, "ss": 1}  # numbers beside the size
-
-_SURE: tuple[Kernel, ...] = ("tc", "dc")  # whose bands hold at the single tap; SS is too smooth for that
-
-
-def kernel_matrix(kernel: Kernel, n: int, shape: Array) -> tuple[Array, list[Array]]:
-    """Return a kernel and its derivatives by the logarithms of its shape.
-
-    `n`: taps; `shape`: lambda, and rho for DC; both between 0 and 1. Returns `K`: (n, n); `derivatives`: by log lambda,
-    and log rho.
-    """
+def kernel_matrix(n: int, decay: float) -> Array:
+    """Return the stable-spline kernel of order one (TC), decay^max(i, j): taps that fade, neighbours alike."""
     i = np.arange(1, n + 1)
-    most, both, apart = np.maximum.outer(i, i), np.add.outer(i, i), np.abs(np.subtract.outer(i, i))
-    log = np.log(shape)
-    if kernel == "tc":
-        K = np.exp(log[0] * most)
-        return K, [most * K]
-    if kernel == "dc":
-        K = np.exp(log[0] * both / 2 + log[1] * apart)
-        return K, [both / 2 * K, apart * K]
-    first, second = np.exp(log[0] * (both + most)) / 2, np.exp(log[0] * 3 * most) / 6
-    return first - second, [(both + most) * first - 3 * most * second]
+    return np.asarray(decay ** np.maximum.outer(i, i))
 
 
-def kernel_root(kernel: Kernel, n: int, shape: Array) -> Array:
-    """Return L with L L^T = K; exact for TC and DC, to rounding for SS.
-
-    `n`: taps. Returns (n, n).
-    """
+def kernel_root(n: int, decay: float) -> Array:
+    """Return the lower triangle L with L L^T = K."""
     i = np.arange(n)
-    apart = np.abs(np.subtract.outer(i, i))
-    if kernel == "ss":  # smooth, so nearly singular: a trace of roughness on every tap makes it definite
-        alike = 1.5 * shape[0] ** (0.5 * apart) - 0.5 * shape[0] ** (1.5 * apart)
-        size = shape[0] ** (1.5 * (i + 1)) / np.sqrt(3.0)
-        return np.asarray(size[:, None] * np.linalg.cholesky(alike + 1e-10 * np.eye(n)))
-    decay, rho = (shape[0], shape[1]) if kernel == "dc" else (shape[0], np.sqrt(shape[0]))
-    lower = np.tril(rho**apart)
-    lower[:, 1:] *= np.sqrt(max(1.0 - rho**2, 0.0))
+    lower = np.tril(decay ** (0.5 * np.abs(np.subtract.outer(i, i))))
+    lower[:, 1:] *= np.sqrt(max(1.0 - decay, 0.0))
     return np.asarray(decay ** ((i + 1) / 2)[:, None] * lower)
 
 
@@ -95,9 +68,7 @@ class Posterior:
     noise_variance: float
     constant: float
     freedom: float  # effective number of coefficients
-    kernel: Kernel
-    hyper: Array  # (n_hyper,), block by block: size over noise variance, then shape
-    evidence: float  # -2 log marginal likelihood, up to a constant
+    hyper: Array  # (2 n_blocks,), block by block: size over noise variance, then decay
 
 
 def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int) -> Triangle:
@@ -112,25 +83,12 @@ def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int
     return Triangle(R=R[phi, phi], r=R[phi, y], left=R[y, y].T @ R[y, y], head=R[0], rows=rows - first)
 
 
-def posterior(t: Triangle, output: int, blocks: Sequence[int], kernels: Sequence[Kernel]) -> Posterior:
-    """Choose sizes, shapes and the kernel by marginal likelihood.
-
-    `output`: column of y; `kernels`: to choose from.
-    """
-    found = [_maximise(t, output, blocks, k) for k in kernels]
-    return min(found, key=lambda f: f.evidence)
-
-
-def _maximise(t: Triangle, output: int, blocks: Sequence[int], kernel: Kernel) -> Posterior:
+def posterior(t: Triangle, output: int, blocks: Sequence[int]) -> Posterior:
+    """Choose size and decay of each block by marginal likelihood; `output`: column of y."""
     from scipy.optimize import minimize
 
-    search = _Evidence(t, output, blocks, kernel)
-    best, lowest = search.start(0.9), np.inf
-    for decay in (0.5, 0.8, 0.95):
-        v = search.start(decay)
-        value = search(v)[0]
-        if value < lowest:
-            best, lowest = v, value
+    search = _Evidence(t, output, blocks)
+    best = min((search.start(decay) for decay in (0.5, 0.8, 0.95)), key=lambda v: search(v)[0])
     done = minimize(search, best, jac=True, method="L-BFGS-B", bounds=search.bounds, options={"maxiter": 60})
     return search.posterior(done.x)
 
@@ -140,37 +98,35 @@ def _qr(rows: Array) -> Array:
 
 
 class _Evidence:
-    """-2 log p(y) at v: for each block log(size / noise variance), then log(-log shape) of each number of its shape."""
+    """-2 log p(y) at v: for each block log(size / noise variance), then log(-log decay)."""
 
-    def __init__(self, t: Triangle, output: int, blocks: Sequence[int], kernel: Kernel) -> None:
-        self.t, self.kernel, self.blocks = t, kernel, list(blocks)
+    def __init__(self, t: Triangle, output: int, blocks: Sequence[int]) -> None:
+        self.t, self.blocks = t, list(blocks)
         self.output, self.r, self.left = output, t.r[:, output], float(t.left[output, output])
         self.count = t.rows - 1
-        self.each = 1 + SHAPES[kernel]
         edges = np.cumsum([0, *blocks])
         self.places = [slice(int(a), int(b)) for a, b in pairwise(edges)]
         power = [max(float(np.mean(np.sum(t.R[:, p] ** 2, axis=0))) / t.rows, 1e-300) for p in self.places]
         self.center = -np.log(power)  # a coefficient of this variance over the noise's changes y by about the noise
-        self.bounds = [b for c in self.center for b in [(c - 25, c + 40), *[(-9.0, 1.1)] * SHAPES[kernel]]]
+        self.bounds = [b for c in self.center for b in [(c - 25, c + 40), (-9.0, 1.1)]]
 
     def start(self, decay: float) -> Array:
-        inner = [np.log(-np.log(decay)), *([np.log(-np.log(0.98))] if self.kernel == "dc" else [])]
-        return np.concatenate([[c + 4.0, *inner] for c in self.center])
+        return np.array([x for c in self.center for x in (c + 4.0, np.log(-np.log(decay)))])
 
     def _prior(self, v: Array) -> tuple[Array, list[tuple[slice, Array]]]:
         """Root of P over the noise variance, and dP/dv, block by block."""
         p = self.t.R.shape[1]
         L, slopes = np.zeros((p, p)), []
-        for b, place in enumerate(self.places):
-            part = v[b * self.each : (b + 1) * self.each]
-            shape = np.exp(-np.exp(part[1:]))
-            K, by_log = kernel_matrix(self.kernel, self.blocks[b], shape)
-            size = np.exp(part[0])
-            L[place, place] = np.sqrt(size) * kernel_root(self.kernel, self.blocks[b], shape)
-            slopes.append((place, size * K))
-            # d log(shape) / dv = log(shape)
-            slopes += [(place, size * d * np.log(s)) for d, s in zip(by_log, shape, strict=True)]
+        for n, place, size, decay in zip(self.blocks, self.places, *self._numbers(v), strict=True):
+            K, i = size * kernel_matrix(n, decay), np.arange(1, n + 1)
+            L[place, place] = np.sqrt(size) * kernel_root(n, decay)
+            slopes += [(place, K), (place, np.log(decay) * np.maximum.outer(i, i) * K)]
         return L, slopes
+
+    @staticmethod
+    def _numbers(v: Array) -> tuple[Array, Array]:
+        """Size and decay of each block."""
+        return np.exp(v[::2]), np.exp(-np.exp(v[1::2]))
 
     def __call__(self, v: Array) -> tuple[float, Array]:
         from scipy.linalg import solve_triangular
@@ -205,11 +161,7 @@ class _Evidence:
             noise_variance=noise,
             constant=float(constant),
             freedom=float(np.sum(inner**2)),
-            kernel=self.kernel,
-            hyper=np.concatenate(
-                [[np.exp(part[0]), *np.exp(-np.exp(part[1:]))] for part in v.reshape(len(self.blocks), self.each)]
-            ),
-            evidence=self(v)[0],
+            hyper=np.column_stack(self._numbers(v)).ravel(),
         )
 
 
@@ -222,7 +174,6 @@ class PredictorTaps:
     noise: Array  # (n_outputs, n_outputs), covariance of e
     y_sd: Array  # (n_outputs,)
     u_sd: Array  # (n_inputs,)
-    kernels: tuple[str, ...]
     # probability of the correlation that is left between outputs and inputs of one sample, if there is no path between
     # them that is faster than a sample; 1 where the record is too short to see one
     within_sample: float
@@ -235,7 +186,7 @@ def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
     n_y = data.n_outputs
     whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
     t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
-    found = [posterior(t, o, (lags,) * z.shape[1], _SURE) for o in range(n_y)]
+    found = [posterior(t, o, (lags,) * z.shape[1]) for o in range(n_y)]
     mean = np.stack([f.mean for f in found])
     error = t.r - t.R @ mean.T
     noise = (t.left + error.T @ error) / max(t.rows - 1 - float(np.mean([f.freedom for f in found])), 1.0)
@@ -252,7 +203,6 @@ def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
         noise=noise,
         y_sd=y_sd,
         u_sd=u_sd,
-        kernels=tuple(f.kernel for f in found),
         within_sample=_within_sample(whole, n_y),
     )
 
@@ -309,6 +259,7 @@ def _slope(through: Array, G: Array, i: int, n_y: int, n_u: int, lags: int) -> A
     return out
 
 
+_WHITENING = 10  # order of the autoregression that whitens an input before it is correlated
 _NOISE_ORDER = 20  # highest of the noise's autoregression
 _OLDER = 10  # lags beyond the taps that are looked at
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
@@ -320,39 +271,34 @@ _WITHIN = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImpulseResponse:
-    """Sampled impulse responses: y = sum of values[k] u[t - k], plus noise."""
-
-    time_s: Array  # (n_taps,), s, beginning at zero delay
-    values: Array  # (n_taps, n_outputs, n_inputs), output unit per input unit
-    covariance: Array  # (n_outputs, n_inputs, n_taps, n_taps), within each response
-    noise_sd: Array  # (n_outputs,), of the innovations
+class _Response:
+    time_s: Array  # (n_times,), s, beginning at zero delay
+    values: Array  # (n_times, n_outputs, n_inputs), output unit per input unit
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     units: Mapping[str, str]
-    kernels: tuple[str, ...]  # chosen for each output
-    method: Literal["rfir", "rarx"]
     warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImpulseResponse(_Response):
+    """Sampled impulse responses: y = sum of values[k] u[t - k], plus noise."""
+
+    covariance: Array  # (n_outputs, n_inputs, n_taps, n_taps), within each response
+    noise_sd: Array  # (n_outputs,), of the innovations
+    method: Literal["rfir", "rarx"]
 
     @property
     def sd(self) -> Array:
         """Standard deviations, shape (n_taps, n_outputs, n_inputs)."""
-        return np.moveaxis(np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=2, axis2=3), 0.0)), 2, 0)
-
-    def delay_samples(self, output: int = 0, channel: int = 0) -> int | None:
-        """Return the first tap that stands out from its own spread, all taps before it together not doing so.
-
-        `output`, `channel`: which output, and which input. Returns whole samples, at most the true delay with a chance
-        of 999 in 1000; None where nothing stands out.
-        """
-        from scipy.stats import norm
-
-        limit = norm.isf(_SEEN / 2 / self.time_s.size)
-        out = np.abs(self.values[:, output, channel]) > limit * np.maximum(self.sd[:, output, channel], 1e-300)
-        return int(np.argmax(out)) if np.any(out) else None
+        return _deviations(self.covariance)
 
 
-def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = tuple(SHAPES)) -> BlackBoxFit:
+def _deviations(covariance: Array) -> Array:
+    return np.moveaxis(np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0)), 2, 0)
+
+
+def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate a long FIR model with a fading prior; every output by itself.
 
     `data`: without feedback. Returns a PolynomialModel whose covariance is that of the posterior; `n_estimated` is the
@@ -364,7 +310,7 @@ def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = tuple(SHAP
     layout = arx_layout(0, nb, nk)
     check_length("rfir", data, 4 * (data.n_samples - layout.first_row), sum(nb) + 1)
     with one_thread():
-        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout, kernels)
+        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout)
     theta, covariance = list[Array](), list[Array]()
     for f, sd in zip(found, y_sd, strict=True):
         scale = np.concatenate([np.full(b, sd / s) for b, s in zip(nb, u_sd, strict=True)])
@@ -382,25 +328,24 @@ def rfir(data: IOData, orders: Orders, *, kernels: Sequence[Kernel] = tuple(SHAP
         offsets=Offsets(u=means, y=y_mean + y_sd * np.array([f.constant for f in found])),
         noise_covariance=np.diag([f.noise_variance * sd**2 for f, sd in zip(found, y_sd, strict=True)]),
         details={
-            "kernel": [f.kernel for f in found],
             "hyperparameters": [f.hyper.tolist() for f in found],
             "effective_coefficients": [f.freedom for f in found],
-            "evidence": [f.evidence for f in found],
         },
     )
 
 
-def impulse_response(data: IOData, n_taps: int, *, method: Literal["auto", "rfir", "rarx"] = "auto") -> ImpulseResponse:
+def impulse_response(data: IOData, n_taps: int) -> ImpulseResponse:
     """Estimate impulse responses with their spread.
+
+    In open loop (``data.open_loop``) the taps are estimated directly, ``rfir``. Where feedback may act they follow from
+    a long autoregression, ``rarx``, and the first tap is zero: without a delay in the loop input and output cannot be
+    told apart.
 
     Parameters
     ----------
     data : IOData
     n_taps : int
         Taps from zero delay on.
-    method : {"auto", "rfir", "rarx"}
-        ``rfir`` in open loop, ``rarx`` where feedback may act (its first tap is zero: without a delay in the loop input
-        and output cannot be told apart); "auto" goes by ``data.open_loop``.
 
     Returns
     -------
@@ -409,16 +354,13 @@ def impulse_response(data: IOData, n_taps: int, *, method: Literal["auto", "rfir
     Raises
     ------
     EstimationError
-        If the record is too short, or a name is not known.
+        If the record is too short, or fewer than two taps are asked for.
     """
-    if method not in ("auto", "rfir", "rarx"):
-        raise EstimationError(f"impulse response: method {method!r}; it is 'auto', 'rfir' or 'rarx'. Give one of them")
     if n_taps < 2:
         raise EstimationError(f"impulse response: {n_taps} tap(s); at least 2 make a response. Ask for more")
-    direct = method == "rfir" or (method == "auto" and data.open_loop)
     values = np.zeros((n_taps, data.n_outputs, data.n_inputs))
     covariance = np.zeros((data.n_outputs, data.n_inputs, n_taps, n_taps))
-    noise_sd, kernels, warnings = (_direct if direct else _through_autoregression)(data, values, covariance)
+    noise_sd, warnings = (_direct if data.open_loop else _through_autoregression)(data, values, covariance)
     return ImpulseResponse(
         time_s=np.arange(n_taps, dtype=np.float64) * data.dt,
         values=values,
@@ -427,29 +369,25 @@ def impulse_response(data: IOData, n_taps: int, *, method: Literal["auto", "rfir
         inputs=data.inputs,
         outputs=data.outputs,
         units=data.units,
-        kernels=kernels,
-        method="rfir" if direct else "rarx",
+        method="rfir" if data.open_loop else "rarx",
         warnings=warnings,
     )
 
 
-def _direct(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
-    """Fill in values and covariance; noise, kernels and warnings."""
-    fit = rfir(data, {"nb": values.shape[0], "nk": 0}, kernels=_SURE)
+def _direct(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...]]:
+    """Fill in values and covariance; noise and warnings."""
+    fit = rfir(data, {"nb": values.shape[0], "nk": 0})
     assert isinstance(fit.model, PolynomialModel)
     assert fit.covariance is not None
     for o, letter, i, place in fit.model.blocks():
         if letter == "B" and i is not None:
             values[:, o, i] = fit.model.theta[place]
             covariance[o, i] = fit.covariance[place, place]
-    kernels = cast("list[str]", fit.details["kernel"])
-    return np.sqrt(np.diag(fit.noise_covariance)), tuple(kernels), fit.warnings
+    return np.sqrt(np.diag(fit.noise_covariance)), fit.warnings
 
 
-def _through_autoregression(
-    data: IOData, values: Array, covariance: Array
-) -> tuple[Array, tuple[str, ...], tuple[str, ...]]:
-    """Fill in values and covariance; noise, kernels and warnings."""
+def _through_autoregression(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...]]:
+    """Fill in values and covariance; noise and warnings."""
     lags, n_y, n_u = values.shape[0] - 1, data.n_outputs, data.n_inputs
     check_length("impulse response", data, 2 * (data.n_samples - lags), lags * (n_y + n_u) + 1)
     with one_thread():
@@ -459,12 +397,10 @@ def _through_autoregression(
     values[1:] = found * scale
     covariance[:, :, 1:, 1:] = spread * scale[:, :, None, None] ** 2
     warnings = () if taps.within_sample > _SEEN else (_WITHIN.format(p=taps.within_sample),)
-    return np.sqrt(np.diag(taps.noise)) * taps.y_sd, taps.kernels, warnings
+    return np.sqrt(np.diag(taps.noise)) * taps.y_sd, warnings
 
 
-def _regress(
-    data: IOData, layout: Layout, kernels: Sequence[Kernel]
-) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
+def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
     """Scale, reduce to a triangle, and fit each output."""
     means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
     y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
@@ -472,7 +408,7 @@ def _regress(
     lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
     nb, first = layout.nb, layout.first_row
     t = triangle([(u[:, i], k) for i, k in lags], y, first)
-    rough = [posterior(t, o, nb, kernels) for o in range(data.n_outputs)]
+    rough = [posterior(t, o, nb) for o in range(data.n_outputs)]
     found = [_whiten(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
     return found, (means, u_sd), (y_mean, y_sd)
 
@@ -495,7 +431,7 @@ def _whiten(
     v, z = (np.asarray(lfilter(noise.D, 1.0, x, axis=0)[p:]) for x in (u, y))
     if _truncated(np.asarray(lfilter(noise.D, 1.0, left)[p:]), v, lags):
         return rough  # what is left comes from inputs older than the taps: no noise, and not to be whitened
-    found = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb, (rough.kernel,))
+    found = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb)
     constant = found.constant / float(noise.D.sum())
     left = _left(found.mean, constant, u, y, lags, first)
     total = float(left @ left) / max(left.size - 1 - found.freedom, 1.0)
@@ -531,16 +467,10 @@ def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StepResponse:
+class StepResponse(_Response):
     """Response to a unit step, with its spread."""
 
-    time_s: Array  # (n_times,), s, from the step
-    values: Array  # (n_times, n_outputs, n_inputs), output unit per input unit
-    sd: Array
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    warnings: tuple[str, ...] = ()
+    sd: Array  # (n_times, n_outputs, n_inputs)
 
 
 def step_response(impulse: ImpulseResponse) -> StepResponse:
@@ -556,11 +486,10 @@ def step_response(impulse: ImpulseResponse) -> StepResponse:
         Its band takes the correlation between taps into account.
     """
     summed = np.cumsum(np.cumsum(impulse.covariance, axis=2), axis=3)
-    sd = np.moveaxis(np.sqrt(np.maximum(np.diagonal(summed, axis1=2, axis2=3), 0.0)), 2, 0)
     return StepResponse(
         time_s=impulse.time_s,
         values=np.cumsum(impulse.values, axis=0),
-        sd=sd,
+        sd=_deviations(summed),
         inputs=impulse.inputs,
         outputs=impulse.outputs,
         units=impulse.units,
@@ -569,21 +498,14 @@ def step_response(impulse: ImpulseResponse) -> StepResponse:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Correlation:
-    """Impulse responses by correlation, one input at a time."""
+class Correlation(_Response):
+    """Impulse responses by correlation, one input at a time; times of negative lags come first."""
 
-    lags: NDArray[np.int64]  # (n_lags,), samples, negative ones first
-    time_s: Array  # (n_lags,), s
-    values: Array  # (n_lags, n_outputs, n_inputs), output unit per input unit
+    lags: NDArray[np.int64]  # (n_times,), samples
     band: Array  # (n_outputs, n_inputs), 99 % of the values lie within it where there is no response
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    order: int  # of the whitening filter
-    warnings: tuple[str, ...]
 
 
-def correlation_analysis(data: IOData, n_lags: int, *, order: int = 10) -> Correlation:
+def correlation_analysis(data: IOData, n_lags: int) -> Correlation:
     """Estimate impulse responses by correlation.
 
     Parameters
@@ -592,8 +514,6 @@ def correlation_analysis(data: IOData, n_lags: int, *, order: int = 10) -> Corre
         Inputs that do not go together.
     n_lags : int
         Lags on either side.
-    order : int
-        Of the autoregression that whitens each input; 0: none.
 
     Returns
     -------
@@ -610,11 +530,11 @@ def correlation_analysis(data: IOData, n_lags: int, *, order: int = 10) -> Corre
 
     if not data.n_inputs:
         raise EstimationError("correlation analysis: no input is named. Give --input")
-    n = data.n_samples - order
-    if n_lags < 1 or order < 0 or n < 4 * n_lags + 4 * order + 20:
+    n, order = data.n_samples - _WHITENING, _WHITENING
+    if n_lags < 1 or n < 4 * n_lags + 4 * order + 20:
         raise EstimationError(
-            f"correlation analysis: {data.n_samples} samples for {n_lags} lags and order {order}; at least "
-            f"{4 * n_lags + 5 * order + 20} are needed. Record longer, or lower both"
+            f"correlation analysis: {data.n_samples} samples for {n_lags} lags; at least {4 * n_lags + 5 * order + 20} "
+            "are needed. Record longer, or ask for fewer lags"
         )
     values = np.empty((2 * n_lags + 1, data.n_outputs, data.n_inputs))
     band, warnings = np.empty((data.n_outputs, data.n_inputs)), list[str]()
@@ -649,15 +569,12 @@ def correlation_analysis(data: IOData, n_lags: int, *, order: int = 10) -> Corre
         inputs=data.inputs,
         outputs=data.outputs,
         units=data.units,
-        order=order,
         warnings=tuple(warnings),
     )
 
 
 def _whitening_filter(u: Array, order: int) -> Array:
     """Coefficients of the autoregression of u, 1 first, by QR."""
-    if not order:
-        return np.ones(1)
     rows = np.column_stack([u[order - k : u.size - k] for k in range(order + 1)])
     found = np.linalg.lstsq(rows[:, 1:], rows[:, 0], rcond=1e-10)[0]  # a periodic input leaves directions open
     return np.concatenate([[1.0], -found])

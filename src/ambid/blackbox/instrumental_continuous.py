@@ -15,14 +15,21 @@ p^k/F(p) is state k of the companion form of F, exact for inputs held over a sam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, left_open, order_per_input
+from ambid.blackbox.data import (
+    IOData,
+    Orders,
+    check_length,
+    check_order_names,
+    left_open,
+    order_per_input,
+    single_order,
+)
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instrumental import ArxEstimate, Signals, centre, estimate_output, operating_point
 from ambid.blackbox.instruments import (
@@ -52,21 +59,21 @@ _NOISE_ORDER = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Chain:
-    """One denominator and the inputs that go through it, in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
+class TransferOrders:
+    """Orders of B_i/F in p = s/w0; its coefficients are f_0 ... f_(n-1), then b_0 ... of each input."""
 
-    inputs: tuple[int, ...]
-    degree: int  # n
-    nb: tuple[int, ...]  # numerator coefficients, p^0 ... p^(nb - 1), for each of these inputs
+    nb: tuple[int, ...]  # numerator coefficients, p^0 ... p^(nb - 1), by input
+    n: int  # degree of F, which all inputs share
+    nk: tuple[int, ...] | None  # delay in samples by input; None: to be scanned
 
     @property
     def size(self) -> int:
-        """Number of coefficients."""
-        return self.degree + sum(self.nb)
+        """Number of coefficients of one output."""
+        return self.n + sum(self.nb)
 
     def split(self, theta: Array) -> tuple[Array, Array]:
         """Return F, (n + 1,), and the numerators, (n_inputs, n + 1), highest power first."""
-        n, num = self.degree, np.zeros((len(self.nb), self.degree + 1))
+        n, num = self.n, np.zeros((len(self.nb), self.n + 1))
         for i, b in enumerate(np.split(theta[n:], np.cumsum(self.nb)[:-1])):
             num[i, n + 1 - b.size :] = b[::-1]
         return np.append(1.0, theta[:n][::-1]), num
@@ -79,14 +86,7 @@ class Setting:
     y: Array  # (n_samples,)
     u: Array  # (n_samples, n_inputs)
     step: float  # sampling interval in units of 1/w0
-    chains: tuple[Chain, ...]
-
-    def parts(self) -> Iterator[tuple[Chain, slice]]:
-        """Yield each chain and the place of its coefficients."""
-        first = 0
-        for c in self.chains:
-            yield c, slice(first, first + c.size)
-            first += c.size
+    orders: TransferOrders
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,21 +121,17 @@ class Found:
 
 def linearise(setting: Setting, theta: Array) -> Linearised:
     """Simulate, and set up one step."""
-    split = [(c, *c.split(theta[place])) for c, place in setting.parts()]
-    made = [responses(den, num, setting.step, setting.u[:, c.inputs]) for c, den, num in split]
-    raw = setting.y - sum(m.y for m in made)
-    nuisance = _nuisance(setting, [den for _, den, _ in split])
+    den, num = setting.orders.split(theta)
+    made = responses(den, num, setting.step, setting.u)
+    raw, nuisance = setting.y - made.y, _nuisance(setting, den)
     basis = span(nuisance)
     error = raw - basis @ (basis.T @ raw)
     size = np.linalg.norm(nuisance, axis=0)
     weights = np.linalg.lstsq(nuisance / size, raw, rcond=1e-8)[0] / size
-    Z, Phi, first = list[Array](), list[Array](), 1
-    for (c, den, _), m in zip(split, made, strict=True):
-        free = nuisance[:, first : first + c.degree] @ weights[first : first + c.degree]
-        first += c.degree
-        Z.append(_output_columns(c, den, m.of_output + filter_states(den, setting.step, free), m, setting.u))
-        Phi.append(_output_columns(c, den, filter_states(den, setting.step, m.y + free + error), m, setting.u))
-    both = np.hstack([*Z, *Phi])
+    free = nuisance[:, 1:] @ weights[1:]
+    Z = _output_columns(setting, den, made.of_output + filter_states(den, setting.step, free), made)
+    Phi = _output_columns(setting, den, filter_states(den, setting.step, made.y + free + error), made)
+    both = np.hstack([Z, Phi])
     both -= basis @ (basis.T @ both)
     return Linearised(error=error, Z=both[:, : theta.size], Phi=both[:, theta.size :], constant=float(weights[0]))
 
@@ -172,7 +168,7 @@ def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found
     """
     rough = list[tuple[Found, float]]()
     for w0 in _time_scales(y.size, dt):
-        setting = Setting(y=y, u=u, step=w0 * dt, chains=orders.chains)
+        setting = Setting(y=y, u=u, step=w0 * dt, orders=orders)
         try:
             rough.append((refine(setting, _start(setting), _ROUGH), w0))
         except (EstimationError, np.linalg.LinAlgError):
@@ -196,96 +192,52 @@ def _time_scales(n: int, dt: float) -> Array:
 
 
 def _start(setting: Setting) -> Array:
-    """Least squares on signals through 1/(p + 1)^n (state variable filters), then each input by itself."""
-    chains = setting.chains
-    if len(chains) == 1:
-        return _state_variable_filter(setting)
-    n = max(c.degree for c in chains)
-    nb = tuple(min(n + 1, max(max(c.nb) for c in chains)) for _ in chains)
-    shared = replace(setting, chains=(Chain(inputs=tuple(range(len(chains))), degree=n, nb=nb),))
-    den, num = shared.chains[0].split(refine(shared, _state_variable_filter(shared), _ROUGH).theta)
-    out = []
-    for i, c in enumerate(chains):
-        u = setting.u[:, i : i + 1]
-        part = responses(den, num[i : i + 1], setting.step, u).y
-        alone = replace(setting, y=part, u=u, chains=(replace(c, inputs=(0,)),))
-        out.append(refine(alone, _state_variable_filter(alone), _ROUGH).theta)
-    return np.concatenate(out)
-
-
-def _state_variable_filter(setting: Setting) -> Array:
-    (chain,), n_u = setting.chains, setting.u.shape[1]
-    smooth = np.asarray(np.poly(-np.ones(chain.degree)), dtype=np.float64)
+    """Least squares on signals through 1/(p + 1)^n (state variable filters)."""
+    smooth = np.asarray(np.poly(-np.ones(setting.orders.n)), dtype=np.float64)
     y = filter_states(smooth, setting.step, setting.y)
-    r = responses(smooth, np.zeros((n_u, smooth.size)), setting.step, setting.u)
-    rows = np.column_stack([_output_columns(chain, smooth, y, r, setting.u), setting.y - y @ smooth[:0:-1]])
-    basis = span(_nuisance(setting, [smooth]))
+    r = responses(smooth, np.zeros((setting.u.shape[1], smooth.size)), setting.step, setting.u)
+    rows = np.column_stack([_output_columns(setting, smooth, y, r), setting.y - y @ smooth[:0:-1]])
+    basis = span(_nuisance(setting, smooth))
     rows -= basis @ (basis.T @ rows)
-    return _mirror_poles(setting, solve(rows[:, :-1], rows[:, :-1], rows[:, -1], who="srivc").theta)
+    return _mirror_poles(solve(rows[:, :-1], rows[:, :-1], rows[:, -1], who="srivc").theta, setting.orders.n)
 
 
-def _output_columns(chain: Chain, den: Array, of_y: Array, made: Responses, u: Array) -> Array:
+def _output_columns(setting: Setting, den: Array, of_y: Array, made: Responses) -> Array:
     """Derivatives of the simulated output: -p^k/F y, then p^k/F u of each input."""
-    n = chain.degree
-    columns = [-of_y]
-    for i, nb in enumerate(chain.nb):
+    n, columns = setting.orders.n, [-of_y]
+    for i, nb in enumerate(setting.orders.nb):
         columns.append(made.of_inputs[:, i, : min(nb, n)])
         if nb == n + 1:  # p^n/F u = u - sum of f_k p^k/F u
-            columns.append((u[:, chain.inputs[i]] - made.of_inputs[:, i] @ den[:0:-1])[:, None])
+            columns.append((setting.u[:, i] - made.of_inputs[:, i] @ den[:0:-1])[:, None])
     return np.hstack(columns)
 
 
-def _nuisance(setting: Setting, dens: list[Array]) -> Array:
+def _nuisance(setting: Setting, den: Array) -> Array:
+    """A constant, and the free responses."""
     n = setting.y.size
-    return np.hstack([np.ones((n, 1)), *[free_response(den, setting.step, n) for den in dens]])
+    return np.hstack([np.ones((n, 1)), free_response(den, setting.step, n)])
 
 
 def _shorten(setting: Setting, theta: Array, at: Linearised, change: Array) -> tuple[Array, Linearised] | None:
     """The longest of the step, its half, quarter ... that makes the error smaller; None if none does."""
     for k in range(_HALVINGS):
-        moved = _mirror_poles(setting, theta + 0.5**k * change)
+        moved = _mirror_poles(theta + 0.5**k * change, setting.orders.n)
         new = linearise(setting, moved)
         if new.loss < at.loss:
             return moved, new
     return None
 
 
-def _mirror_poles(setting: Setting, theta: Array) -> Array:
+def _mirror_poles(theta: Array, n: int) -> Array:
     """Mirror poles of the right half plane: a simulated output must not run away. The error decides if it stays."""
-    out = theta.copy()
-    for c, place in setting.parts():
-        roots = np.roots(c.split(theta[place])[0])
-        if np.all(np.isfinite(roots)) and np.max(roots.real) >= 0:
-            roots = np.where(roots.real >= 0, -np.maximum(roots.real, 1e-9) + 1j * roots.imag, roots)
-            out[place.start : place.start + c.degree] = np.poly(roots).real[:0:-1]
-    return out
+    roots = np.roots(np.append(1.0, theta[:n][::-1]))
+    if not np.all(np.isfinite(roots)) or np.max(roots.real) < 0:
+        return theta
+    roots = np.where(roots.real >= 0, -np.maximum(roots.real, 1e-9) + 1j * roots.imag, roots)
+    return np.concatenate([np.poly(roots).real[:0:-1], theta[n:]])
 
 
 _DELAYS = tuple(range(6))  # scanned where nk is not given
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TransferOrders:
-    """Orders of a continuous-time transfer function."""
-
-    nb: tuple[int, ...]  # numerator coefficients by input
-    nf: tuple[int, ...]  # denominator degree by input
-    nk: tuple[int, ...] | None  # delay in samples by input; None: to be scanned
-    common: bool  # whether the inputs share one denominator
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients of one output."""
-        return sum(c.size for c in self.chains)
-
-    @property
-    def chains(self) -> tuple[Chain, ...]:
-        """The denominators with their inputs."""
-        if self.common:
-            return (Chain(inputs=tuple(range(len(self.nb))), degree=self.nf[0], nb=self.nb),)
-        return tuple(
-            Chain(inputs=(i,), degree=f, nb=(b,)) for i, (f, b) in enumerate(zip(self.nf, self.nb, strict=True))
-        )
 
 
 def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -296,9 +248,9 @@ def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
     data : IOData
         Without feedback; inputs held over a sample.
     orders : Mapping[str, int or tuple of int]
-        ``nb``: numerator coefficients (1: a constant), one or one for each input. ``nf``: denominator degree; one
-        number for a denominator that all inputs share, a tuple for one of each input's own. ``nk``: delay in samples,
-        one or one for each input; left out: the one up to 5, common to all inputs, that fits best.
+        ``nb``: numerator coefficients (1: a constant), one or one for each input. ``nf``: degree of the denominator,
+        which all inputs share. ``nk``: delay in samples, one or one for each input; left out: the one up to 5, common
+        to all inputs, that fits best.
 
     Returns
     -------
@@ -327,15 +279,14 @@ def transfer_orders(who: str, data: IOData, orders: Orders) -> TransferOrders:
     n_u = data.n_inputs
     if not n_u:
         raise EstimationError(f"{who}: no input is named; it estimates the way from inputs to outputs. Give --input")
-    nb, nf = order_per_input(who, orders, "nb", 1, n_u), order_per_input(who, orders, "nf", 1, n_u)
-    for b, f in zip(nb, nf, strict=True):
-        if b > f + 1:
-            raise EstimationError(
-                f"{who}: {b} numerator coefficients over a denominator of degree {f}; a plant that can be sampled has "
-                f"at most {f + 1}. Lower nb, or raise nf"
-            )
+    nb, n = order_per_input(who, orders, "nb", 1, n_u), single_order(who, orders, "nf", 1)
+    if max(nb) > n + 1:
+        raise EstimationError(
+            f"{who}: {max(nb)} numerator coefficients over a denominator of degree {n}; a plant that can be sampled "
+            f"has at most {n + 1}. Lower nb, or raise nf"
+        )
     nk = None if left_open(orders, "nk") else order_per_input(who, orders, "nk", 0, n_u)
-    return TransferOrders(nb=nb, nf=nf, nk=nk, common=not isinstance(orders["nf"], tuple) or n_u == 1)
+    return TransferOrders(nb=nb, n=n, nk=nk)
 
 
 def _all_outputs(data: IOData, orders: TransferOrders, nk: tuple[int, ...], first: int) -> list[tuple[Found, float]]:
@@ -367,7 +318,8 @@ def _srivc_fit(
             ScaledTransfer(
                 theta=f.theta,
                 covariance=error.size / max(error.size - orders.size - 1, 1) * inner,
-                groups=tuple((c.degree, c.nb) for c in orders.chains),
+                n=orders.n,
+                nb=orders.nb,
                 w0=w0,
                 gain=size / u_size,
             )
@@ -377,7 +329,7 @@ def _srivc_fit(
     return build_fit(
         "srivc",
         data,
-        orders={"nb": orders.nb, "nf": orders.nf[0] if orders.common else orders.nf, "nk": nk},
+        orders={"nb": orders.nb, "nf": orders.n, "nk": nk},
         model=model,
         covariance=covariance,
         n_estimated=data.n_outputs * orders.size,
@@ -387,7 +339,6 @@ def _srivc_fit(
         details={
             "condition": [f.at.solve().condition for f, _ in found],
             "steps": [f.steps for f, _ in found],
-            "noise_order": [0] * len(found),
         },
     )
 
@@ -431,11 +382,7 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
     who = "clsrivc"
     require_reference(who, data)
     used = transfer_orders(who, data, {"nk": 0, **orders})
-    if len(set(used.nf)) > 1 or not used.common:
-        raise EstimationError(
-            f"{who}: order nf = {used.nf}; the inputs share one denominator here. Give nf as one number"
-        )
-    n, nk = used.nf[0], used.nk or ()
+    n, nk = used.n, used.nk or ()
     through = [b == n + 1 for b in used.nb]
     sampled = arx_layout(n, tuple(n + t for t in through), tuple(k + (not t) for k, t in zip(nk, through, strict=True)))
     check_length(who, data, data.n_samples - sampled.first_row, sampled.free.size + 1)
@@ -504,7 +451,7 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
     """Continuous coefficients nearest to a sampled estimate in the metric of its information."""
     from scipy.optimize import least_squares
 
-    n, nb = orders.nf[0], orders.nb
+    n, nb = orders.n, orders.nb
     root, eta = _information(found)
 
     def error(theta: Array) -> Array:
@@ -555,14 +502,12 @@ def _clsrivc_fit(
 ) -> BlackBoxFit:
     from scipy.stats import chi2
 
-    n, nk = orders.nf[0], orders.nk or ()
+    n, nk = orders.n, orders.nk or ()
     scaled, warnings = [], []
     for o, (c, w) in enumerate(zip(nearest, w0, strict=True)):
         half = np.linalg.pinv(c.root, rcond=1e-14)
         scaled.append(
-            ScaledTransfer(
-                theta=c.theta, covariance=half @ half.T, groups=((n, orders.nb),), w0=w, gain=sds[1][o] / sds[0]
-            )
+            ScaledTransfer(theta=c.theta, covariance=half @ half.T, n=n, nb=orders.nb, w0=w, gain=sds[1][o] / sds[0])
         )
         if c.freedom and chi2.sf(c.misfit, c.freedom) < _UNLIKELY:
             warnings.append(

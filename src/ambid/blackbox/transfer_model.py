@@ -188,29 +188,26 @@ class TransferModel(BlackBoxModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScaledTransfer:
-    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input, group by group."""
+    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
 
     theta: Array  # (n_theta,)
     covariance: Array  # (n_theta, n_theta)
-    groups: tuple[tuple[int, tuple[int, ...]], ...]  # degree, and numerator coefficients of the inputs that share it
+    n: int  # degree of the denominator
+    nb: tuple[int, ...]  # numerator coefficients by input
     w0: float  # rad/s
     gain: Array  # (n_inputs,), SI unit of a numerator coefficient
 
     def in_s(self) -> tuple[list[Array], list[Array], Array]:
         """Return numerators and denominators by input in s and SI, and their derivative by `theta`."""
-        num, den, rows, first = list[Array](), list[Array](), list[Array](), 0
-        unit = np.eye(self.theta.size)
-        for n, nb in self.groups:
-            worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
-            by_den = np.vstack([np.zeros(self.theta.size), (unit[first : first + n] * worth[:n, None])[::-1]])
-            first += n
-            for b in nb:
-                by_num = (unit[first : first + b] * (worth[:b] * self.gain[len(num)])[:, None])[::-1]
-                num.append(by_num @ self.theta)
-                den.append(np.append(1.0, by_den[1:] @ self.theta))
-                rows += [by_num, by_den]
-                first += b
-        return num, den, np.vstack(rows)
+        n, unit, num, rows = self.n, np.eye(self.theta.size), list[Array](), list[Array]()
+        worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
+        by_den = np.vstack([np.zeros(self.theta.size), (unit[:n] * worth[:n, None])[::-1]])
+        den = np.append(1.0, by_den[1:] @ self.theta)
+        for gain, own in zip(self.gain, np.split(unit[n:], np.cumsum(self.nb)[:-1]), strict=True):
+            by_num = (own * (worth[: own.shape[0]] * gain)[:, None])[::-1]
+            num.append(by_num @ self.theta)
+            rows += [by_num, by_den]
+        return num, [den] * len(num), np.vstack(rows)
 
 
 def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]) -> tuple[TransferModel, Array]:

@@ -90,9 +90,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     solutions = [f[0] for f in found]
     size = n + sum(nb)
     scaled = [
-        ScaledTransfer(
-            theta=s.theta[:size], covariance=s.covariance[:size, :size], groups=((n, nb),), w0=1.0, gain=sd / u_sd
-        )
+        ScaledTransfer(theta=s.theta[:size], covariance=s.covariance[:size, :size], n=n, nb=nb, w0=1.0, gain=sd / u_sd)
         for s, sd in zip(solutions, y_sd, strict=True)
     ]
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))

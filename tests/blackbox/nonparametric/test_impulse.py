@@ -52,24 +52,15 @@ def in_loop(n, seed, *, noise=0.5, told=False):
     return IOData(u=u[:, None], y=y[:, None], dt=0.1, inputs=("u0",), outputs=("y",), units={}, open_loop=told)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
-def test_kernels_and_roots_agree(kernel):
-    shape = np.array([0.8, 0.95])[: 2 if kernel == "dc" else 1]
-    K, slopes = kernel_matrix(kernel, 30, shape)
-    root = kernel_root(kernel, 30, shape)
-    size = np.sqrt(np.diag(K))
-    np.testing.assert_allclose(root @ root.T / np.outer(size, size), K / np.outer(size, size), atol=2e-10)
-    for j, slope in enumerate(slopes):
-        complex_shape = shape.astype(complex)
-        complex_shape[j] *= np.exp(1e-30j)
-        np.testing.assert_allclose(kernel_matrix(kernel, 30, complex_shape)[0].imag / 1e-30, slope, rtol=1e-12)
+def test_kernel_and_root_agree():
+    root = kernel_root(30, 0.8)
+    np.testing.assert_allclose(root @ root.T, kernel_matrix(30, 0.8), atol=1e-14)
 
 
-@pytest.mark.parametrize("kernel", ["tc", "dc", "ss"])
-def test_the_gradient_and_the_value_of_the_evidence_are_exact(kernel):
+def test_the_gradient_and_the_value_of_the_evidence_are_exact():
     data = record(400, 1, inputs=2)
     u, y = data.u - data.u.mean(axis=0), data.y[:, 0] - data.y.mean()
-    evidence = _Evidence(triangle([(x, k) for x in u.T for k in range(15)], y[:, None], 14), 0, (15, 15), kernel)
+    evidence = _Evidence(triangle([(x, k) for x in u.T for k in range(15)], y[:, None], 14), 0, (15, 15))
     v = evidence.start(0.8) + 0.1 * np.random.default_rng(0).standard_normal(evidence.start(0.8).size)
     value, gradient = evidence(v)
     for j in range(v.size):
@@ -155,10 +146,11 @@ def test_offset_several_inputs_and_dead_time():
     assert at_rest == pytest.approx(3.0, abs=1.0)
     response = impulse_response(data, 60)
     assert response.method == "rfir"
-    assert response.delay_samples(0, 0) == 2
-    assert response.delay_samples(0, 1) == 1
+    for channel, delay in ((0, 2), (1, 1)):  # taps of a dead time lie within their spread
+        beyond = np.abs(response.values[:, 0, channel]) > 4.5 * response.sd[:, 0, channel]
+        assert np.argmax(beyond) == delay
     still = impulse_response(replace(data, y=np.random.default_rng(0).standard_normal((3000, 1))), 60)
-    assert still.delay_samples() is None
+    assert np.all(np.abs(still.values) <= 4.5 * still.sd)
 
 
 def test_feedback_is_seen_through():
@@ -170,9 +162,9 @@ def test_feedback_is_seen_through():
         assert found.method == "rarx"
         assert found.values[0, 0, 0] == 0
         z.append(((found.values - truth[:, None, None]) / np.maximum(found.sd, 1e-12))[1:25, 0, 0])
-        direct = impulse_response(data, 40, method="rfir")
+        direct = rfir(data, {"nb": 40, "nk": 0})
         assert any("biased" in w for w in direct.warnings)
-        wrong.append(np.abs(direct.values[:25, 0, 0] - truth[:25]).max())
+        wrong.append(np.abs(direct.model.outputs[0].B[0][:25] - truth[:25]).max())
     z = np.array(z)
     assert np.mean(np.abs(z) < 1.96) > 0.8
     assert np.abs(z.mean(axis=0)).max() < 2.0
@@ -220,8 +212,6 @@ def test_what_breaks_a_rule_is_refused():
     data = record(300, 0)
     with pytest.raises(EstimationError, match="nb is missing"):
         rfir(data, {"nk": 1})
-    with pytest.raises(EstimationError, match="method"):
-        impulse_response(data, 20, method="fir")
     with pytest.raises(EstimationError, match="at least 2"):
         impulse_response(data, 1)
     with pytest.raises(EstimationError, match="constant"):
