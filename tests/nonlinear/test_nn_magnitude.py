@@ -9,8 +9,8 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit_file import model_from_json, model_to_json
 from ambid.nonlinear.nn import nn
-from ambid.nonlinear.nn_magnitude import grid_starts
-from ambid.nonlinear.state_network import StateNetwork, run
+from ambid.nonlinear.state_network import StateNetwork
+from ambid.nonlinear.state_start import grid_starts
 from tests.measured import ABSENT, BENCHMARKS
 
 DATA = BENCHMARKS
@@ -54,7 +54,7 @@ def test_starts_are_the_models_of_the_grid() -> None:
     y = np.abs(lfilter([0.0, 0.5], A, u[:, 0]))
     for n in (1, 2, 3, 4):
         layout, theta = grid_starts(((y[:, None], u),), n, 1, 0.02)[0]
-        X, _ = run(layout, layout.matrices(theta), y[:, None], np.hstack([u, np.ones_like(u)]), np.zeros(n + 1))
+        X, _ = layout.matrices(theta).run(y[:, None], np.hstack([u, np.ones_like(u)]), np.zeros(n + 1))
         poles = np.linalg.eigvals(layout.matrices(theta).A)
         filtered = lfilter([0.0, 1.0], np.real(np.poly(poles)), u[:, 0])
         gain = (filtered @ X[:-1, 0]) / (filtered @ filtered)

@@ -11,8 +11,7 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.nn import nn
-from ambid.nonlinear.nn_magnitude import magnitude_layout
-from ambid.nonlinear.state_network import ONE_AXIS, Layout, StateNetwork, StateProblem, free_entries
+from ambid.nonlinear.state_network import ONE_AXIS, Layout, StateNetwork, StateProblem
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
@@ -28,16 +27,18 @@ def one_axis(neurons: int, *, gain: bool) -> Layout:
 
 
 def free(neurons: int, *, gain: bool) -> Layout:
-    return Layout(
-        form="free", dt=0.05, n_inputs=2, heads=(0, 2), steps=(0.3, 0.0, 0.0), entries=free_entries((2, 1), 2),
-        scale=(1.0,) * 5, rates=(1.0,) * 3, rows=(0, 1, 2), gain=gain, neurons=neurons,
-    )  # fmt: skip
+    return Layout.free(0.05, (2, 1), (0.3, 0.0, 0.0), (1.0,) * 5, gain=gain, neurons=neurons)
+
+
+def magnitude(n: int, n_inputs: int, neurons: int) -> Layout:
+    steps = (0.4,) * (n - 1) + (0.0,)
+    return Layout.free(0.05, (n,), steps, (1.0,) * (n + n_inputs), sensor=True, neurons=neurons)
 
 
 @pytest.mark.parametrize(
     "layout",
     [one_axis(2, gain=False), one_axis(2, gain=True), free(0, gain=True), free(2, gain=True),
-     magnitude_layout(3, 2, 2, 0.05), magnitude_layout(1, 1, 0, 0.05)],
+     magnitude(3, 2, 2), magnitude(1, 1, 0)],
     ids=["one-axis", "one-axis with gain", "free", "free with network", "magnitude", "magnitude, linear"],
 )  # fmt: skip
 def test_the_triangle_holds_slopes_of_errors_and_of_the_prior(layout: Layout) -> None:

@@ -129,6 +129,3 @@ def test_the_delay_of_a_stable_plant_is_found(delay: int, noise: float) -> None:
 def test_the_delay_of_an_unstable_plant_under_feedback_is_found(n: int, amplitude: float, quiet: float) -> None:
     fit = nn([bearing(n, amplitude, 1, quiet=quiet)], {"descent": 0, "delay": "auto"})
     assert fit.settings["delay"] == 1
-    tried = fit.details["tried_delays"]
-    assert isinstance(tried, list)
-    assert min(tried, key=lambda x: x["log_det_errors"])["delay"] == 1

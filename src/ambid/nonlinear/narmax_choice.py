@@ -34,11 +34,11 @@ from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
 from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, problem_at
-from ambid.nonlinear.nn_magnitude import pole_grid
 from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term, lagged, products
 from ambid.nonlinear.records import Parts
 from ambid.nonlinear.selection import Candidates, MatrixCandidates, Selection, candidates, select_terms
 from ambid.nonlinear.settings import choice, read_settings, whole
+from ambid.nonlinear.state_start import pole_grid
 
 _ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations
 _NEARLY_ALL = 0.99  # of the output's energy

@@ -3,13 +3,15 @@
 Delay -> subspace start -> the thesis's training beside Gauss-Newton (for the learning curves) -> Levenberg-Marquardt on
 simulation errors -> hidden layer (option) -> predictor gain, where errors are not white -> global search, where all
 that failed, and training again -> covariance.
+
+Behind a sensor that sees no sign, such as a pulse counter (output=magnitude): starts from a grid of poles -> number of
+states by Bayes' criterion -> number of odd hidden units by how the free run goes on behind parts of the records.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -19,7 +21,6 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions, silent
 from ambid.nonlinear.fit import NonlinearFit, Settings
-from ambid.nonlinear.nn_magnitude import nn_of_magnitude
 from ambid.nonlinear.records import Scaled, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, whole
 from ambid.nonlinear.state_start import (
@@ -27,6 +28,7 @@ from ambid.nonlinear.state_start import (
     NO_START,
     SHORT,
     find_delay,
+    grid_starts,
     guess_delay,
     matrices_json,
     search_start,
@@ -37,8 +39,8 @@ from ambid.nonlinear.state_start import (
 )  # fmt: skip
 from ambid.nonlinear.state_training import (
     Fitting,
-    Interrupted,
     State,
+    Training,
     add_gain,
     add_units,
     finish,
@@ -49,6 +51,10 @@ from ambid.nonlinear.state_training import (
 )  # fmt: skip
 
 _SIGNED: Mapping[str, object] = {"neurons": 0, "prior": 3.0, "starts": 3, "evaluations": 2000}
+_MAGNITUDE: Mapping[str, object] = {"prior": 1.0, "starts": 20}
+_MAGNITUDE_ALWAYS: Mapping[str, object] = {
+    "form": "free", "noise": "output", "delay": 0, "descent": 0, "evaluations": 0, "uncertainty": "laplace",
+}  # fmt: skip
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
 _LONG = (20, 30)  # samples of past for the first model of plants that a short one does not show
 _BETTER = 1e-2  # of the errors' log determinant, by which a network from the global search must be better
@@ -57,6 +63,15 @@ _LARGEST = 5  # states beyond the outputs that are tried
 _DELAY, _TRAINING, _RESCUE, _AGAIN, _SPREAD = (  # shares of the time: rescues are rare
     (0.0, 0.15), (0.15, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0),
 )  # fmt: skip
+
+MOST_STATES = 4  # behind a sensor without sign
+_MOST_UNITS = 3
+_REFINED = 8  # linear starts that are searched from
+_CLEAR = 10.0  # of Bayes' criterion, which a larger model has to gain (Kass and Raftery 1995): errors are not white
+_FOLDS = (0.5, 0.625, 0.75)  # of each record are trained on in the choice of units ..
+_AHEAD = 0.25  # .. and so much behind is run on
+_LESS = 0.95  # part of the held-out error to which further units have to bring it
+_LAST = 10  # times as many iterations for the best start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,33 +121,36 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     entries; its starts come from subspace models of several horizons.
     """
     chosen = {k: v for k, v in asdict(read_settings(NnSettings, "nn", settings)).items() if v is not None}
-    given = {k: v for k, v in chosen.items() if k in settings}
-    if chosen["output"] == "magnitude":
-        return nn_of_magnitude(records, given, seed, tick)
-    s: dict[str, Any] = {**_SIGNED, **chosen}
-    data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)))
-    s["form"] = _choose_form(str(s["form"]), records[0])
-    fitting, reason = Fitting(data=data), ""
+    unsigned = chosen["output"] == "magnitude"
+    if unsigned:
+        _check_magnitude(records, {k: v for k, v in chosen.items() if k in settings})
+    s: dict[str, Any] = {**_MAGNITUDE, **chosen, **_MAGNITUDE_ALWAYS} if unsigned else {**_SIGNED, **chosen}
+    data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
+    fitting, reason = Fitting(data=data), NO_START
     try:
-        reason = _start(s, data, records[0], fitting, tick)
-        if not reason:
-            _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
-        reason = _rescue(s, data, records[0], fitting, seed, tick, reason, asked=bool(given.get("evaluations")))
-        if fitting.state is not None:
-            fitting.warnings += _suspect(s, fitting)
-    except KeyboardInterrupt as stop:
-        if isinstance(stop, Interrupted):
-            fitting.state = stop.state
+        if unsigned:
+            _train_magnitude(s, records[0].dt, fitting, seed, tick)
+        else:
+            s["form"] = _choose_form(str(s["form"]), records[0])
+            reason = _start(s, data, records[0], fitting, tick)
+            if not reason:
+                _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
+            asked = bool("evaluations" in settings and s["evaluations"])
+            reason = _rescue(s, data, records[0], fitting, seed, tick, reason, asked=asked)
+            if fitting.state is not None:
+                fitting.warnings += _suspect(s, fitting)
+    except KeyboardInterrupt:
         fitting.interrupt()
-        reason = reason or "interrupted before there was a network"
+        if reason in ("", NO_START):
+            reason = "interrupted before there was a network"
     except np.linalg.LinAlgError as error:
         reason = f"the training broke down: {error}"
         fitting.state = None
     state = fitting.state
-    if state is not None and s["form"] == "free":
+    if state is not None and not unsigned and s["form"] == "free":
         m = state.layout.matrices(state.theta)
-        fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B[:, :-1], sampled=True)
-    used = {**s, "delay": fitting.delay}
+        fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B, sampled=True)
+    used = {**s, "delay": fitting.delay, "neurons": 0 if state is None else state.layout.neurons}
     return finish(records, used, fitting, reason, seed=seed, how=s["uncertainty"], tick=part_of(tick, *_SPREAD))
 
 
@@ -185,9 +203,8 @@ def _start(s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting
 def _find_delay(s: Mapping[str, Any], state: State, whole: Scaled, fitting: Fitting, tick: Tick | None) -> None:
     """Find the delay by short trainings from a first network."""
     rather_late = s["form"] == "free" and "states" not in s
-    fitting.delay, errors = find_delay(state, whole, fitting.delay, tick, rather_late=rather_late)
+    fitting.delay = find_delay(state, whole, fitting.delay, tick, rather_late=rather_late)
     fitting.data = shift_inputs(whole, fitting.delay)
-    fitting.details["tried_delays"] = [{"delay": k, "log_det_errors": v} for k, v in errors.items()]
     if fitting.delay == LARGEST:
         fitting.warnings.append(
             f"the delay that fits best is the largest looked for, {LARGEST} samples: give delay if inputs act later"
@@ -223,9 +240,18 @@ def _train_all(s: Mapping[str, Any], fitting: Fitting, seed: int, tick: Tick | N
         tick, (_LARGEST if chosen else 0, 3, 3 * starts * (s["neurons"] > 0), 3)
     )  # fmt: skip
     began, data = perf_counter(), fitting.data
-    if chosen:
-        _choose_states(fitting, choice)
     assert fitting.state is not None
+    if chosen:
+        p, dt = data.y_level.size, fitting.state.layout.dt
+
+        def starts_of(n: int) -> list[State]:
+            begun = start_free(data, dt, n)
+            return [] if isinstance(begun, str) else [begun]
+
+        found = _choose_states(
+            fitting, range(p, p + _LARGEST + 1), starts_of, choice, patience=2, stage="choice of states", iterations=6
+        )
+        fitting.state = found.state if found is not None else fitting.state
     first = fitting.state
     if s["descent"]:
         curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
@@ -233,14 +259,11 @@ def _train_all(s: Mapping[str, Any], fitting: Fitting, seed: int, tick: Tick | N
         began = fitting.timed("one-step training", began)
     if s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
         bare = first.widen(gain=False)
-        fitting.take(train(bare, data, stage="simulation errors", iterations=most, tick=physics), even_worse=True)
+        train(bare, data, stage="simulation errors", iterations=most, tick=physics, fitting=fitting)
     if s["neurons"]:
-        base = fitting.state
-        begun = [add_units(base, int(s["neurons"]), float(s["prior"]), [seed, k]) for k in range(starts)]
-        run = partial(train, data=data, stage="hidden layer", iterations=most)
-        for found in train_each(begun, lambda start, own: run(start, tick=own), hidden):
-            fitting.take(found)
-            fitting.rivals.append(found.state)
+        begun = [add_units(fitting.state, int(s["neurons"]), float(s["prior"]), [seed, k]) for k in range(starts)]
+        trained = train_each(begun, data, hidden, stage="hidden layer", iterations=most, fitting=fitting)
+        fitting.rivals = [x.state for x in trained]
     _train_gain(s, fitting, first, gain)
     fitting.timed("training", began)
 
@@ -255,32 +278,126 @@ def _train_gain(s: Mapping[str, Any], fitting: Fitting, first: State, tick: Tick
     if wide is None:
         fitting.warnings.append("no predictor gain was found that keeps the predictor finite")
         return
-    found = train(wide, data, stage="prediction errors", iterations=int(s["iterations"]), tick=tick)
-    fitting.take(found, even_worse=True)
+    train(wide, data, stage="prediction errors", iterations=int(s["iterations"]), tick=tick, fitting=fitting)
 
 
-def _choose_states(fitting: Fitting, tick: Tick | None) -> None:
-    """Try more and more states; keep the number that Bayes' criterion likes best."""
-    data, best = fitting.data, fitting.state
-    assert best is not None
-    p, tried, best_bic, dt = data.y_level.size, dict[int, float](), np.inf, best.layout.dt
-    for n in range(p, p + _LARGEST + 1):
-        own = part_of(tick, (n - p) / (_LARGEST + 1), (n - p + 1) / (_LARGEST + 1))
-        if own is not None:
-            own("choice of states", 0.0)
-        begun = start_free(data, dt, n)
-        after = None
-        if not isinstance(begun, str):
-            after = train(begun, data, stage="choice of states", iterations=6, tick=own)
-        if after is None:
+def _choose_states(
+    fitting: Fitting,
+    tried: Sequence[int],
+    starts: Callable[[int], Sequence[State]],
+    tick: Tick | None,
+    *,
+    patience: int,
+    clear: float = 0.0,
+    **how: Any,
+) -> Training | None:
+    """The network with the number of states that Bayes' criterion likes best; a larger one has to be `clear` of it."""
+    best: Training | None = None
+    values: list[dict[str, Any]] = []
+    for n, own in zip(tried, portions(tick, [1.0] * len(tried)), strict=True):
+        trained = train_each(starts(n), fitting.data, own, **how)
+        if not trained:
             continue
-        tried[n] = after.state.bic
-        if tried[n] < best_bic:
-            best, best_bic = after.state, tried[n]
-        elif n >= 2 + best.layout.n:
+        at = trained[0].state
+        values.append({"states": n, "bic": at.bic})
+        if best is None or at.bic < best.state.bic - clear:
+            best = trained[0]
+        elif n >= best.state.layout.n + patience:
             break
-    fitting.state = best
-    fitting.details["tried_states"] = [{"states": n, "bic": b} for n, b in tried.items()]
+    fitting.details["tried_states"] = values
+    return best
+
+
+# --- a sensor without sign -------------------------------------------------------------------------------------------
+
+
+def _check_magnitude(records: Sequence[IOData], given: Mapping[str, object]) -> None:
+    used = ("output", *_MAGNITUDE, "iterations", "states", "neurons")
+    for name, value in given.items():
+        if name not in used and value not in ("auto", _MAGNITUDE_ALWAYS[name]):
+            raise EstimationError(
+                f"nn: {name} = {value!r} means nothing with output = magnitude; what does: {', '.join(used)}. Leave "
+                "it out"
+            )
+    states = given.get("states")
+    if isinstance(states, int) and states > MOST_STATES:
+        raise EstimationError(f"nn: states = {states} with output = magnitude; at most {MOST_STATES}. Lower it")
+    for r, x in enumerate(records):
+        if x.n_outputs != 1 or not x.n_inputs:
+            raise EstimationError("nn: output = magnitude is for one output and one input or more. Choose them")
+        if np.min(x.y) < 0:
+            raise EstimationError(
+                f"nn: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
+                "magnitude is not. Use output = signed"
+            )
+
+
+def _train_magnitude(s: Mapping[str, Any], dt: float, fitting: Fitting, seed: int, tick: Tick | None) -> None:
+    """Train a network behind a sensor without sign: number of states, number of units, training on all."""
+    began, starts, data, most = perf_counter(), int(s["starts"]), fitting.data, int(s["iterations"])
+    tried = range(1, MOST_STATES + 1) if "states" not in s else (int(s["states"]),)
+    units = range(_MOST_UNITS + 1) if "neurons" not in s else (int(s["neurons"]),)
+    linear, choice, last = portions(
+        tick, (4.0, len(_FOLDS) * sum(units) * starts * (len(units) > 1), units[-1] * starts)
+    )  # fmt: skip
+    base = _choose_states(
+        fitting, tried, lambda n: [State.of(*x, data) for x in grid_starts(data.parts, n, _REFINED, dt)], linear,
+        patience=MOST_STATES, clear=_CLEAR, stage="linear part", iterations=most,
+    )  # fmt: skip
+    began = fitting.timed("linear", began)
+    if base is None:
+        return
+    fitting.take(base)
+    neurons = _choose_units(s, fitting, base.state, seed, choice) if len(units) > 1 else units[0]
+    began = fitting.timed("choice of units", began)
+    trained = _train_units(base.state, data, neurons, s, seed, last) if neurons else []
+    if trained and not train(trained[0].state, data, stage="hidden layer", iterations=_LAST * most, fitting=fitting):
+        fitting.take(trained[0])
+    size = float(np.std(np.concatenate([y for y, _ in data.parts])))
+    fitting.curves = [replace(c, training=c.training / max(size, 1e-300)) for c in fitting.curves]
+    fitting.timed("training", began)
+
+
+def _choose_units(s: Mapping[str, Any], fitting: Fitting, linear: State, seed: int, tick: Tick | None) -> int:
+    """Number of hidden units by the runs that go on behind the parts of the records that are trained on."""
+    data, squares = fitting.data, np.zeros(_MOST_UNITS + 1)
+    parts = iter(portions(tick, [k for _ in _FOLDS for k in range(1, _MOST_UNITS + 1)]))
+    for share in _FOLDS:
+        cut = [round(share * y.shape[0]) for y, _ in data.parts]
+        fewer = _first_samples(data, cut)
+        found = train(linear, fewer, stage="linear part", iterations=int(s["iterations"]))
+        base = linear if found is None else found.state
+        squares[0] += _error_ahead(base, data, cut) ** 2
+        for neurons in range(1, _MOST_UNITS + 1):
+            trained = _train_units(base, fewer, neurons, s, seed, next(parts))
+            squares[neurons] += _error_ahead(trained[0].state, data, cut) ** 2 if trained else np.inf
+    errors = np.sqrt(squares / len(_FOLDS))
+    fitting.details["held_out"] = [{"neurons": k, "error": float(e)} for k, e in enumerate(errors) if np.isfinite(e)]
+    chosen = 0
+    for k in range(1, errors.size):
+        if errors[k] < _LESS * errors[chosen]:
+            chosen = k
+    return chosen
+
+
+def _first_samples(data: Scaled, cut: Sequence[int]) -> Scaled:
+    return replace(data, parts=tuple((y[:k], u[:k]) for (y, u), k in zip(data.parts, cut, strict=True)))
+
+
+def _error_ahead(at: State, data: Scaled, cut: list[int]) -> float:
+    """Error of the run that goes on behind what was trained on, scaled."""
+    longer = _first_samples(data, [k + round(_AHEAD * y.shape[0]) for (y, _), k in zip(data.parts, cut, strict=True)])
+    errors = at.problem(longer).errors(at.vector)[1]
+    size = float(np.sqrt(np.mean(np.concatenate([e[k:] for e, k in zip(errors, cut, strict=True)]) ** 2)))
+    return size if np.isfinite(size) else np.inf
+
+
+def _train_units(
+    base: State, data: Scaled, neurons: int, s: Mapping[str, Any], seed: int, tick: Tick | None
+) -> list[Training]:
+    """Several random starts of a hidden layer, the best first; units have no effect at first."""
+    begun = [add_units(base, neurons, float(s["prior"]), [seed, neurons, k]) for k in range(int(s["starts"]))]
+    return train_each(begun, data, tick, stage="hidden layer", iterations=int(s["iterations"]))
 
 
 # --- rescue ----------------------------------------------------------------------------------------------------------
@@ -321,10 +438,9 @@ def _rescue(
                     again = State.of(second.state.layout, second.state.theta, second.data)
                     second.state = add_gain(again, second.data, second.state.K) or second.state
             _train_all({**s, "descent": 0}, second, seed, part_of(tick, *_AGAIN))
-    except KeyboardInterrupt as stop:
-        after = stop.state if isinstance(stop, Interrupted) else second.state
-        fitting.state = after if _is_better(after, before) else before
-        raise KeyboardInterrupt from stop
+    except KeyboardInterrupt:
+        fitting.state = second.state if _is_better(second.state, before) else before
+        raise
     fitting.timed("global search", began)
     after = second.state
     better = _is_better(after, before)

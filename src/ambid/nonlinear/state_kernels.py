@@ -1,9 +1,9 @@
 """Compiled recursions of state-space networks in scaled signals: predictor and free run with exact sensitivities.
 
-e = y - x[heads], x+ = A x + B u + K e + G W2 f(W1 [x; u] + b1); the last column of u is 1 and does not enter the hidden
-layer. Anchored units have f(a) = tanh(a) - tanh(b) - (1 - tanh(b)^2)(a - b): no value and no slope at the operating
-point. A sensor without sign adds a last state, z+ = rho z + (1 - rho) m, with m the mean of |x1| over the sampling
-interval, x1 being straight in it; rho < 0 says that there is no such sensor.
+e = y - x[heads], x+ = M [x; u; e; f], f = W2 phi(W1 [x; u] + b1); the last column of u is 1 and does not enter the
+hidden layer. Units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no value and no slope at the
+operating point. A sensor without sign adds a last state, z+ = rho z + (1 - rho) m, with m the mean of |x1| over the
+sampling interval, x1 being straight in it; units behind it are plain ones.
 """
 
 from __future__ import annotations
@@ -27,14 +27,45 @@ def mean_magnitude(a: float, b: float) -> float:
 
 
 @compiled(error_model="numpy")
-def run_states(
-    A: Array, B: Array, K: Array, heads: Table, G: Array, W1: Array, b1: Array, W2: Array, anchored: int, rho: float,
-    u: Array, y: Array, x0: Array, X: Array, E: Array,
+def _fill_step(
+    heads: Table, W1: Array, b1: Array, W2: Array, sensor: bool, x: Array, u: Array, e: Array, v: Array, phi: Array,
+    by_a: Array, by_b: Array,
 ) -> None:  # fmt: skip
-    """Write predicted states X (n_samples + 1, n or n + 1), innovations E (n_samples, p); NaN from a divergence on."""
-    N, m, n, p, h, q = u.shape[0], u.shape[1], A.shape[0], heads.size, W1.shape[0], G.shape[1]
-    sensor, f = x0.size > n, np.zeros(q)
-    X[0] = x0
+    """Write v = [x; u; e; f] of one sample, the units' values, and their slopes by a and b."""
+    m, p, (q, h) = u.size, heads.size, W2.shape
+    n = v.size - m - p - q
+    for i in range(n):
+        v[i] = x[i]
+    for i in range(m):
+        v[n + i] = u[i]
+    for i in range(p):
+        v[n + m + i] = e[i]
+    v[n + m + p :] = 0.0
+    for k in range(h):
+        a = 0.0
+        for i in range(n + m - 1):
+            a += W1[k, i] * v[i]
+        th = np.tanh(a + b1[k])
+        phi[k], by_a[k], by_b[k] = th, 1.0 - th * th, 1.0 - th * th
+        if not sensor:
+            tb = np.tanh(b1[k])
+            db = 1.0 - tb * tb
+            phi[k] -= tb + db * a
+            by_a[k] -= db
+            by_b[k] += 2.0 * tb * db * a - db
+        for j in range(q):
+            v[n + m + p + j] += W2[j, k] * phi[k]
+
+
+@compiled(error_model="numpy")
+def run_states(
+    M: Array, heads: Table, W1: Array, b1: Array, W2: Array, rho: float, u: Array, y: Array, X: Array, E: Array,
+) -> None:  # fmt: skip
+    """Write predicted states X (n_samples + 1, n or n + 1), of which the first is given, and innovations E
+    (n_samples, p); NaN from a divergence on.
+    """
+    N, n, p, sensor = u.shape[0], M.shape[0], heads.size, X.shape[1] > M.shape[0]
+    v, units = np.empty(M.shape[1]), np.empty((3, b1.size))
     for t in range(N):
         for i in range(p):
             E[t, i] = y[t, i] - X[t, heads[i]]
@@ -43,29 +74,11 @@ def run_states(
                 X[t:] = np.nan
                 E[t:] = np.nan
                 return
-        f[:] = 0.0
-        for k in range(h):
-            a = 0.0
-            for i in range(n):
-                a += W1[k, i] * X[t, i]
-            for j in range(m - 1):
-                a += W1[k, n + j] * u[t, j]
-            phi = np.tanh(a + b1[k])
-            if anchored == 1:
-                tb = np.tanh(b1[k])
-                phi -= tb + (1.0 - tb * tb) * a
-            for j in range(q):
-                f[j] += W2[j, k] * phi
+        _fill_step(heads, W1, b1, W2, sensor, X[t], u[t], E[t], v, units[0], units[1], units[2])
         for i in range(n):
             s = 0.0
-            for j in range(n):
-                s += A[i, j] * X[t, j]
-            for j in range(m):
-                s += B[i, j] * u[t, j]
-            for j in range(p):
-                s += K[i, j] * E[t, j]
-            for j in range(q):
-                s += G[i, j] * f[j]
+            for j in range(v.size):
+                s += M[i, j] * v[j]
             X[t + 1, i] = s
         if sensor:
             X[t + 1, n] = rho * X[t, n] + (1.0 - rho) * mean_magnitude(X[t, 0], X[t + 1, 0])
@@ -73,66 +86,44 @@ def run_states(
 
 @compiled(error_model="numpy")
 def slope_states(
-    A: Array, K: Array, heads: Table, G: Array, W1: Array, b1: Array, W2: Array, anchored: int, rho: float,
-    D: Array, used: Table, u: Array, X: Array, E: Array, s: Array, out: Array,
+    M: Array, heads: Table, W1: Array, b1: Array, W2: Array, rho: float, D: Array, used: Table, u: Array, X: Array,
+    E: Array, s: Array, out: Array,
 ) -> None:  # fmt: skip
     """Write the slopes of the predictions, out (n_samples, p, P); s (n or n + 1, P): of the state, first to last.
 
-    Columns: directions D (n, n + m + p + q, P1) of [A | B | K | G], the last of them that of rho where there is a
-    sensor, W1 row by row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `used`
-    (n, n + m + p + q) is 0 where no direction changes an entry.
+    Columns: directions D (n, n + m + p + q, P1) of M, the last of them that of rho where there is a sensor, W1 row by
+    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `used` (n, n + m + p + q) is 0 where no
+    direction changes an entry.
     """
-    N, m, n, p, h, q = u.shape[0], u.shape[1], A.shape[0], heads.size, W1.shape[0], G.shape[1]
+    N, m, n, p, (q, h) = u.shape[0], u.shape[1], M.shape[0], heads.size, W2.shape
     P1, P, nz, sensor = D.shape[2], s.shape[1], n + m - 1, X.shape[1] > n
-    c_b = P1 + h * nz
+    c_b, first_f = P1 + h * nz, n + m + p
     c_W2 = c_b if sensor else c_b + h
     F, new = np.empty((n, n)), np.zeros((X.shape[1], P))
-    phi, by_a, by_b, f = np.zeros(h), np.zeros(h), np.zeros(h), np.zeros(q)
-    v = np.zeros(n + m + p + q)
+    phi, by_a, by_b, v = np.empty(h), np.empty(h), np.empty(h), np.empty(M.shape[1])
     for t in range(N):
         for i in range(p):
             for c in range(P):
                 out[t, i, c] = s[heads[i], c]
-        f[:] = 0.0
+        _fill_step(heads, W1, b1, W2, sensor, X[t], u[t], E[t], v, phi, by_a, by_b)
         for i in range(n):
             for j in range(n):
-                F[i, j] = A[i, j]
+                F[i, j] = M[i, j]
             if not sensor:
                 for j in range(p):
-                    F[i, heads[j]] -= K[i, j]
-        for k in range(h):
-            a = 0.0
-            for i in range(n):
-                a += W1[k, i] * X[t, i]
-            for j in range(m - 1):
-                a += W1[k, n + j] * u[t, j]
-            th = np.tanh(a + b1[k])
-            phi[k], by_a[k], by_b[k] = th, 1.0 - th * th, 1.0 - th * th
-            if anchored == 1:
-                tb = np.tanh(b1[k])
-                db = 1.0 - tb * tb
-                phi[k] -= tb + db * a
-                by_a[k] -= db
-                by_b[k] += 2.0 * tb * db * a - db
-            for j in range(q):
-                f[j] += W2[j, k] * phi[k]
-            for i in range(n):
+                    F[i, heads[j]] -= M[i, n + m + j]
+            new[i] = 0.0
+            for k in range(h):
                 g = 0.0
                 for j in range(q):
-                    g += G[i, j] * W2[j, k]
+                    g += M[i, first_f + j] * W2[j, k]
+                    new[i, c_W2 + j * h + k] = M[i, first_f + j] * phi[k]
                 for j in range(n):
                     F[i, j] += g * by_a[k] * W1[k, j]
-        for j in range(n):
-            v[j] = X[t, j]
-        for j in range(m):
-            v[n + j] = u[t, j]
-        for j in range(p):
-            v[n + m + j] = E[t, j]
-        for j in range(q):
-            v[n + m + p + j] = f[j]
-        for i in range(n):
-            for c in range(P):
-                new[i, c] = 0.0
+                for j in range(nz):
+                    new[i, P1 + k * nz + j] = g * by_a[k] * v[j]
+                if not sensor:
+                    new[i, c_b + k] = g * by_b[k]
             for j in range(n):
                 w = F[i, j]
                 if w != 0.0:
@@ -143,26 +134,15 @@ def slope_states(
                     w = v[j]
                     for c in range(P1):
                         new[i, c] += D[i, j, c] * w
-            for k in range(h):
-                g = 0.0
-                for j in range(q):
-                    g += G[i, j] * W2[j, k]
-                    new[i, c_W2 + j * h + k] += G[i, j] * phi[k]
-                for j in range(n):
-                    new[i, P1 + k * nz + j] += g * by_a[k] * X[t, j]
-                for j in range(m - 1):
-                    new[i, P1 + k * nz + n + j] += g * by_a[k] * u[t, j]
-                if not sensor:
-                    new[i, c_b + k] += g * by_b[k]
         if sensor:
             a, b = X[t, 0], X[t + 1, 0]
             mean = mean_magnitude(a, b)
-            by_a0, by_b0 = 0.5 * np.sign(a), 0.5 * np.sign(b)
+            by_first, by_last = 0.5 * np.sign(a), 0.5 * np.sign(b)
             if a * b < 0.0:
-                by_a0 = (a - mean * np.sign(a)) / (abs(a) + abs(b))
-                by_b0 = (b - mean * np.sign(b)) / (abs(a) + abs(b))
+                by_first = (a - mean * np.sign(a)) / (abs(a) + abs(b))
+                by_last = (b - mean * np.sign(b)) / (abs(a) + abs(b))
             for c in range(P):
-                new[n, c] = rho * s[n, c] + (1.0 - rho) * (by_a0 * s[0, c] + by_b0 * new[0, c])
+                new[n, c] = rho * s[n, c] + (1.0 - rho) * (by_first * s[0, c] + by_last * new[0, c])
             new[n, P1 - 1] += X[t, n] - mean
         for i in range(X.shape[1]):
             for c in range(P):

@@ -10,7 +10,7 @@ to tell the directions apart by.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -39,25 +39,66 @@ _SIGNS = (0.0, 1.0, -1.0)  # of the state that a search behind a sensor without 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matrices:
-    """What the recursions want, in scaled signals; d* are derivatives by the first weights, first axis n_directions."""
+    """What the recursions want, in scaled signals: M = [A | B | c | K | G] and its slopes D, the hidden layer."""
 
-    A: Array
-    B: Array  # the last column is the constant
-    K: Array
-    G: Array
+    heads: Table  # (n_outputs,), state that each output is
+    M: Array  # (n, n + n_inputs + 1 + n_outputs + n_rows)
+    D: Array  # (*M.shape, n_directions), by the first weights
     W1: Array
     b1: Array
     W2: Array
     rho: float  # pole of a sensor without sign
-    dA: Array
-    dB: Array
-    dK: Array
-    dG: Array
+
+    @property
+    def A(self) -> Array:
+        """Of the sampled linear part."""
+        return self.M[:, : self.M.shape[0]]
+
+    @property
+    def B(self) -> Array:
+        """Of the sampled linear part, without the constant."""
+        n, known = self.M.shape[0], self.W1.shape[1]
+        return self.M[:, n:known]
+
+    @property
+    def K(self) -> Array:
+        """Predictor gain."""
+        return self.M[:, self._gain]
+
+    @property
+    def _gain(self) -> slice:
+        first = self.W1.shape[1] + 1
+        return slice(first, first + self.heads.size)
 
     def without_gain(self, *, hidden: bool = True) -> Matrices:
         """Return the matrices without gain, and without slopes by it; `hidden` false leaves out the units as well."""
-        bare = replace(self, K=np.zeros_like(self.K), dK=np.zeros_like(self.dK))
-        return bare if hidden else replace(bare, G=np.zeros_like(self.G), dG=np.zeros_like(self.dG))
+        M, D, gone = self.M.copy(), self.D.copy(), self._gain if hidden else slice(self._gain.start, None)
+        M[:, gone], D[:, gone] = 0.0, 0.0
+        return replace(self, M=M, D=D)
+
+    def run(self, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
+        """Return states (n_samples + 1, width) and innovations (n_samples, p), NaN from a divergence on.
+
+        `u` has a last column of ones, `x0` is the first state.
+        """
+        from ambid.nonlinear.state_kernels import run_states
+
+        X, E = np.empty((u.shape[0] + 1, x0.size)), np.empty((u.shape[0], self.heads.size))
+        X[0] = x0
+        run_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, u, y, X, E)
+        return X, E
+
+    def slopes(self, u: Array, X: Array, E: Array, s: Array) -> Array:
+        """Return the slopes of the predictions (n_samples, p, n_columns) along what `run` returned.
+
+        `s` (width, n_columns) is changed from the first state's slopes to the last's.
+        """
+        from ambid.nonlinear.state_kernels import slope_states
+
+        out = np.empty((u.shape[0], self.heads.size, s.shape[1]))
+        used = np.any(self.D != 0.0, axis=2).astype(np.int64)
+        slope_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, self.D, used, u, X, E, s, out)
+        return out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +118,23 @@ class Layout:
     gain: bool = False  # whether K is estimated; else it is 0
     neurons: int = 0
     sensor: bool = False  # whether the output is |x1| behind a low pass, which is the last state
+
+    @classmethod
+    def free(
+        cls, dt: float, chains: tuple[int, ...], steps: Sequence[float], scale: Sequence[float], **more: Any
+    ) -> Layout:
+        """Return the form ``free``, of which `chains` counts the states of each output; a sensor has no constant."""
+        n = sum(chains)
+        m, heads, ends = len(scale) - n, np.cumsum((0, *chains))[:-1].tolist(), (np.cumsum(chains) - 1).tolist()
+        entries = [(r, c) for r in ends for c in range(n)] + [(r, n + c) for r in range(n) for c in range(m)]
+        if more.get("sensor"):
+            heads = [n]
+        else:
+            entries += [(r, n + m) for r in heads]
+        return cls(
+            form="free", dt=dt, n_inputs=m, heads=tuple(heads), steps=tuple(steps), entries=tuple(entries),
+            scale=tuple(scale), rates=(1.0,) * n, rows=tuple(range(n)), **more,
+        )  # fmt: skip
 
     @property
     def n(self) -> int:
@@ -113,11 +171,6 @@ class Layout:
     def anchored(self) -> bool:
         """Whether hidden units have neither value nor slope at the operating point: A and B are the slope there."""
         return not self.sensor
-
-    @cached_property
-    def head_table(self) -> Table:
-        """`heads` as the recursions want them, shape (n_outputs,)."""
-        return np.array(self.heads, dtype=np.int64)
 
     @cached_property
     def unit(self) -> Array:
@@ -161,17 +214,25 @@ class Layout:
 
     def matrices(self, theta: Array) -> Matrices:
         """Return the matrices of a sample and their derivatives; `theta` is scaled."""
-        n, h, k, P1 = self.n, self.neurons, len(self.entries), self.n_directions
-        A, B, G, dA, dB, dG = self._continuous(theta) if self.form == "one-axis" else self._sampled(theta)
-        K, dK = np.zeros((n, self.p)), np.zeros((P1, n, self.p))
+        n, h, k, P1, q = self.n, self.neurons, len(self.entries), self.n_directions, len(self.rows)
+        F, dF = np.zeros((n, n + self.n_inputs + 1 + q)), np.zeros((k, n, n + self.n_inputs + 1 + q))
+        F[:, : F.shape[1] - q] = self.weights(theta)
+        F[list(self.rows), range(F.shape[1] - q, F.shape[1])] = self.rates
+        for j, (r, c) in enumerate(self.entries):
+            dF[j, r, c] = 1.0
+        if self.form == "one-axis":
+            F, dF = _sampled(F, dF, self.dt)
+        M, D = np.insert(F, [F.shape[1] - q] * self.p, 0.0, axis=1), np.zeros((n, F.shape[1] + self.p, P1))
+        own = np.arange(F.shape[1] - q, M.shape[1] - q)
+        D[:, np.delete(np.arange(M.shape[1]), own), :k] = np.moveaxis(dF, 0, 2)
         if self.gain:
-            K = theta[k:P1].reshape(n, self.p).copy()
-            dK[np.arange(k, P1), np.repeat(np.arange(n), self.p), np.tile(np.arange(self.p), n)] = 1.0
+            M[:, own] = theta[k:P1].reshape(n, self.p)
+            D[np.repeat(np.arange(n), self.p), np.tile(own, n), np.arange(k, P1)] = 1.0
         W1, b1, W2 = np.split(theta[P1:], np.cumsum(self.hidden_sizes)[:2])
         return Matrices(
-            A=A, B=B, K=K, G=G, W1=W1.reshape(h, n + self.n_inputs).copy(), b1=b1.copy() if b1.size else np.zeros(h),
-            W2=W2.reshape(len(self.rows), h).copy(), rho=float(theta[k]) if self.sensor else 0.0,
-            dA=dA, dB=dB, dK=dK, dG=dG,
+            heads=np.array(self.heads, dtype=np.int64), M=M, D=D, W1=W1.reshape(h, n + self.n_inputs).copy(),
+            b1=b1.copy() if b1.size else np.zeros(h), W2=W2.reshape(q, h).copy(),
+            rho=float(theta[k]) if self.sensor else 0.0,
         )  # fmt: skip
 
     def weights(self, theta: Array) -> Array:
@@ -191,84 +252,21 @@ class Layout:
             M[r, c] = value
         return M
 
-    def _sampled(self, theta: Array) -> tuple[Array, ...]:
-        n, q = self.n, len(self.rows)
-        M = self.weights(theta)
-        D = np.zeros((self.n_directions, *M.shape))
-        for j, (r, c) in enumerate(self.entries):
-            D[j, r, c] = 1.0
-        G = np.zeros((n, q))
-        G[list(self.rows), range(q)] = self.rates
-        return (
-            np.ascontiguousarray(M[:, :n]), np.ascontiguousarray(M[:, n:]), G,
-            np.ascontiguousarray(D[:, :, :n]), np.ascontiguousarray(D[:, :, n:]), np.zeros((D.shape[0], n, q)),
-        )  # fmt: skip
 
-    def _continuous(self, theta: Array) -> tuple[Array, ...]:
-        """Exponential of [[A, B, G], [0, 0, 0]] dt; derivatives from the doubled matrix (Mathias 1996)."""
-        from scipy.linalg import expm
+def _sampled(F: Array, dF: Array, dt: float) -> tuple[Array, Array]:
+    """Upper rows of the exponential of [[F], [0]] dt, and their slopes from the doubled matrix (Mathias 1996)."""
+    from scipy.linalg import expm
 
-        n, m, q, k = self.n, self.n_inputs + 1, len(self.rows), len(self.entries)
-        size = n + m + q
-        block = np.zeros((k, 2 * size, 2 * size))
-        block[:, :n, : n + m] = self.weights(theta)
-        block[:, list(self.rows), range(n + m, size)] = self.rates
-        block[:, size:, size:] = block[:, :size, :size]
-        for j, (r, c) in enumerate(self.entries):
-            block[j, r, size + c] = 1.0
-        full = expm(block * self.dt)
-        M = full[0, :n, :size]
-        D = np.zeros((self.n_directions, n, size))
-        D[:k] = full[:, :n, size:]
-        cut = (slice(0, n), slice(n, n + m), slice(n + m, size))
-        return (
-            *(np.ascontiguousarray(M[:, c]) for c in cut),
-            *(np.ascontiguousarray(D[:, :, c]) for c in cut),
-        )  # fmt: skip
-
-
-def free_entries(chains: tuple[int, ...], n_inputs: int, *, constants: bool = True) -> tuple[tuple[int, int], ...]:
-    """Return the free weights of the form ``free``, of which `chains` counts the states of each output."""
-    n = sum(chains)
-    ends = np.cumsum(chains) - 1
-    heads = np.cumsum((0, *chains))[:-1]
-    out = [(int(r), c) for r in ends for c in range(n)]
-    out += [(r, n + c) for r in range(n) for c in range(n_inputs)]
-    return (*out, *((int(r), n + n_inputs) for r in heads if constants))
+    (n, size), k = F.shape, dF.shape[0]
+    block = np.zeros((k, 2 * size, 2 * size))
+    block[:, :n, :size] = F
+    block[:, size : size + n, size:] = F
+    block[:, :n, size:] = dF
+    full = expm(block * dt)
+    return full[0, :n, :size], full[:, :n, size:]
 
 
 # --- runs and errors -------------------------------------------------------------------------------------------------
-
-
-def run(layout: Layout, m: Matrices, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
-    """Return states (n_samples + 1, width) and innovations (n_samples, p), NaN from a divergence on.
-
-    `u` has a last column of ones, `x0` is the first state.
-    """
-    from ambid.nonlinear.state_kernels import run_states
-
-    X, E = np.empty((u.shape[0] + 1, layout.width)), np.empty((u.shape[0], layout.p))
-    run_states(
-        m.A, m.B, m.K, layout.head_table, m.G, m.W1, m.b1, m.W2, int(layout.anchored), m.rho, u, y,
-        np.ascontiguousarray(x0), X, E,
-    )  # fmt: skip
-    return X, E
-
-
-def slopes(layout: Layout, m: Matrices, u: Array, X: Array, E: Array, s: Array) -> Array:
-    """Return the slopes of the predictions (n_samples, p, n_columns) along what `run` returned.
-
-    `s` (width, n_columns) is changed from the first state's slopes to the last's.
-    """
-    from ambid.nonlinear.state_kernels import slope_states
-
-    out = np.empty((u.shape[0], layout.p, s.shape[1]))
-    D = np.ascontiguousarray(np.moveaxis(np.concatenate([m.dA, m.dB, m.dK, m.dG], axis=2), 0, 2))
-    used = np.any(D != 0.0, axis=2).astype(np.int64)
-    slope_states(
-        m.A, m.K, layout.head_table, m.G, m.W1, m.b1, m.W2, int(layout.anchored), m.rho, D, used, u, X, E, s, out
-    )  # fmt: skip
-    return out
 
 
 def largest_pole(layout: Layout, theta: Array) -> float:
@@ -276,7 +274,7 @@ def largest_pole(layout: Layout, theta: Array) -> float:
     m = layout.matrices(theta)
     F = m.A.copy()
     if layout.gain:
-        F[:, layout.head_table] -= m.K
+        F[:, layout.heads] -= m.K
     return float(np.max(np.abs(np.linalg.eigvals(F)))) if np.all(np.isfinite(F)) else np.inf
 
 
@@ -301,7 +299,7 @@ class StateProblem:
         """Return states and errors of every record."""
         theta, x0 = self.split(v)
         m = self.layout.matrices(theta)
-        found = [run(self.layout, m, y, u, x) for (y, u), x in zip(self.parts, x0, strict=True)]
+        found = [m.run(y, u, x) for (y, u), x in zip(self.parts, x0, strict=True)]
         return [X for X, _ in found], [E for _, E in found]
 
     def prior_rows(self, v: Array) -> Array:
@@ -328,49 +326,36 @@ class StateProblem:
         """Return the triangle of [J | r] of all rows."""
         rows = [self.prior_rows(theta)]
         with np.errstate(over="ignore", invalid="ignore"):
-            for k, (J, E) in enumerate(self._slopes(theta)):
-                small = triangle_of(
-                    [self._weighted(J[a : a + _ROWS], E[a : a + _ROWS]) for a in range(0, J.shape[0], _ROWS)]
+            for k, both in enumerate(self._own_rows(theta)):
+                width, some = both.shape[2], range(0, both.shape[1], _ROWS)
+                rows.append(
+                    self._widen(triangle_of([both[:, a : a + _ROWS].reshape(-1, width) for a in some]), k, theta.size)
                 )
-                rows.append(self._spread(small, k, theta.size))
         whole = np.concatenate(rows)
         whole[:, self.held] = 0.0
         return triangle_of([whole])
 
     def sample_rows(self, v: Array) -> list[Array]:
         """Return slopes and errors of every sample, joined to ones of unit variance: (n_samples, p, v.size + 1)."""
-        out = []
-        for k, (J, E) in enumerate(self._slopes(v)):
-            both = self._weighted(J, E).reshape(self.layout.p, E.shape[0], -1)
-            out.append(np.moveaxis(self._spread(both, k, v.size), 0, 1))
-        return out
+        return [np.moveaxis(self._widen(both, k, v.size), 0, 1) for k, both in enumerate(self._own_rows(v))]
 
-    def _slopes(self, v: Array) -> Iterator[tuple[Array, Array]]:
-        """Slopes by (weights, own first state) and errors, of each record."""
+    def _own_rows(self, v: Array) -> Iterator[Array]:
+        """Weighted slopes by (weights, own first state) and errors of each record, outputs along the first axis."""
         theta, x0 = self.split(v)
         layout, m = self.layout, self.layout.matrices(theta)
         for (y, u), x in zip(self.parts, x0, strict=True):
-            X, E = run(layout, m, y, u, x)
+            X, E = m.run(y, u, x)
             s = np.hstack([np.zeros((layout.width, theta.size)), np.eye(layout.width)])
-            yield slopes(layout, m, u, X, E, s), E
+            both = np.concatenate([m.slopes(u, X, E, s), E[:, :, None]], axis=2)
+            yield np.tensordot(self.weight, both, axes=(0, 1))
 
-    def _spread(self, rows: Array, k: int, size: int) -> Array:
+    def _widen(self, rows: Array, k: int, size: int) -> Array:
         """Rows of record `k` over all unknown: other records' first states do not enter."""
         P, n = self.layout.n_theta, self.layout.width
         wide = np.zeros((*rows.shape[:-1], size + 1))
         wide[..., :P], wide[..., P + k * n : P + (k + 1) * n] = rows[..., :P], rows[..., P:-1]
         wide[..., -1] = rows[..., -1]
         return wide
-
-    def _weighted(self, J: Array, E: Array) -> Array:
-        """Slopes and errors of all outputs, joined to ones of unit variance."""
-        out = np.empty((self.layout.p, J.shape[0], J.shape[2] + 1))
-        for q, row in enumerate(self.weight.T):
-            out[q, :, :-1] = row[q] * J[:, q]
-            out[q, :, -1] = E @ row
-            for o in range(q):  # the weight is triangular
-                out[q, :, :-1] += row[o] * J[:, o]
-        return out.reshape(-1, J.shape[2] + 1)
 
 
 # --- model -----------------------------------------------------------------------------------------------------------
@@ -458,7 +443,7 @@ class StateNetwork:
     def predict(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.predict`; NaN from where the predictor diverges on."""
         X = self.states(u, y)
-        out: Array = self.y_level + self.y_scale * X[:, self.layout.head_table]
+        out: Array = self.y_level + self.y_scale * X[:, self.layout.heads]
         out[: self.lag] = np.nan
         return out
 
@@ -470,28 +455,28 @@ class StateNetwork:
         ys, us = self._late(u, y)
         x0, _ = self._first_state(ys, us, derive=False)
         out = np.full((np.asarray(u).shape[0], self.layout.width), np.nan)
-        out[self.delay :] = run(self.layout, self.layout.matrices(self._scaled), ys, us, x0)[0][:-1]
+        out[self.delay :] = self.layout.matrices(self._scaled).run(ys, us, x0)[0][:-1]
         return out
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.jacobian`, that of the first state included."""
         layout, m, (ys, us) = self.layout, self.layout.matrices(self._scaled), self._late(u, y)
         x0, s = self._first_state(ys, us, derive=True)
-        X, E = run(layout, m, ys, us, x0)
+        X, E = m.run(ys, us, x0)
         out = np.zeros((np.asarray(u).shape[0], self.n_outputs, self.theta.size))
-        out[self.delay :] = slopes(layout, m, us, X, E, s) * (self.y_scale[:, None] / layout.unit)
+        out[self.delay :] = m.slopes(us, X, E, s) * (self.y_scale[:, None] / layout.unit)
         out[: self.lag] = 0.0
         return out
 
     def simulate(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.simulate`, from the state that these samples show."""
         whole, head = with_head(self, u, y)
-        layout, m, (ys, us) = self.layout, self.layout.matrices(self._scaled), self._late(u, whole)
+        m, (ys, us) = self.layout.matrices(self._scaled), self._late(u, whole)
         x0, _ = self._first_state(ys, us, derive=False)
         k = min(self._head, us.shape[0])
-        x = run(layout, m, ys[:k], us[:k], x0)[0][-1]
-        rest = run(layout, m.without_gain(), ys[k:], us[k:], x)[0][:-1]
-        whole[head:] = self.y_level + self.y_scale * rest[:, layout.head_table]
+        x = m.run(ys[:k], us[:k], x0)[0][-1]
+        rest = m.without_gain().run(ys[k:], us[k:], x)[0][:-1]
+        whole[head:] = self.y_level + self.y_scale * rest[:, self.layout.heads]
         return whole
 
     def novelty(self, u: Array, y: Array) -> Array:
@@ -517,7 +502,7 @@ class StateNetwork:
         y, u = y[: self._head], u[: self._head]
         if self.layout.sensor:
             return _search_first_state(self.layout, self._scaled, y, u)
-        return _solve_first_state(self.layout, self.layout.matrices(self._scaled), y, u, derive=derive)
+        return _solve_first_state(self.layout.matrices(self._scaled), self.layout.n_theta, y, u, derive=derive)
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
@@ -550,23 +535,23 @@ class StateNetwork:
             ) from error
 
 
-def _solve_first_state(layout: Layout, m: Matrices, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
-    """Least squares without hidden layer and gain, O x0 = y - (forced response), and its slopes by the weights.
+def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
+    """Least squares without hidden layer and gain, O x0 = y - (forced response), and its slopes by the `P` weights.
 
     With r what is left: dx0 = (O'O)^-1 (dO' r - O' d(O x0 + forced)).
     """
-    n, P, heads, linear = layout.n, layout.n_theta, layout.head_table, m.without_gain(hidden=False)
+    n, linear = m.M.shape[0], m.without_gain(hidden=False)
     still = np.zeros_like(y), np.zeros_like(u)
-    runs = [run(layout, linear, *still, e) for e in np.eye(n)]
-    forced = run(layout, linear, y, u, np.zeros(n))[0][:-1, heads].ravel()
-    O = np.stack([X[:-1, heads].ravel() for X, _ in runs], axis=1)  # noqa: E741
+    runs = [linear.run(*still, e) for e in np.eye(n)]
+    forced = linear.run(y, u, np.zeros(n))[0][:-1, m.heads].ravel()
+    O = np.stack([X[:-1, m.heads].ravel() for X, _ in runs], axis=1)  # noqa: E741
     x0: Array = np.asarray(np.linalg.lstsq(O, y.ravel() - forced, rcond=None)[0], dtype=np.float64)
     if not derive:
         return x0, np.empty((n, 0))
-    X, E = run(layout, linear, y, u, x0)
-    D = slopes(layout, linear, u, X, E, np.zeros((n, P))).reshape(-1, P)
+    X, E = linear.run(y, u, x0)
+    D = linear.slopes(u, X, E, np.zeros((n, P))).reshape(-1, P)
     left = y.ravel() - forced - O @ x0
-    bent = np.stack([left @ slopes(layout, linear, still[1], X, E, np.zeros((n, P))).reshape(-1, P) for X, E in runs])
+    bent = np.stack([left @ linear.slopes(still[1], X, E, np.zeros((n, P))).reshape(-1, P) for X, E in runs])
     s: Array = np.ascontiguousarray(np.linalg.solve(O.T @ O, bent - O.T @ D), dtype=np.float64)
     return x0, s
 

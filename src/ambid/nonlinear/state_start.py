@@ -22,11 +22,10 @@ from ambid.estimation.global_search import STAGE, GlobalFound, global_search
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.problem import noise_floor
 from ambid.estimation.progress import Tick, guessed, silent
-from ambid.estimation.search import search
 from ambid.nonlinear.fit import LearningCurve
-from ambid.nonlinear.records import Scaled
-from ambid.nonlinear.state_network import ONE_AXIS, Layout, free_entries, largest_pole
-from ambid.nonlinear.state_training import State, add_gain
+from ambid.nonlinear.records import Parts, Scaled
+from ambid.nonlinear.state_network import ONE_AXIS, Layout
+from ambid.nonlinear.state_training import State, add_gain, train
 from ambid.signals.delay import find_delay as delay
 
 NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
@@ -38,6 +37,12 @@ _MOST = 5000  # samples that the first guess looks at
 _SHORT = 5  # iterations of a short training
 _WORTH = 2.0  # gain of the log likelihood, times two, for which a neighbour is taken
 _TRAINED = 3000  # samples that short trainings look at
+
+_REAL = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98)  # poles of the grid
+_RADII = (0.6, 0.8, 0.9, 0.95, 0.98)
+_ANGLES = np.linspace(0.1, 1.6, 16)  # rad per sample
+_SENSOR = 0.3  # pole of the sensor at first
+_STEP = 0.4  # of the chain of states: near the size of 1 - pole for a plant that is sampled well
 
 _SHOT = 128  # samples
 _SHOTS = 8192  # samples of a record that are cut into shots
@@ -92,7 +97,7 @@ def one_axis_layout(data: Scaled, dt: float, heads: tuple[int, ...], unit: float
 
 def start_free(data: Scaled, dt: float, n: int, past: int = SHORT) -> State | str:
     """Return a first network of `n` states of the form ``free``, or the reason why there is none."""
-    p, m = data.y_level.size, data.u_level.size
+    p = data.y_level.size
     if n < p:
         raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
     found = _subspace(data, n, past)
@@ -112,11 +117,7 @@ def start_free(data: Scaled, dt: float, n: int, past: int = SHORT) -> State | st
     T = np.stack(rows)
     if not np.linalg.cond(T) < 1e10:
         return "the outputs do not show all states: lower states, or excite more"
-    layout = Layout(
-        form="free", dt=dt, n_inputs=m, heads=tuple(int(x) for x in np.cumsum((0, *chains))[:-1]), steps=tuple(steps),
-        entries=free_entries(chains, m), scale=(*np.repeat(data.y_scale, chains).tolist(), *data.u_scale.tolist()),
-        rates=(1.0,) * n, rows=tuple(range(n)),
-    )  # fmt: skip
+    layout = Layout.free(dt, chains, steps, (*np.repeat(data.y_scale, chains).tolist(), *data.u_scale.tolist()))
     return _begin(layout, _in_states(T, A, B), T @ K, data)
 
 
@@ -179,6 +180,60 @@ def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[
     return {"A": (found[0] * by[:, :n]).tolist(), "B": (found[1] * by[:, n:]).tolist()}
 
 
+# --- a grid of poles, where the sensor sees no sign -------------------------------------------------------------------
+
+
+def grid_starts(parts: Parts, n: int, most: int, dt: float) -> list[tuple[Layout, Array]]:
+    """Return the `most` best linear models of `n` poles on a grid behind a sensor without sign, the best first.
+
+    The sign is not in the data, and a search from a wrong one ends in a wrong minimum. Each model has the gain that
+    fits the magnitude best.
+    """
+    from scipy.signal import lfilter
+
+    m = parts[0][1].shape[1]
+    layout = Layout.free(dt, (n,), (_STEP,) * (n - 1) + (0.0,), (1.0,) * (n + m), sensor=True)
+    y = np.concatenate([p[0][:, 0] for p in parts])
+    scored: list[tuple[float, int, Array, int, float]] = []
+    for A in pole_grid(n):
+        for j in range(m):
+            x = np.concatenate([np.abs(lfilter([0.0, 1.0], A, p[1][:, j])) for p in parts])
+            size = float(x @ x)
+            if np.isfinite(size) and size > 0:
+                gain = float(x @ y) / size
+                scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), A, j, gain))
+    scored.sort(key=lambda found: found[:2])
+    return [(layout, _grid_weights(layout, A, j, gain)) for _, _, A, j, gain in scored[:most]]
+
+
+def _grid_weights(layout: Layout, A: Array, channel: int, gain: float) -> Array:
+    """Weights of the model gain q^-1 / A(q^-1): last row from the polynomial in q - 1, B from the impulse response."""
+    n = layout.n
+    shifted = np.poly1d(A)(np.poly1d([1.0, 1.0])).coeffs  # of the powers of q - 1, highest first
+    theta = np.zeros(layout.n_theta)
+    theta[:n] = -shifted[:0:-1] / _STEP ** np.arange(n - 1, -1, -1)
+    theta[n - 1] += 1.0
+    M = layout.weights(theta)[:, :n]
+    visible = np.stack([np.linalg.matrix_power(M, k)[0] for k in range(n)])
+    response = np.zeros(n)
+    for k in range(n):
+        response[k] = gain * (k == 0) - float(A[1 : k + 1] @ response[:k][::-1])
+    theta[n + channel : n + n * layout.n_inputs : layout.n_inputs] = np.linalg.solve(visible, response)
+    theta[-1] = _SENSOR
+    return theta
+
+
+def pole_grid(n: int) -> list[Array]:
+    """Return denominators (n + 1,) of linear models of `n` poles, of q^0, q^-1, ..."""
+    if n < 2:
+        return [np.array([1.0, -p]) for p in _REAL] if n else [np.ones(1)]
+    pairs = [np.array([1.0, -2 * r * np.cos(w), r * r]) for r in _RADII for w in _ANGLES]
+    pairs += [np.convolve([1.0, -p], [1.0, -q]) for p in _REAL for q in _REAL if q >= p]
+    for _ in range(n - 2):
+        pairs = [np.convolve(p, [1.0, -q]) for p in pairs for q in (_REAL if n == 3 else _REAL[1::2])]
+    return pairs
+
+
 # --- delay -----------------------------------------------------------------------------------------------------------
 
 
@@ -205,13 +260,10 @@ def guess_delay(data: Scaled) -> int:
     return min((x.samples for x in found if x.samples is not None), default=0)
 
 
-def find_delay(
-    state: State, whole: Scaled, delay: int, tick: Tick | None, *, rather_late: bool = False
-) -> tuple[int, dict[int, float]]:
+def find_delay(state: State, whole: Scaled, delay: int, tick: Tick | None, *, rather_late: bool = False) -> int:
     """Go from a guess to a neighbour as long as a short training ends with smaller errors there.
 
-    `state` is a first network at `delay`, `whole` not yet shifted. The second value is the logarithm of the determinant
-    of the errors' covariance after a short training, by delay.
+    `state` is a first network at `delay`, `whole` not yet shifted.
     """
     share = _TRAINED // len(whole.parts)
     cut = replace(whole, parts=tuple((y[:share], u[:share]) for y, u in whole.parts))
@@ -222,10 +274,12 @@ def find_delay(
     def error(trial: int) -> float:
         nonlocal state
         if trial not in errors:
-            after = _train_shortly(state, shift_inputs(cut, trial))
-            errors[trial] = np.inf if after is None else after.score
-            if after is not None and errors[trial] <= min(errors.values()):
-                state = after
+            data = shift_inputs(cut, trial)
+            start = State.of(state.layout, state.theta, data)
+            found = train(start, data, stage="", iterations=_SHORT, rounds=1, damping=1e-6)
+            errors[trial] = np.inf if found is None else found.state.score
+            if found is not None and errors[trial] <= min(errors.values()):
+                state = found.state
             if tick is not None:
                 tick("delay", guessed(len(errors), 3.0))
         return errors[trial]
@@ -234,17 +288,7 @@ def find_delay(
         worth = -step * float(np.log(n)) if rather_late else _WORTH
         while 0 <= delay + step <= largest and n * (error(delay) - error(delay + step)) > worth:
             delay += step
-    return delay, {k: v for k, v in sorted(errors.items()) if np.isfinite(v)}
-
-
-def _train_shortly(state: State, data: Scaled) -> State | None:
-    at = State.of(state.layout, state.theta, data)
-    begun = at.at(at.problem(data), at.vector)
-    if begun is None:
-        return None
-    problem = replace(begun.problem(data), farthest=max(1.0, 1.001 * largest_pole(begun.layout, begun.theta)))
-    found = search(problem, begun.vector, stage="", most=_SHORT, tolerance=0.0, damping=1e-6)
-    return begun.at(problem, found.theta)
+    return delay
 
 
 # --- the thesis's training ------------------------------------------------------------------------------------------

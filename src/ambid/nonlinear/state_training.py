@@ -6,7 +6,7 @@ anchored, without value and slope at the operating point, so that A and B are th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.estimation.linear import information_inverse, least_squares
-from ambid.estimation.progress import Tick, part_of
+from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.cloud import cloud_of
@@ -27,6 +27,7 @@ from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, la
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
 _SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
+_FIRST = 3  # iterations for what units put out, before what they see is searched for
 _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
 _PAST = 10  # samples of errors and inputs that a regression of the errors looks at
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
@@ -44,7 +45,7 @@ class State:
     theta: Array  # (n_theta,), scaled
     x0: Array  # (n_records, width), scaled, first states
     noise: Array  # (n_outputs, n_outputs), scaled, covariance of its errors
-    n_rows: int  # samples in all
+    n_rows: int = 0  # samples in all
     prior: float | None = None  # deviation of the hidden layer's weights before the data
 
     @classmethod
@@ -52,9 +53,8 @@ class State:
         """Return a network that starts each record from its first outputs."""
         x0 = np.zeros((len(data.parts), layout.width))
         for k, (y, _) in enumerate(data.parts):
-            x0[k, layout.head_table] = y[0]
-        n = sum(y.shape[0] for y, _ in data.parts)
-        return cls(layout=layout, theta=theta, x0=x0, noise=np.eye(layout.p), n_rows=n)
+            x0[k, layout.heads] = y[0]
+        return cls(layout=layout, theta=theta, x0=x0, noise=np.eye(layout.p))
 
     @property
     def vector(self) -> Array:
@@ -78,8 +78,8 @@ class State:
 
     @property
     def bic(self) -> float:
-        """Bayes' criterion."""
-        return self.n_rows * self.score + self.layout.n_theta * float(np.log(self.n_rows))
+        """Bayes' criterion, first states counted."""
+        return self.n_rows * self.score + self.vector.size * float(np.log(self.n_rows))
 
     @property
     def stable(self) -> bool:
@@ -114,15 +114,9 @@ class State:
         with np.errstate(over="ignore", invalid="ignore"):
             e = np.concatenate(problem.errors(v)[1])
             noise = e.T @ e / e.shape[0]
-        return replace(self, theta=theta, x0=x0, noise=noise) if np.all(np.isfinite(noise)) else None
-
-
-class Interrupted(KeyboardInterrupt):
-    """An interruption in the middle of a search, with the best network of that search."""
-
-    def __init__(self, state: State) -> None:
-        super().__init__()
-        self.state = state
+        if not np.all(np.isfinite(noise)):
+            return None
+        return replace(self, theta=theta, x0=x0, noise=noise, n_rows=e.shape[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,59 +128,99 @@ class Training:
     converged: bool
 
 
+@dataclass(slots=True, kw_only=True)
+class Fitting(Attempt):
+    """What a fit has come to."""
+
+    data: Scaled  # each output beside the input that acts at its time
+    delay: int = 0
+    state: State | None = None  # the best network so far; None before the first
+    rivals: list[State] = field(default_factory=list)  # what every start of a hidden layer came to
+
+    def take(self, found: Training) -> None:
+        """Take over a learning curve, and the network if it is better, or has units or a gain that the last had not."""
+        self.curves.append(found.curve)
+        at, now = found.state, self.state
+        kinds = [(x.layout.neurons, x.layout.gain) for x in (at, now) if x is not None]
+        if now is None or kinds[0] != kinds[1] or at.score < now.score:
+            self.state, self.status = at, "converged" if found.converged else "stalled"
+
+
 # --- training --------------------------------------------------------------------------------------------------------
 
 
 def train(
-    state: State, data: Scaled, *, stage: str, iterations: int, tick: Tick | None, damping: float | None = None
+    state: State,
+    data: Scaled,
+    *,
+    stage: str,
+    iterations: int,
+    tick: Tick | None = None,
+    fitting: Fitting | None = None,
+    rounds: int = _ROUNDS,
+    damping: float | None = None,
 ) -> Training | None:
-    """Search for weights and first states over whole records; None where the start diverges."""
+    """Search for weights and first states over whole records; None where the start diverges.
+
+    `fitting` takes over what was found, also by a search that is interrupted.
+    """
+    if damping is None:  # physics alone begins near: Gauss-Newton at once
+        damping = 1e-2 if state.layout.sensor else 1e-3 if state.layout.neurons else 1e-9
+    if state.layout.sensor and state.layout.neurons:
+        first, tick = portions(tick, (1.0, rounds))
+        state = _wake_units(state, data, iterations, damping, first)
     at = state.at(state.problem(data), state.vector)
     if at is None:
         return None
-    seconds, errors, converged = [0.0], list[float](), False
-    if damping is None:  # physics alone begins near: Gauss-Newton at once
-        damping = 1e-3 if state.layout.neurons else 1e-9
-    for k in range(_ROUNDS):
-        before, problem, best = at, at.problem(data), [at.vector]
+    seconds, errors = [0.0], list[float]()
+    what = "prediction" if state.layout.gain else "simulation"
+    for k in range(rounds):
+        before, problem = at, at.problem(data)
         if at.layout.gain:  # a start that is not stable may stay so
             problem = replace(problem, farthest=max(1.0, largest_pole(at.layout, at.theta) * (1.0 + 1e-9)))
-        try:
-            found = search(
-                problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
-                damping=damping, tick=part_of(tick, *_SHARES[k : k + 2]), keep=best.append,
-            )  # fmt: skip
-        except KeyboardInterrupt as stop:
-            raise Interrupted(at.at(problem, best[-1]) or at) from stop
+        found = search(
+            problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
+            damping=damping, tick=part_of(tick, *_SHARES[k : k + 2]), keep_best=True,
+        )  # fmt: skip
         seconds += [seconds[-1] + t for t in found.seconds]
         errors += [before.size * float(np.sqrt(c / (at.n_rows * at.layout.p))) for c in found.costs]
-        converged = found.converged
-        after = at.at(problem, found.theta)
-        if after is None:
+        at = at.at(problem, found.theta) or at
+        curve = LearningCurve(
+            method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds[1:]), training=np.array(errors)
+        )
+        result = Training(state=at, curve=curve, converged=found.converged)
+        if found.interrupted or abs(before.score - at.score) < 0.02:
             break
-        at = after
-        if abs(before.score - at.score) < 0.02:
-            break
-    what = "prediction" if state.layout.gain else "simulation"
-    curve = LearningCurve(
-        method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds[1:]), training=np.array(errors)
-    )
-    return Training(state=at, curve=curve, converged=converged)
+    if fitting is not None:
+        fitting.take(result)
+    if found.interrupted:
+        raise KeyboardInterrupt
+    return result
 
 
-def train_each(
-    starts: Sequence[State], run: Callable[[State, Tick | None], Training | None], tick: Tick | None
-) -> Iterator[Training]:
-    """Train from several starts, one after the other; those that diverge are left out."""
-    for k, start in enumerate(starts):
-        found = run(start, part_of(tick, k / len(starts), (k + 1) / len(starts)))
-        if found is not None:
-            yield found
+def _wake_units(start: State, data: Scaled, iterations: int, damping: float, tick: Tick | None) -> State:
+    """Begin units that put out nothing yet against the errors of the linear part, their prior being strong.
+
+    As long as they put out nothing the data say nothing of what they see, and the prior would take it away: what they
+    see is held for the first iterations.
+    """
+    k, (n_W1, _, _) = start.layout.n_directions, start.layout.hidden_sizes
+    if np.any(start.theta[k + n_W1 :]):
+        return start
+    free, stage = start.problem(data), "hidden layer"
+    begun = search(replace(free, held=slice(k, k + n_W1)), start.vector, stage=stage, most=_FIRST, damping=damping)
+    begun = search(
+        free, begun.theta, stage=stage, most=iterations, tolerance=1e-6, damping=damping, tick=tick
+    )  # fmt: skip
+    theta, x0 = free.split(begun.theta)
+    return replace(start, theta=theta, x0=x0)
 
 
-def best_of(trained: Iterator[Training]) -> Training | None:
-    """Return the training with the least errors."""
-    return min(trained, key=lambda found: found.state.score, default=None)
+def train_each(starts: Sequence[State], data: Scaled, tick: Tick | None, **how: Any) -> list[Training]:
+    """Train from several starts, one after the other, best first; those that diverge are left out."""
+    parts = portions(tick, [1.0] * len(starts))
+    found = [train(start, data, tick=own, **how) for start, own in zip(starts, parts, strict=True)]
+    return sorted((x for x in found if x is not None), key=lambda x: x.state.score)
 
 
 def add_gain(state: State, data: Scaled, K: Array) -> State | None:
@@ -195,7 +229,7 @@ def add_gain(state: State, data: Scaled, K: Array) -> State | None:
     layout, problem = wide.layout, wide.problem(data)
     k = len(layout.entries)
     heads = np.zeros((layout.n, layout.p))
-    heads[layout.head_table, range(layout.p)] = 0.5
+    heads[layout.heads, range(layout.p)] = 0.5
     best: State | None = None
     for gain in (K, 0.5 * K, heads, 0.0 * K):
         v = wide.vector
@@ -277,56 +311,51 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
 # --- standard deviations ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Spread:
-    """Spread of the weights."""
+def _estimate_spread(
+    fitting: Fitting, state: State, how: str, seed: int, tick: Tick | None
+) -> tuple[Array | None, str]:
+    """Covariance of trained weights in the units of the model's, the first states counted, and where it is from.
 
-    covariance: Array | None  # (n_theta, n_theta), or None, in the units of the model's weights
-    origin: str  # for `NonlinearFit.covariance_from`
-    condition: float  # of the scaled information's root
-    warnings: tuple[str, ...] = ()
-
-
-def estimate_spread(
-    state: State, data: Scaled, how: str, seed: int, tick: Tick | None, rivals: Sequence[State] = ()
-) -> Spread:
-    """Return the spread of trained weights, the first states counted; `rivals` are what other starts came to."""
+    What a reader must be told of it goes to the warnings.
+    """
+    data = fitting.data
     problem, v = state.problem(data), state.vector
-    P, condition = information_inverse(problem.triangle(v)[:, :-1])
-    physical = state.layout.form == "one-axis" and state.layout.neurons > 0
-    if how == "none" or P is None or physical:
+    P, fitting.details["condition"] = information_inverse(problem.triangle(v)[:, :-1])
+    reason = ""
+    if how == "none":
+        reason = "no covariance was asked for, and so there are no standard deviations"
+    elif state.layout.form == "one-axis" and state.layout.neurons:
         reason = (
-            f"no standard deviations: the data do not determine all weights (condition number {condition:.1e}). "
-            "Fewer states or neurons, or more excitation"
+            "no standard deviations: A and B are the slope that the network gives at the operating point, and what its "
+            "units cannot follow of the plant is not known; without it intervals of 95 % hold in half of the cases. "
+            "Compare fits with more neurons, or with a smaller swing, or say neurons = 0"
         )
-        if physical:
-            reason = (
-                "no standard deviations: A and B are the slope that the network gives at the operating point, and what "
-                "its units cannot follow of the plant is not known; without it intervals of 95 % hold in half of the "
-                "cases. Compare fits with more neurons, or with a smaller swing, or say neurons = 0"
-            )
-        if how == "none":
-            reason = "no covariance was asked for, and so there are no standard deviations"
-        return Spread(covariance=None, origin="", condition=condition, warnings=(reason,))
+    elif P is None:
+        reason = (
+            "no standard deviations: the data do not determine all weights (condition number "
+            f"{fitting.details['condition']:.1e}). Fewer states or neurons, or more excitation"
+        )
+    if reason:
+        fitting.warnings.append(reason)
+        return None, ""
+    assert P is not None
     origin = "laplace" if state.layout.neurons else "information"
-    if how == "auto":
-        how = "laplace" if is_white(state, data) else "sandwich"
-    if how == "sandwich":
-        P = sandwich_at(problem, v)
-        assert P is not None
-        origin = "sandwich"
-    elif how == "bootstrap":
+    if how == "bootstrap":
         P, origin = bootstrapped(problem.sample_rows(v), problem.prior_rows(v), seed, tick), "bootstrap"
+    elif how == "sandwich" or (how == "auto" and not is_white(state, data)):
+        robust = sandwich_at(problem, v)
+        assert robust is not None
+        P, origin = robust, "sandwich"
     unit, k = state.layout.unit, state.theta.size
     covariance = P[:k, :k] * unit[:, None] * unit
-    extra, warnings = disagreement(state, rivals, covariance)
+    extra, warnings = disagreement(state, fitting.rivals, covariance)
     if state.layout.neurons and state.layout.anchored:
-        warnings = (
+        fitting.warnings.append(
             "A and B are the slope that the network gives at the operating point; what its units cannot follow of the "
-            "plant is not in their standard deviations. Compare a fit with more neurons, or with a smaller swing",
-            *warnings,
+            "plant is not in their standard deviations. Compare a fit with more neurons, or with a smaller swing"
         )
-    return Spread(covariance=covariance + extra, origin=origin, condition=condition, warnings=warnings)
+    fitting.warnings += warnings
+    return covariance + extra, origin
 
 
 def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tuple[Array, tuple[str, ...]]:
@@ -356,29 +385,6 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
 # --- the fit ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True, kw_only=True)
-class Fitting(Attempt):
-    """What a fit has come to."""
-
-    data: Scaled  # each output beside the input that acts at its time
-    delay: int = 0
-    state: State | None = None  # the best network so far; None before the first
-    rivals: list[State] = field(default_factory=list)  # what every start of a hidden layer came to
-
-    def take(self, found: Training | None, *, even_worse: bool = False) -> None:
-        """Take over a network if it is better, or of another size, and its learning curve."""
-        if found is None:
-            return
-        self.curves.append(found.curve)
-        self.keep(found, even_worse=even_worse)
-
-    def keep(self, found: Training, *, even_worse: bool = False) -> None:
-        """Take over a network if it is better, or of another size."""
-        at, now = found.state, self.state
-        if even_worse or now is None or at.layout.neurons != now.layout.neurons or at.score < now.score:
-            self.state, self.status = at, "converged" if found.converged else "stalled"
-
-
 def finish(
     records: Sequence[IOData],
     used: Mapping[str, Any],
@@ -402,16 +408,24 @@ def finish(
     if state is None or model is None:
         reason = "the network does not stay finite on the records that it was trained on: check the columns"
         return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
+    if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
+        way_out = "say " if state.layout.sensor else "say noise = innovations, or "
+        fitting.warnings.append(
+            "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
+            f"records are open loop: {way_out}--open-loop if there was no feedback"
+        )
     began = perf_counter()
-    spread = estimate_spread(state, data, how, seed, tick, fitting.rivals)
+    covariance, origin = _estimate_spread(fitting, state, how, seed, tick)
     fitting.timed("standard deviations", began)
     fitting.timing_s["all"] = sum(fitting.timing_s.values())
     freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
     noise = state.noise * state.n_rows / freedom
-    fitting.warnings += [*_caution(records, state), *spread.warnings]
-    fitting.details |= {**_details(state, model), "condition": spread.condition}
+    fitting.details |= {
+        "form": state.layout.form, "gain": state.layout.gain, "A": model.A.tolist(), "B": model.B.tolist(),
+        "K": state.K.tolist(),
+    }  # fmt: skip
     return fitting.result(
-        "nn", records, used, seed, model=model, covariance=spread.covariance, covariance_from=spread.origin,
+        "nn", records, used, seed, model=model, covariance=covariance, covariance_from=origin,
         n_estimated=int(state.theta.size), noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
     )  # fmt: skip
 
@@ -419,39 +433,12 @@ def finish(
 def _make_model(records: Sequence[IOData], data: Scaled, state: State, delay: int) -> StateNetwork | None:
     """The model with the cloud of its own states in training; None where it leaves the finite numbers there."""
     model = StateNetwork(
-        layout=state.layout,
-        theta=state.theta * state.layout.unit,
-        u_level=data.u_level,
-        u_scale=data.u_scale,
-        y_level=data.y_level,
-        y_scale=data.y_scale,
+        layout=state.layout, theta=state.theta * state.layout.unit, delay=delay, u_level=data.u_level,
+        u_scale=data.u_scale, y_level=data.y_level, y_scale=data.y_scale,
         cloud=cloud_of(np.zeros((1, state.layout.width + state.layout.n_inputs))),
-        delay=delay,
-    )
+    )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore"):
         z = np.concatenate([model.regressors(x.u, x.y) for x in records])
     if not np.all(np.isfinite(z)) or not np.all(np.isfinite(model.theta)):
         return None
     return replace(model, cloud=cloud_of(z))
-
-
-def _caution(records: Sequence[IOData], state: State) -> tuple[str, ...]:
-    if not records[0].n_inputs or all(x.open_loop for x in records) or state.layout.gain:
-        return ()
-    way_out = "say " if state.layout.sensor else "say noise = innovations, or "
-    return (
-        "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
-        f"records are open loop: {way_out}--open-loop if there was no feedback",
-    )
-
-
-def _details(state: State, model: StateNetwork) -> dict[str, object]:
-    if state.layout.sensor:
-        return {"poles": [[float(p.real), float(p.imag)] for p in np.linalg.eigvals(model.A)]}
-    return {
-        "form": state.layout.form,
-        "gain": state.layout.gain,
-        "A": model.A.tolist(),
-        "B": model.B.tolist(),
-        "K": state.K.tolist(),
-    }
