@@ -1,7 +1,7 @@
 """Many runs of the eight polynomial structures: no bias, intervals that cover, spread as stated.
 
-Each of the 200 runs has a twin with the noise turned round. What is linear in the noise cancels in their mean, so the
-bias is seen below the 0.07 standard deviations by which the mean of 200 runs scatters of itself.
+Each of the 120 runs has a twin with the noise turned round. What is linear in the noise cancels in their mean, so the
+bias is seen below the 0.09 standard deviations by which the mean of 120 runs scatters of itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tests.blackbox.polynomial.systems import SYSTEMS
 
 pytestmark = pytest.mark.slow
 
-N_RUNS = 200
+N_RUNS = 120
 N_SAMPLES = 2000
 
 
@@ -40,10 +40,13 @@ def test_no_bias(runs):
 def test_intervals_cover(runs):
     error, sd = runs
     inside = np.mean(np.abs(error) < 1.959964 * sd, axis=0)
-    assert np.all((inside[0] >= 0.90) & (inside[0] <= 0.985)), inside
+    # 120 runs know a share to 0.02
+    assert np.all((inside[0] >= 0.885) & (inside[0] <= 0.993)), inside
+    assert 0.915 <= np.mean(inside) <= 0.98
 
 
 def test_spread_is_as_stated(runs):
     error, sd = runs
     ratio = np.std(error[:, 0], axis=0, ddof=1) / np.sqrt(np.mean(sd[:, 0] ** 2, axis=0))
-    assert np.all((ratio > 0.85) & (ratio < 1.17)), ratio  # 200 runs know it to 5 %
+    assert np.all((ratio > 0.82) & (ratio < 1.22)), ratio  # 120 runs know it to 6.5 %
+    assert 0.89 < np.mean(ratio) < 1.13

@@ -10,7 +10,7 @@ from ambid.blackbox.subspace import pbsid
 from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, modal, record
 from tests.statistical.test_subspace import real_numbers
 
-RUNS = 100
+RUNS = 50
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(plant, hold, n):
             first.append(real_numbers(pbsid(data, {"n": plant.order}), plant)[0])
     e, s = np.array(errors), np.array(sds)
     inside = np.mean(np.abs(e) < 1.96 * s, axis=0)
-    # 100 runs: one number's share scatters by 0.02; the mean over all by less
-    assert np.all(inside > 0.86)
+    # 50 runs: one number's share scatters by 0.03; the mean over all by less
+    assert np.all(inside > 0.82)
     assert 0.90 < np.mean(inside) < 0.985
     assert np.all(np.abs(np.mean(e, axis=0)) < 0.35 * np.std(e, axis=0))
     # quantiles: near an unstable pole the response at low frequency has long tails

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.signal import lfilter
+from scipy.signal import lfilter, ss2tf
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
@@ -39,11 +39,11 @@ def in_loop(rng, A, B, dt, *, n, noise, colour=True, kp, kd, reference=None) -> 
     e = noise * rng.standard_normal(n)
     v = lfilter([1, 0.5], [1, -0.7], e) if colour else e
     r = rng.standard_normal(n) if reference is None else reference
-    x, before, u, y = np.zeros(2), 0.0, np.zeros(n), np.zeros(n)
-    for k in range(n):
-        y[k] = x[0] + v[k]
-        u[k] = r[k] - kp * y[k] - kd * (y[k] - before)
-        before, x = y[k], A @ x + B[:, 0] * u[k]
+    num, den = ss2tf(A, B, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    control = [kp + kd, -kd]
+    closed = np.r_[den, 0.0] + np.convolve(num[0], control)
+    y = lfilter(num[0], closed, r) + lfilter(den, closed, v)
+    u = r - lfilter(control, 1.0, y)
     return io_data(u + 1.0, y + 0.3, reference=r, dt=dt)
 
 

@@ -96,11 +96,6 @@ def unstable_loop(n: int, seed: int, sd: float = 0.1) -> tuple[IOData, np.ndarra
     rng = np.random.default_rng(seed)
     a, c = np.poly([1.1, 0.5]), np.array([1, -0.6, 0.2])
     e, r = sd * rng.standard_normal(n), rng.standard_normal(n)
-    y, u = np.zeros(n), np.zeros(n)
-    for t in range(n):
-        y[t] = e[t] + (0.5 * u[t - 1] if t else 0.0)
-        for k in (1, 2):
-            if t >= k:
-                y[t] += c[k] * e[t - k] - a[k] * y[t - k]
-        u[t] = r[t] - y[t]
-    return record(u[:, None], y[:, None]), a, c
+    closed = np.add(a, [0.0, 0.5, 0.0])
+    y = lfilter([0.0, 0.5], closed, r) + lfilter(c, closed, e)
+    return record((r - y)[:, None], y[:, None]), a, c
