@@ -12,7 +12,7 @@ from ambid.estimation.likelihood import weight_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.validate.physical import innovation_tests
+from ambid.validate.physical import innovation_products, innovation_tests
 from tests.bearing.benches import parameters, problem_of, run
 
 NAMES = ("m", "k_x", "k_i", "R", "L")
@@ -52,7 +52,7 @@ def one_run(seed: int, *, n: int, auto: bool) -> Outcome:
     covariance = assemble(problem, vector, with_derivatives=False).innovations.S / 1.5**2
     at = linearise(problem, vector, weight_of(covariance))
     found = fit.problem.delay_samples(fit.vector)
-    own, inputs = innovation_tests(fit, e)
+    own, inputs = innovation_tests(fit, innovation_products(fit, e))
     return Outcome(
         estimate=np.array([theta[k] for k in NAMES]) / truth,
         sd=known.standard_deviations(robust=False) / np.abs(truth),

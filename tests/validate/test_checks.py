@@ -11,7 +11,14 @@ from ambid.estimation.prediction import sparse_gain
 from ambid.estimation.sensitivity import innovations
 from ambid.physics.models import model
 from ambid.record import Channel, Record
-from ambid.validate.physical import agreement, implausible, innovation_checks, lowest_power_hz, physical_checks
+from ambid.validate.physical import (
+    agreement,
+    implausible,
+    innovation_checks,
+    innovation_products,
+    lowest_power_hz,
+    physical_checks,
+)
 from ambid.validate.residuals import ResidualTest, residual_check
 from tests.bearing.benches import BEARING, problem_of, run
 from tests.validate.wrong import WithoutMotionalVoltage
@@ -35,7 +42,7 @@ def record_of(fit):
 def all_checks(fit):
     moved = agreement(fit)
     known = replace(uncertainty(fit), disagreement=moved.disagreement())
-    checks = innovation_checks(fit, innovations(fit.problem, fit.vector), known, moved)
+    checks = innovation_checks(fit, innovation_products(fit, innovations(fit.problem, fit.vector)), known, moved)
     robust = not all(c.passed for c in checks.values())
     return {**checks, **physical_checks(fit, known, record_of(fit), robust=robust)}
 

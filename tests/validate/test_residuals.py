@@ -8,7 +8,7 @@ from scipy.stats import chi2, kstest
 
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import innovations
-from ambid.validate.physical import innovation_tests
+from ambid.validate.physical import innovation_products, innovation_tests
 from tests.bearing.benches import problem_of, run
 from tests.validate.wrong import WithoutMotionalVoltage
 
@@ -29,11 +29,11 @@ def fitted(name, n, seed, *, change=lambda problem: problem, **bench):
 
 
 def residuals_white(fit, e):
-    return innovation_tests(fit, e)[0]
+    return innovation_tests(fit, innovation_products(fit, e))[0]
 
 
 def residuals_uncorrelated(fit, e):
-    return innovation_tests(fit, e)[1]
+    return innovation_tests(fit, innovation_products(fit, e))[1]
 
 
 @pytest.mark.parametrize("name", KNOWN)

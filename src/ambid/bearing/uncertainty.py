@@ -24,7 +24,7 @@ from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 _SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
 _LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask
 _FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
-_BATCHES = 30  # stretches of the record for the robust covariance
+STRETCHES = 30  # stretches of the record for the robust covariance
 _ADVICE = {
     "k_x": "k_x shows where the displacement force counts: excite more at low frequency (from {low:.2g} Hz), or larger",
     "k_i": "k_i shows in the motional voltage and in the force: excite larger motion near {mid:.3g} Hz",
@@ -108,10 +108,10 @@ class Uncertainty:
         return tuple(bool(r < WEAK) for r in self.relative_sd(robust=robust))
 
 
-def uncertainty(fit: Fit) -> Uncertainty:
+def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
     """Compute covariances and the identifiability verdict of a fit.
 
-    `fit`: not failed.
+    `fit`: not failed; `scores`: (n_stretches, size), of stretches of the record, where a pass over it gave them.
     """
     problem, sl = fit.problem, fit.problem.slices
     n, size = problem.n_physical, problem.magnitude
@@ -128,7 +128,7 @@ def uncertainty(fit: Fit) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=_gram(whole[:n] @ _scores(fit).T) * unit,
+        robust=_gram(whole[:n] @ _scatter(_scores(fit) if scores is None else scores).T) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=singular_values,
@@ -197,17 +197,18 @@ def _gram(a: Array) -> Array:
 
 
 def _scores(fit: Fit) -> Array:
-    """Scores of the stretches of the record, (n_stretches, size); their scatter is the middle of the sandwich."""
-    problem = fit.problem
-    work = Workspace(problem) if fit.work is None else fit.work.of(problem)
-    none = np.zeros((problem.n_used, 0))
-    found = products(problem, fit.vector, weight_of(fit.covariance), work, none, _BATCHES)
+    """Scores of the stretches of the record, (n_stretches, size)."""
+    work = Workspace(fit.problem) if fit.work is None else fit.work.of(fit.problem)
+    found = products(fit.problem, fit.vector, weight_of(fit.covariance), work, stretches=STRETCHES)
     if found is None:
         raise ValueError("the fit has no predictor; it has failed")
-    scores = found.scores
-    scores -= scores.mean(axis=0)
+    return found.scores
+
+
+def _scatter(scores: Array) -> Array:
+    """Rows whose squares are the middle of the sandwich: scores less their mean."""
     count = scores.shape[0]
-    return np.asarray(scores * np.sqrt(count / max(count - 1, 1)))
+    return np.asarray((scores - scores.mean(axis=0)) * np.sqrt(count / max(count - 1, 1)))
 
 
 def experiment_hint(

@@ -6,7 +6,7 @@ along the columns of T^-1, which are nearly orthonormal: their Gram matrix then 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,15 +32,18 @@ class Workspace:
     """
 
     def __init__(self, problem: PredictorProblem) -> None:
-        n_samples, d = problem.y.shape[0], problem.delay
-        at = np.arange(problem.skip, n_samples, problem.stride)
-        self.y = np.ascontiguousarray(problem.y[at] / problem.scales.output)
+        d, n_used = problem.delay, problem.n_used
+        self.y = problem.y[problem.skip :: problem.stride] / problem.scales.output
         n, (n_u, n_y) = len(problem.model.states), (problem.u.shape[1], problem.y.shape[1])
-        self.w = np.zeros((at.size, n + len(problem.lags) * n_u + n_y + 1))
+        self.w = np.empty((n_used, n + len(problem.lags) * n_u + n_y + 1))
         self.z = self.w[:, n:]
         for j, s in enumerate(problem.lags):
             # inputs after the last sample do not exist; they would act only after the last output
-            self.z[:, j * n_u : (j + 1) * n_u] = problem.u[np.minimum(at - d - s, n_samples - 1)] / problem.scales.input
+            here, there = self.z[:, j * n_u : (j + 1) * n_u], problem.u[problem.skip - d - s :: problem.stride]
+            there = there[:n_used]
+            here[: there.shape[0]] = there
+            here[there.shape[0] :] = problem.u[-1]
+            here /= problem.scales.input
         self.z[:, -1 - n_y : -1], self.z[:, -1] = self.y, 1.0
         self.turn: tuple[Array, Array] | None = None
         self._problem = problem
@@ -196,35 +199,47 @@ def _turn(triangle: Array) -> tuple[Array, Array] | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Products:
-    """Scalar products over a whole record of J, e and further columns, J along the directions of `turn`."""
+    """Scalar products over a whole record of J, e and lagged signals, J along the directions of `turn`."""
 
     turn: Array  # (size, size)
     rows: Array  # (size + 1, size + 1), of [J turn, e], summed over the outputs
-    cross: Array  # (n_outputs, size + 1, n_columns), of [J turn, e] of each output and the columns
+    cross: Array  # (n_outputs, size + 1, n_columns), of [J turn, e] of each output and the lagged signals
+    inner: Array  # (n_columns, n_columns), of the lagged signals
+    squares: Array  # (n_outputs,), of e
     scores: Array  # (n_stretches, size), J' e of stretches of the record, by each number
 
 
 def products(
-    problem: PredictorProblem, vector: Array, weight: Array, work: Workspace, columns: Array, stretches: int = 1
+    problem: PredictorProblem,
+    vector: Array,
+    weight: Array,
+    work: Workspace,
+    lagged: Sequence[tuple[Array, tuple[int, ...]]] = (),
+    stretches: int = 1,
 ) -> Products | None:
     """Return all scalar products that checks and robust covariances are made of, from one pass of sensitivities.
 
-    `columns`: (n_used, n_columns); `stretches`: into about how many the record is cut. None where there is no
-    predictor, or the data do not tell all numbers apart.
+    `lagged`: signals, (n_used, n_signals), with the lags at which they become columns, lag by lag, zero before the
+    record; `stretches`: into about how many the record is cut. None where there is no predictor, or the data do not
+    tell all numbers apart.
     """
     p, n_used, n_y = problem.size, problem.n_used, work.y.shape[1]
     if work.turn is None and linearise(problem, vector, weight, work) is None:
         return None
     turn = np.eye(p) if work.turn is None else work.turn[1]
     length = max(1, n_used // stretches)
-    rows, cross = np.zeros((p + 1, p + 1)), np.zeros((n_y, p + 1, columns.shape[1]))
-    scores, first = np.zeros((-(-n_used // length), p)), 0
+    n_columns = sum(len(lags) * signals.shape[1] for signals, lags in lagged)
+    rows, cross, inner = np.zeros((p + 1, p + 1)), np.zeros((n_y, p + 1, n_columns)), np.zeros((n_columns, n_columns))
+    squares, scores, first = np.zeros(n_y), np.zeros((-(-n_used // length), p)), 0
     for block in residual_blocks(problem, vector, weight, work, turn):
         m = block.shape[0]
+        columns = _lagged_block(lagged, first, m, n_columns)
+        inner += columns.T @ columns
         for o in range(n_y):
             own = block[:, o]
             rows += own.T @ own
-            cross[o] += own.T @ columns[first : first + m]
+            cross[o] += own.T @ columns
+            squares[o] += own[:, p] @ own[:, p]
             for b in range(first // length, (first + m - 1) // length + 1):
                 part = own[max(b * length - first, 0) : (b + 1) * length - first]
                 scores[b] += part[:, :p].T @ part[:, p]
@@ -232,7 +247,18 @@ def products(
     if not first or not np.all(np.isfinite(rows)):
         return None
     back = np.eye(p) if work.turn is None else work.turn[0]
-    return Products(turn=turn, rows=rows, cross=cross, scores=scores @ back)
+    return Products(turn=turn, rows=rows, cross=cross, inner=inner, squares=squares, scores=scores @ back)
+
+
+def _lagged_block(lagged: Sequence[tuple[Array, tuple[int, ...]]], first: int, m: int, width: int) -> Array:
+    """Samples `first` to ``first + m`` of the columns of all signals at all their lags, (m, width)."""
+    out, place = np.zeros((m, width)), 0
+    for signals, lags in lagged:
+        for lag in lags:
+            there = signals[max(first - lag, 0) : max(first + m - lag, 0)]
+            out[m - there.shape[0] :, place : place + signals.shape[1]] = there
+            place += signals.shape[1]
+    return out
 
 
 def reduce_rows(rows: Array, *, last: bool = False) -> Array:

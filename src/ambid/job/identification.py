@@ -23,7 +23,6 @@ from ambid.rig import Rig
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
-    from ambid.bearing.uncertainty import Uncertainty
     from ambid.estimation.likelihood import Fit
     from ambid.estimation.parts import Check
     from ambid.job.bearing_records import BearingWords, TakenRecord
@@ -78,7 +77,6 @@ def identify_used(
 ) -> tuple[Estimate, Record]:
     """Return what `identify` does, and the part of the record that was used."""
     from ambid.bearing.linear import greybox
-    from ambid.bearing.uncertainty import uncertainty
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
     bench, plant = load(record, rig, **reading), model(rig.model)
@@ -94,7 +92,7 @@ def identify_used(
         clock.split("fit", "global_search", float(str(fit.global_search["seconds"])))
     say("check")
     with one_thread():
-        estimate = judge(fit, uncertainty(fit), rig, bench, delay_how="estimated" if delay == "auto" else "given")
+        estimate = judge(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
     clock.lap("checks")
     if validate is not None:
         from ambid.validate.second_record import validation
@@ -106,14 +104,13 @@ def identify_used(
     return replace(estimate, timing_s=clock.laps), bench
 
 
-def judge(
-    fit: Fit, known: Uncertainty, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]
-) -> Estimate:
+def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
     """Check a fit that has not failed on its own record, and put the estimate together, without timings.
 
-    `known`: of that fit; `bench`: the record it came from, channels named by role.
+    `bench`: the record it came from, channels named by role.
     """
     from ambid.bearing.result import estimate_of
+    from ambid.bearing.uncertainty import uncertainty
     from ambid.estimation.prediction import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validate import physical
@@ -123,8 +120,9 @@ def judge(
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
     if e is None:
         raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
-    moved = physical.agreement(fit)
-    checks = physical.innovation_checks(fit, e, known, moved)
+    found = physical.innovation_products(fit, e)
+    known, moved = uncertainty(fit, found.scores), physical.agreement(fit)
+    checks = physical.innovation_checks(fit, found, known, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
     checks |= physical.assumption_checks(fit, known, delay_how)

@@ -21,7 +21,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.linear import carry
 from ambid.bearing.multistart import MAX_DELAY
-from ambid.bearing.uncertainty import Uncertainty, experiment_hint
+from ambid.bearing.uncertainty import STRETCHES, Uncertainty, experiment_hint
 from ambid.estimation.criteria import chi_squared_tail
 from ambid.estimation.likelihood import Fit, free_one, prior_rows, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
@@ -77,14 +77,37 @@ class Agreement:
         return np.asarray(self.shift[np.argmax(np.max(np.abs(self.shift / self.sd), axis=1))])
 
 
-def innovation_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
+def innovation_products(fit: Fit, e: Array) -> Products:
+    """Return all scalar products that tests of the innovations and robust covariances want, in one pass.
+
+    `e`: (n_used, n_outputs), innovations at the fit, scaled.
+    """
+    problem, weight = fit.problem, weight_of(fit.covariance)
+    u = problem.u[problem.skip :: problem.stride] / problem.scales.input
+    own, inputs = _lags(len(e))
+    work = fit.work if fit.work is not None else Workspace(problem)
+    lagged = ((e @ weight.T, own), (u, inputs))
+    found = products(problem, fit.vector, weight, work.of(problem), lagged, STRETCHES)
+    if found is None:
+        raise ValueError("the fit has no predictor; it has failed")
+    return found
+
+
+def _lags(n: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Lags at which innovations and inputs of `n` samples are tested."""
+    longest = max(2, n // 20)
+    inputs = {round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}
+    return tuple(k for k in _WHITE_LAGS if k < n // 10), tuple(sorted(inputs))
+
+
+def innovation_checks(fit: Fit, found: Products, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
     """Check what the innovations say of the model, and with that of its standard deviations.
 
-    `e`: (n_used, n_outputs), innovations, scaled; `moved`: estimates from the record used in other ways. Returns
+    `found`: of `innovation_products`; `moved`: estimates from the record used in other ways. Returns
     ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
     the robust standard deviations are to be used.
     """
-    own, inputs = innovation_tests(fit, e)
+    own, inputs = innovation_tests(fit, found)
     return {
         "residuals_white": residual_check(own, "innovations against their own past"),
         "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
@@ -98,72 +121,50 @@ def innovation_checks(fit: Fit, e: Array, known: Uncertainty, moved: Agreement) 
     }
 
 
-def innovation_tests(fit: Fit, e: Array) -> tuple[ResidualTest, ResidualTest]:
-    """Test the innovations against their own past, and against past inputs.
-
-    `e`: (n_used, n_outputs), innovations at the fit, scaled.
-    """
-    problem, weight = fit.problem, weight_of(fit.covariance)
-    white, n = e @ weight.T, len(e)
-    u = problem.u[problem.skip :: problem.stride] / problem.scales.input
-    longest = max(2, n // 20)
-    own = tuple(k for k in _WHITE_LAGS if k < n // 10)
-    inputs = tuple(sorted({round(float(k)) for k in np.geomspace(1, min(longest, 400), 9)}))
-    lagged = np.hstack([_lagged(white, own), _lagged(u, inputs)])
-    lagged = lagged / np.maximum(np.linalg.norm(lagged, axis=0), 1e-300)
-    work = fit.work if fit.work is not None else Workspace(problem)
-    found = products(problem, fit.vector, weight, work.of(problem), lagged)
-    if found is None:
-        raise ValueError("the fit has no predictor; it has failed")
-    first = len(own) * white.shape[1]
+def innovation_tests(fit: Fit, found: Products) -> tuple[ResidualTest, ResidualTest]:
+    """Test the innovations against their own past, and against past inputs, from `innovation_products`."""
+    own, inputs = _lags(fit.problem.n_used)
+    first = len(own) * fit.problem.y.shape[1]
     return (
-        _test_columns(fit, found, white, lagged, own, slice(0, first)),
-        _test_columns(fit, found, white, lagged, inputs, slice(first, None)),
+        _test_columns(fit, found, own, slice(0, first)),
+        _test_columns(fit, found, inputs, slice(first, None)),
     )
 
 
-def _test_columns(
-    fit: Fit, found: Products, white: Array, lagged: Array, lags: tuple[int, ...], which: slice
-) -> ResidualTest:
-    """Score test of some lagged columns as further regressors of every whitened innovation."""
-    columns = lagged[:, which]
-    statistic, degrees = _explain_columns(fit, found, columns.T @ columns, which)
-    correlation = (white.T @ columns) / np.linalg.norm(white, axis=0)[:, None]
+def _test_columns(fit: Fit, found: Products, lags: tuple[int, ...], which: slice) -> ResidualTest:
+    """Score test of some lagged columns, scaled to unit length, as further regressors of every innovation."""
+    size = np.maximum(np.sqrt(np.diag(found.inner)[which]), 1e-300)
+    cross = found.cross[:, :, which] / size
+    statistic, degrees = _explain_columns(fit, found, cross, found.inner[which, which] / np.outer(size, size))
+    correlation = cross[:, -1] / np.sqrt(found.squares)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     return ResidualTest(
         p=chi_squared_tail(max(degrees, 1), statistic),
         statistic=statistic,
         degrees=degrees,
         largest=float(np.abs(correlation[place])),
-        largest_lag=lags[int(place[1]) // (columns.shape[1] // len(lags))],
+        largest_lag=lags[int(place[1]) // (size.size // len(lags))],
     )
 
 
-def _lagged(signals: Array, lags: tuple[int, ...]) -> Array:
-    """Columns of all signals at all lags, lag by lag, zero before the record."""
-    out = np.zeros((signals.shape[0], len(lags) * signals.shape[1]))
-    for j, lag in enumerate(lags):
-        out[lag:, j * signals.shape[1] : (j + 1) * signals.shape[1]] = signals[:-lag]
-    return out
-
-
-def _explain_columns(fit: Fit, found: Products, inner: Array, which: slice) -> tuple[float, int]:
+def _explain_columns(fit: Fit, found: Products, cross: Array, inner: Array) -> tuple[float, int]:
     """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
 
+    `cross`: (n_outputs, size + 1, n_columns), their products with [J, e]; `inner`: (n_columns, n_columns).
     What the Jacobian and the priors explain is taken off by the Schur complement of their products, which lose no
     digits because the Jacobian is nearly orthonormal there.
     """
-    p, (n_y, _, _) = fit.problem.size, found.cross.shape
+    p, n_y = fit.problem.size, cross.shape[0]
     prior = fit.J_prior @ found.turn
     own = found.rows[:p, :p] + prior.T @ prior
     pull = found.rows[:p, p] + prior.T @ fit.r_prior
-    cross = np.hstack([found.cross[o, :p, which] for o in range(n_y)])
+    beside = np.hstack(list(cross[:, :p]))
     size = column_sizes(np.sqrt(np.diag(own))[None, :])
     values, vectors = np.linalg.eigh(own / np.outer(size, size))
     seen = values > _BLIND * values[-1]
-    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([cross, pull]) / size[:, None])
+    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([beside, pull]) / size[:, None])
     rest = np.kron(np.eye(n_y), inner) - factor[:, :-1].T @ factor[:, :-1]
-    left = np.concatenate([found.cross[o, p, which] for o in range(n_y)]) - factor[:, :-1].T @ factor[:, -1]
+    left = cross[:, p].ravel() - factor[:, :-1].T @ factor[:, -1]
     values, vectors = np.linalg.eigh(rest)
     kept = values > _SAME**2
     inside = (vectors[:, kept].T @ left) / np.sqrt(values[kept])

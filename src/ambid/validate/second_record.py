@@ -18,7 +18,7 @@ from ambid.estimation.prediction import expected_prediction_sd, prediction_error
 from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.models import model
-from ambid.validate.physical import innovation_tests
+from ambid.validate.physical import innovation_products, innovation_tests
 from ambid.validate.residuals import fit_of, residual_check
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
@@ -200,7 +200,7 @@ def _expected_sd(run: Replay, estimate: Estimate, horizons: list[int]) -> dict[i
 
 def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
     e = run.innovations / run.fit.problem.scales.output
-    own, inputs = innovation_tests(run.fit, e)
+    own, inputs = innovation_tests(run.fit, innovation_products(run.fit, e))
     return {
         "residuals_white": residual_check(own, "innovations against their own past"),
         "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
