@@ -20,7 +20,7 @@ from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, start
 from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
 from ambid.estimation.innovations import stable
-from ambid.estimation.likelihood import Fit, score_statistic, search, workspace_near
+from ambid.estimation.likelihood import Fit, extend, promise_of, score_statistic, search, workspace_near
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.estimation.problem import PredictorProblem
@@ -218,25 +218,32 @@ def carry(fit: Fit, problem: PredictorProblem) -> Array:
     return vector
 
 
+def free_delay(fit: Fit) -> tuple[PredictorProblem, Array]:
+    """Return a fit's problem with the delay as one number more, and the fit's vector in it."""
+    free = replace(fit.problem, fractional=True, lag=0.0)
+    return free, carry(fit, free)
+
+
 def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
     """Estimate the delay as a real number where the score test says that the data show a fraction of a sample."""
     price = np.log(fit.problem.n_used)  # BIC: one number more
     for _ in range(8):
         delay = fit.problem.delay
-        free = replace(fit.problem, fractional=True, lag=0.0, skip=max(fit.problem.skip, delay + 2))
-        start = carry(fit, free)
-        promise = score_statistic(fit, free, start)
-        before = start.copy()
+        free, start = free_delay(fit)
+        work = workspace_near(fit, free)
+        rows = extend(fit, free, start, work)
+        promise = promise_of(rows)
         if delay > 0:  # from the other side of the whole sample the slope differs
+            before = start.copy()
             before[free.slices["fraction"]] = -1e-9
-            promise = max(promise, score_statistic(fit, free, before))
+            promise = max(promise, promise_of(extend(fit, free, before, work)))
         if promise < price:
-            return fit
+            return replace(fit, freed=None if rows is None else rows[0])
         neighbour = _better_neighbour(fit, tick)
         if neighbour is not None:
             fit = neighbour
             continue
-        found = search(free, start, tick=tick, work=workspace_near(fit, free))
+        found = search(free, start, tick=tick, work=work)
         total = free.delay_samples(found.vector)
         if found.status == "failed" or fit.criterion - found.criterion < price:
             return fit

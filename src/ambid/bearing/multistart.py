@@ -16,7 +16,8 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation import start as weak_form
 from ambid.estimation.likelihood import evaluate, search, with_linear_part
-from ambid.estimation.problem import PredictorProblem, Scales, noise_floor, scales_for
+from ambid.estimation.predictor import assemble_all
+from ambid.estimation.problem import PredictorProblem, Scales, all_scales, noise_floor
 from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -153,15 +154,25 @@ def _coarse(
     from_data = list(
         weak_form.candidates(model.name, moments, noise, delays, centred.rate_hz, fixed_values(parameters))
     )
-    found: list[Candidate] = []
-    for d in delays:
-        work: Workspace | None = None
-        for values, sizes in _possible(model, [v for own, v in from_data if own == d], parameters):
-            scales = scales_for(model, values, spread, floor, centred.rate_hz)
-            problem = candidate_problem(model, part, parameters, sizes, scales, d, int(max(delays)) + 2)
-            vector = _vector(problem, values)
-            work = work or Workspace(problem)  # the scaled data are the same for all candidates of a delay
-            found.append(Candidate(criterion=evaluate(problem, vector, work)[0], problem=problem, vector=vector))
+    possible = [
+        (d, values, sizes)
+        for d in delays
+        for values, sizes in _possible(model, [v for own, v in from_data if own == d], parameters)
+    ]
+    if not possible:
+        return []
+    scales = all_scales(model, [values for _, values, _ in possible], spread, floor, centred.rate_hz)
+    skip = int(max(delays)) + 2
+    problems = [
+        candidate_problem(model, part, parameters, sizes, own, d, skip)
+        for (d, _, sizes), own in zip(possible, scales, strict=True)
+    ]
+    vectors = [_vector(problem, values) for problem, (_, values, _) in zip(problems, possible, strict=True)]
+    found, work = list[Candidate](), Workspace(problems[0])
+    for problem, vector, predictor in zip(problems, vectors, assemble_all(problems, vectors), strict=True):
+        work = work.of(problem)  # the scaled data are the same for all candidates of a delay
+        value = np.inf if predictor is None else evaluate(problem, vector, work, predictor)[0]
+        found.append(Candidate(criterion=value, problem=problem, vector=vector))
     return sorted(found, key=lambda c: c.criterion)
 
 

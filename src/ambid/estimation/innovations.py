@@ -9,10 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
+
+_STEP = 1e-7  # of a Newton step, relative: convergence is quadratic, which leaves an error of about 1e-14
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,26 +54,55 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
     return Innovations(K=_gain_of(A, C, P, R), P=P, S=S)
 
 
+def predictor_gains(A: Array, C: Array, Q: Array, R: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the predictor gains of several plants at once, and for which of them the quick way leads to one.
+
+    `A`, `Q`: (n_plants, n_states, n_states); `C`, `R`: as for `predictor_gain`, of all of them. Returns (n_plants,
+    n_states, n_outputs).
+    """
+    P = _stable_subspace(A, C, Q, R)
+    if P is None:
+        return np.zeros((*A.shape[:-1], C.shape[0])), np.zeros(A.shape[0], dtype=bool)
+    K = _gain_of(A, C, P, R)
+    started = np.abs(np.linalg.eigvals(A - K @ C)).max(axis=-1) < 1.0
+    for _ in range(8):
+        before, P = P, solve_lyapunov(A - K @ C, Q + K @ R @ _turned(K))
+        K = _gain_of(A, C, P, R)
+        settled = np.abs(P - before).max(axis=(1, 2)) <= _STEP * np.abs(P).max(axis=(1, 2))
+        if np.all(settled | ~started):
+            break
+    return K, started & settled
+
+
+def _turned(a: NDArray[Any]) -> NDArray[Any]:
+    """Transpose of one or several stacked matrices."""
+    return np.swapaxes(a, -1, -2)
+
+
 def _stable_subspace(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
-    """P from the eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd."""
-    n = A.shape[0]
+    """P from the eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd.
+
+    Of one plant, or of several stacked; None where that is impossible for one of them.
+    """
+    n = A.shape[-1]
     try:
-        back = np.linalg.inv(A).T
+        back = _turned(np.linalg.inv(A))
         left = back @ C.T @ np.linalg.solve(R, C)
-        values, vectors = np.linalg.eig(np.vstack([np.hstack([back, left]), np.hstack([Q @ back, A + Q @ left])]))
-        chosen = vectors[:, np.argsort(np.abs(values))[n:]]
-        P = np.real(np.linalg.solve(chosen[:n].T, chosen[n:].T).T)
+        values, vectors = np.linalg.eig(
+            np.concatenate([np.concatenate([back, left], -1), np.concatenate([Q @ back, A + Q @ left], -1)], -2)
+        )
+        chosen = np.take_along_axis(vectors, np.argsort(np.abs(values))[..., None, n:], -1)
+        P = np.real(_turned(np.linalg.solve(_turned(chosen[..., :n, :]), _turned(chosen[..., n:, :]))))
     except np.linalg.LinAlgError:
         return None
-    return 0.5 * (P + P.T) if np.all(np.isfinite(P)) else None
+    return 0.5 * (P + _turned(P)) if np.all(np.isfinite(P)) else None
 
 
 def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | None = None) -> Array | None:
     """Iterate Newton-Kleinman from a stabilising gain; None where it does not settle in a few steps."""
     for _ in range(8):
         P = solve_lyapunov(A - K @ C, Q + K @ R @ K.T)
-        # quadratic convergence: a step of 1e-7 leaves an error of about 1e-14
-        if before is not None and np.abs(P - before).max() <= 1e-7 * np.abs(P).max():
+        if before is not None and np.abs(P - before).max() <= _STEP * np.abs(P).max():
             return P
         K, before = _gain_of(A, C, P, R), P
     return None
@@ -78,18 +111,19 @@ def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | No
 def _gain_of(A: Array, C: Array, P: Array, R: Array) -> Array:
     """Predictor gain A P C^T (C P C^T + R)^-1."""
     seen = C @ P
-    return np.asarray(np.linalg.solve(seen @ C.T + R, seen @ A.T).T, dtype=np.float64)
+    return np.asarray(_turned(np.linalg.solve(seen @ C.T + R, seen @ _turned(A))), dtype=np.float64)
 
 
 def solve_lyapunov(F: Array, Q: Array) -> Array:
-    """Solve P = F P F^T + Q for one or several symmetric right-hand sides.
+    """Solve P = F P F^T + Q for one or several symmetric right-hand sides, or for several plants with one each.
 
-    `F`: (n, n), stable; `Q`: symmetric right-hand sides. Returns symmetric solutions.
+    `F`: (n, n), stable, or (n_plants, n, n); `Q`: symmetric right-hand sides. Returns symmetric solutions.
     """
-    n = F.shape[0]
-    kronecker = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)
-    P = np.linalg.solve(np.eye(n * n) - kronecker, Q.reshape(-1, n * n).T).T.reshape(Q.shape)
-    return np.asarray(0.5 * (P + np.swapaxes(P, -1, -2)), dtype=np.float64)
+    n = F.shape[-1]
+    kronecker = (F[..., :, None, :, None] * F[..., None, :, None, :]).reshape(*F.shape[:-2], n * n, n * n)
+    right = Q.reshape(-1, n * n).T if F.ndim == 2 else Q.reshape(-1, n * n, 1)
+    P = _turned(np.linalg.solve(np.eye(n * n) - kronecker, right)).reshape(Q.shape)
+    return np.asarray(0.5 * (P + _turned(P)), dtype=np.float64)
 
 
 def gain_derivatives(A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.linear import BLIND, directions, triangle_of
+from ambid.estimation.predictor import Predictor
 from ambid.estimation.problem import PredictorProblem
 from ambid.estimation.search import Status
 from ambid.estimation.sensitivity import Workspace, innovations, linearise
@@ -45,6 +46,7 @@ class Fit:
     evaluations: int
     start_s: float = 0.0  # time that finding start values took before this search, s
     work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
+    freed: Array | None = None  # Jacobian with the delay freed as well, where that was asked and is not needed
     # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue`
     global_search: Mapping[str, object] | None = None
 
@@ -74,13 +76,15 @@ def criterion(problem: PredictorProblem, vector: Array, covariance: Array) -> fl
     return float(problem.n_used * np.linalg.slogdet(covariance)[1] + r @ r)
 
 
-def evaluate(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> tuple[float, Array | None]:
+def evaluate(
+    problem: PredictorProblem, vector: Array, work: Workspace | None = None, predictor: Predictor | None = None
+) -> tuple[float, Array | None]:
     """Return the criterion and the innovation covariance at a vector, without a Jacobian.
 
-    `vector`: (size,). Returns `criterion`: infinite where there is no predictor; `covariance`: (n_outputs, n_outputs),
-    or None.
+    `vector`: (size,); `work`, `predictor`: of this problem, to save making them again. Returns `criterion`:
+    infinite where there is no predictor; `covariance`: (n_outputs, n_outputs), or None.
     """
-    e = innovations(problem, vector, work)
+    e = innovations(problem, vector, work, predictor)
     if e is None:
         return np.inf, None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -115,6 +119,21 @@ def workspace_near(fit: Fit, problem: PredictorProblem) -> Workspace:
     return work
 
 
+def extend(
+    fit: Fit, problem: PredictorProblem, vector: Array, work: Workspace | None = None
+) -> tuple[Array, Array] | None:
+    """Return Jacobian and residual of a larger problem at a fit, compressed, priors included; None without predictor.
+
+    `vector`: (size,), the fit's numbers written in that problem; `work`: of that problem.
+    """
+    work = workspace_near(fit, problem) if work is None else work
+    at = linearise(problem, vector, weight_of(fit.covariance), work)
+    if at is None:
+        return None
+    r, J = prior_rows(problem, vector)
+    return np.vstack([at.J, J]), np.concatenate([at.r, r])
+
+
 def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float:
     """Return the fall of the criterion that freeing all numbers of `problem` promises to second order.
 
@@ -124,11 +143,12 @@ def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float
     Returns chi-squared with as many degrees of freedom as numbers were added, if they are not needed; 0 where
     undefined.
     """
-    at = linearise(problem, vector, weight_of(fit.covariance), workspace_near(fit, problem))
-    if at is None:
-        return 0.0
-    r, J = prior_rows(problem, vector)
-    return directions(np.vstack([at.J, J])).explain(np.concatenate([at.r, r]))
+    return promise_of(extend(fit, problem, vector))
+
+
+def promise_of(rows: tuple[Array, Array] | None) -> float:
+    """Return the score statistic of Jacobian and residual, 0 where there are none."""
+    return 0.0 if rows is None else directions(rows[0]).explain(rows[1])
 
 
 def free_one(fit: Fit, name: str) -> tuple[float, float]:
@@ -152,11 +172,10 @@ def free_one(fit: Fit, name: str) -> tuple[float, float]:
     )
     n = old.n_physical
     vector = np.insert(fit.vector, n, value / size)
-    at = linearise(problem, vector, weight_of(fit.covariance), workspace_near(fit, problem))
-    if at is None:
+    rows = extend(fit, problem, vector)
+    if rows is None:
         return 0.0, value
-    r, rows = prior_rows(problem, vector)
-    found, residual = directions(np.vstack([at.J, rows])), np.concatenate([at.r, r])
+    found, residual = directions(rows[0]), rows[1]
     if not found.seen.all():  # the data cannot tell it from the others
         return 0.0, value
     return found.explain(residual), value - float(found.solve(residual)[n]) * size

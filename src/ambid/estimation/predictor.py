@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.innovations import Innovations, gain_derivatives, predictor_gain, stable, stack
+from ambid.estimation.innovations import Innovations, gain_derivatives, predictor_gain, predictor_gains, stable, stack
 from ambid.estimation.problem import PredictorProblem
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import StateSpace
@@ -59,14 +59,55 @@ def assemble(
         K, dK, inner = _gain(problem, vector[sl["noise"]], plant, slopes, near, with_derivatives=with_derivatives)
     except (np.linalg.LinAlgError, ValueError, ArithmeticError):
         return None
+    return _recursion(problem, vector, lag, plant, K, inner, slopes, dK)
+
+
+def assemble_all(problems: Sequence[PredictorProblem], vectors: Sequence[Array]) -> list[Predictor | None]:
+    """Build the predictors of several problems, without derivatives: together, as small matrices cost less in stacks.
+
+    `problems`: of one model, noise described by levels, delays equal but for whole samples; `vectors`: (size,) each.
+    """
+    first, sl = problems[0], problems[0].slices
+    lag, pairs = first.lag, list(zip(problems, vectors, strict=True))
+    try:
+        C = first.model.matrices(first.parameters(vectors[0])).C * first.scales.state / first.scales.output[:, None]
+        plants = _discrete_all(pairs, C, lag if len(first.taps) > 1 else None)
+        noise, n_d = np.array([v[sl["noise"]] for v in vectors]), plants.E.shape[-1]
+        Q = (plants.E * np.exp(2 * noise[:, None, :n_d])) @ np.swapaxes(plants.E, 1, 2)
+        sensor = np.exp(2 * np.hstack([np.zeros((len(pairs), 1)), noise[:, n_d:]]))
+        gains, found = predictor_gains(plants.A, C, Q, sensor[:, :, None] * np.eye(C.shape[0]))
+    except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+        return [assemble(p, v, with_derivatives=False) for p, v in pairs]
+    out = list[Predictor | None]()
+    for k, (problem, vector) in enumerate(pairs):
+        if found[k]:
+            plant = DiscreteSpace(A=plants.A[k], B=plants.B[k], B_late=plants.B_late[k], E=plants.E[k], C=C)
+            out.append(_recursion(problem, vector, lag, plant, gains[k]))
+        else:
+            out.append(assemble(problem, vector, with_derivatives=False))
+    return out
+
+
+def _recursion(
+    problem: PredictorProblem,
+    vector: Array,
+    lag: float,
+    plant: DiscreteSpace,
+    K: Array,
+    inner: Innovations | None = None,
+    slopes: Sequence[DiscreteSpace] = (),
+    dK: Array | None = None,
+) -> Predictor | None:
+    """Put the recursion together from a plant and its gain, with derivatives where there are those of the gain."""
+    sl = problem.slices
     step, step_slopes = _stepped(problem, lag, plant, slopes)
     F, offset = step.A - K @ plant.C, vector[sl["offset"]]
     if not stable(F):
         return None
     M = np.hstack([F, step.inputs, K, (step.E @ offset)[:, None]])
-    dM = np.zeros((*M.shape, problem.size if with_derivatives else 0))
+    dM = np.zeros((*M.shape, 0 if dK is None else problem.size))
     dE = np.zeros((*step.E.shape, dM.shape[2]))
-    if with_derivatives:
+    if dK is not None:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
             dM[:, :n, q], dM[:, n:first_y, q], dM[:, -1, q] = d.A, d.inputs, d.E @ offset
@@ -112,6 +153,21 @@ def _discrete(
     return plant, slopes[: problem.slices["fraction"].stop] if with_derivatives else ()
 
 
+def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fraction: float | None) -> DiscreteSpace:
+    """Scaled discrete plants of several problems, stacked."""
+    spaces = [p.model.matrices(p.parameters(v)) for p, v in pairs]
+    state, into, push = (np.array([getattr(p.scales, k) for p, _ in pairs]) for k in ("state", "input", "disturbance"))
+    A, B, E = (
+        np.array(matrices) * size[:, None, :] / state[:, :, None]
+        for matrices, size in (
+            ([s.A for s in spaces], state),
+            ([s.B for s in spaces], into),
+            ([s.E for s in spaces], push),
+        )
+    )
+    return discretise(StateSpace(A=A, B=B, E=E, C=C), 1.0 / pairs[0][0].rate_hz, fraction=fraction)[0]
+
+
 def _gain(
     problem: PredictorProblem,
     noise: Array,
@@ -120,18 +176,19 @@ def _gain(
     near: Array | None,
     *,
     with_derivatives: bool,
-) -> tuple[Array, Array, Innovations | None]:
+) -> tuple[Array, Array | None, Innovations | None]:
     """Predictor gain and its derivatives by physical parameters, delay and noise numbers."""
     (n, n_d), n_y, n_slopes = plant.E.shape, plant.C.shape[0], len(slopes)
     size = n_slopes + noise.size
     if problem.noise != "levels":
+        K = noise.reshape(n, n_y) if problem.noise == "gain" else problem.gain
         dK = np.zeros((size, n, n_y))
         dK[n_slopes:] = np.eye(n * n_y).reshape(n * n_y, n, n_y)[: noise.size]
-        return noise.reshape(n, n_y) if problem.noise == "gain" else problem.gain, dK, None
+        return K, dK if with_derivatives else None, None
     variance, sensor = np.exp(2 * noise[:n_d]), np.concatenate([[1.0], np.exp(2 * noise[n_d:])])
     at = predictor_gain(plant.A, plant.C, (plant.E * variance) @ plant.E.T, np.diag(sensor), near=near)
     if not with_derivatives:
-        return at.K, np.zeros((0, n, n_y)), at
+        return at.K, None, at
     dA, dQ, dR = np.zeros((size, n, n)), np.zeros((size, n, n)), np.zeros((size, n_y, n_y))
     dA[:n_slopes] = stack([d.A for d in slopes], (n, n))
     half = (stack([d.E for d in slopes], (n, n_d)) * variance) @ plant.E.T

@@ -7,7 +7,7 @@ States, inputs and outputs are scaled to order one before anything is factorised
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Literal
@@ -16,7 +16,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, StateSpace
 
 NoiseForm = Literal["levels", "gain", "given"]
 
@@ -150,13 +150,20 @@ def scales_for(
     `values`: rough parameters, SI; `inputs`: (n_inputs,), SI, standard deviations of the inputs; `outputs`:
     (n_outputs,), SI, about the noise of the outputs, see `noise_floor`.
     """
-    discrete, _ = discretise(model.matrices(values), 1.0 / rate_hz)
+    return all_scales(model, [values], inputs, outputs, rate_hz)[0]
+
+
+def all_scales(
+    model: LinearModel, places: Sequence[Mapping[str, float]], inputs: Array, outputs: Array, rate_hz: float
+) -> list[Scales]:
+    """Return the scales of predictors at several places, see `scales_for`."""
+    spaces = [model.matrices(values) for values in places]
+    A, B, E = (np.array(matrices) for matrices in zip(*((s.A, s.B, s.E) for s in spaces), strict=True))
+    discrete, _ = discretise(StateSpace(A=A, B=B, E=E, C=spaces[0].C), 1.0 / rate_hz)
     reach = np.maximum(np.abs(discrete.C @ discrete.E), np.abs(discrete.C @ discrete.A @ discrete.E))
     state = np.array([outputs[model.outputs.index(s)] if s in model.outputs else 0.0 for s in model.states])
     state[state == 0] = outputs[0] * rate_hz / 20  # velocity, the only state that is not measured
-    return Scales(
-        state=state,
-        input=inputs,
-        output=outputs,
-        disturbance=1 / np.max(reach / outputs[:, None], axis=0),
-    )
+    return [
+        Scales(state=state, input=inputs, output=outputs, disturbance=disturbance)
+        for disturbance in 1 / np.max(reach / outputs[:, None], axis=1)
+    ]

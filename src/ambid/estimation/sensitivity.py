@@ -13,7 +13,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.linear import column_sizes
-from ambid.estimation.predictor import assemble
+from ambid.estimation.predictor import Predictor, assemble
 from ambid.estimation.problem import PredictorProblem
 
 _BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
@@ -94,16 +94,18 @@ def _aligned(shape: tuple[int, ...]) -> Array:
     return raw[first : first + size].reshape(shape)
 
 
-def innovations(problem: PredictorProblem, vector: Array, work: Workspace | None = None) -> Array | None:
+def innovations(
+    problem: PredictorProblem, vector: Array, work: Workspace | None = None, predictor: Predictor | None = None
+) -> Array | None:
     """Return the innovations in scaled output units.
 
-    `vector`: (size,); `work`: of this problem, to save making it again. Returns (n_used, n_outputs), or None where
-    there is no predictor at `vector`.
+    `vector`: (size,); `work`, `predictor`: of this problem, to save making them again. Returns (n_used,
+    n_outputs), or None where there is no predictor at `vector`.
     """
     from ambid.estimation.kernels import state_scan
 
     work = work or Workspace(problem)
-    predictor = assemble(problem, vector, with_derivatives=False)
+    predictor = predictor or assemble(problem, vector, with_derivatives=False)
     if predictor is None:
         return None
     state_scan(predictor.M, work.w, predictor.x0.copy())

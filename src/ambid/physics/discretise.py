@@ -52,31 +52,37 @@ def discretise(
     upper right block of exp([[M, dM], [0, M]] T) (Mathias 1996).
 
     `space`: continuous-time matrices; `period_s`: sampling period in s; `derivatives`: directions (dA, dB, dE); dC is
-    passed on. Returns `discrete`: the discrete matrices; `directional`: their derivatives, one for each direction;
-    where `fraction` is given, one more: along the fraction itself.
+    passed on. Without directions matrices may be stacked, (..., rows, columns). Returns `discrete`: the discrete
+    matrices; `directional`: their derivatives, one for each direction; where `fraction` is given, one more: along the
+    fraction itself.
     """
-    n, nu = space.B.shape
-    size = n + nu + space.E.shape[1]
+    n, nu = space.B.shape[-2:]
+    size = n + nu + space.E.shape[-1]
     kind = np.result_type(space.A, space.B, space.E)
-    stack = np.zeros((max(1, len(derivatives)), 2 * size, 2 * size), dtype=kind)
+    several, width = ((len(derivatives),), 2 * size) if derivatives else (space.A.shape[:-2], size)
+    stack = np.zeros((*several, width, width), dtype=kind)
     edges = (slice(0, n), slice(n, n + nu), slice(n + nu, size))
     for name, columns in zip("ABE", edges, strict=True):
-        stack[:, :n, columns] = getattr(space, name)
+        stack[..., :n, columns] = getattr(space, name)
         if derivatives:
             stack[:, :n, columns.start + size : columns.stop + size] = [getattr(d, name) for d in derivatives]
-    stack[:, size : size + n, size:] = stack[:, :n, :size]
+    if derivatives:
+        stack[:, size : size + n, size:] = stack[:, :n, :size]
     stack *= period_s
     full = _exponential(stack, n)
     late = full if fraction is None else _exponential(stack * (1.0 - fraction), n)
 
     def split(now: Array, partial: Array, c: Array) -> DiscreteSpace:
-        b = partial[:n, n : n + nu]
-        return DiscreteSpace(A=now[:n, :n], B=b, B_late=now[:n, n : n + nu] - b, E=now[:n, n + nu :], C=c)
+        b = partial[..., :n, n : n + nu]
+        return DiscreteSpace(
+            A=now[..., :n, :n], B=b, B_late=now[..., :n, n : n + nu] - b, E=now[..., :n, n + nu : size], C=c
+        )
 
-    discrete = split(full[0, :size, :size], late[0, :size, :size], space.C)
+    first, first_late = (full[0], late[0]) if derivatives else (full, late)
+    discrete = split(first, first_late, space.C)
     directional = [split(full[j, :size, size:], late[j, :size, size:], d.C) for j, d in enumerate(derivatives)]
     if fraction is not None:
-        slope = -period_s * late[0, :n, :n] @ space.B
+        slope = -period_s * first_late[..., :n, :n] @ space.B
         zero = np.zeros_like
         directional.append(
             DiscreteSpace(A=zero(discrete.A), B=slope, B_late=-slope, E=zero(discrete.E), C=zero(space.C))
@@ -94,8 +100,9 @@ def _exponential(a: NDArray[Any], n: int) -> NDArray[Any]:
     Scaled by their first `n` rows and columns, which the others only follow: large inputs cost no digits.
     `a`: (..., size, size).
     """
-    norm = float(np.max(np.sum(np.abs(a[..., :n, :n]), axis=-2)))
-    squarings = max(0, int(np.ceil(np.log2(norm / _REACH)))) if norm > 0.0 and np.isfinite(norm) else 0
+    norms = np.sum(np.abs(a[..., :n, :n]), axis=-2)
+    norm = float(np.max(norms, initial=0.0, where=np.isfinite(norms)))
+    squarings = max(0, int(np.ceil(np.log2(norm / _REACH)))) if norm > 0.0 else 0
     a = a / 2.0**squarings
     square = a @ a
     fourth = square @ square

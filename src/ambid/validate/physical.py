@@ -19,15 +19,15 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.linear import carry
+from ambid.bearing.linear import carry, free_delay
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import STRETCHES, Uncertainty, experiment_hint
 from ambid.estimation.criteria import chi_squared_tail
-from ambid.estimation.likelihood import Fit, free_one, prior_rows, search, weight_of, workspace_near
+from ambid.estimation.likelihood import Fit, extend, free_one, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.parts import Check
 from ambid.estimation.prediction import sparse_gain
-from ambid.estimation.sensitivity import Products, Workspace, linearise, products
+from ambid.estimation.sensitivity import Products, Workspace, products
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
@@ -295,12 +295,13 @@ def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
         return Check(passed=True, detail="the delay was given: the other numbers are right if it is")
     if problem.fractional:
         return Check(passed=True, detail="the delay was estimated as a real number and counts in the intervals")
-    free = replace(problem, fractional=True, lag=0.0)
-    vector = carry(fit, free)
-    at = linearise(free, vector, weight_of(fit.covariance), workspace_near(fit, free))
-    if at is None:
+    freed = fit.freed
+    if freed is None:
+        rows = extend(fit, *free_delay(fit))
+        freed = None if rows is None else rows[0]
+    if freed is None:
         return Check(passed=False, detail="the delay could not be freed at the estimate: give channels.<input>.delay")
-    found = directions(np.vstack([at.J, prior_rows(free, vector)[1]])).inverse()
+    found = directions(freed).inverse()
     s, own = float(np.sqrt(found[n, n])), np.diag(found)[:n]
     along = found[:n, n] / s
     t = np.abs(along) / np.sqrt(np.maximum(own - along**2, _BLIND * own))
