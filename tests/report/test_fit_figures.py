@@ -30,7 +30,7 @@ def data() -> IOData:
 
 def test_poles_and_zeros_are_drawn_with_their_regions(data: IOData) -> None:
     fit = judge(structure("oe").estimator(data, {"nb": 3, "nf": 2, "nk": 1}), data)
-    (axes,) = (a for a in fit_overview(fit, data).findobj(Axes) if "zeros" in a.get_title())
+    (axes,) = (a for a in fit_overview(fit, [data]).findobj(Axes) if "zeros" in a.get_title())
     regions = [p for p in axes.patches if isinstance(p, Ellipse)]
     centres = np.array([complex(*p.get_center()) for p in regions])
     truth = np.array([POLES, POLES.conj(), ZEROS, ZEROS.conj()])

@@ -7,8 +7,8 @@ import pytest
 
 from ambid.bearing.measured import Measured, model_responses
 from ambid.job import frf
-from ambid.report.fit_figures import frf_figure
 from ambid.report.fit_text import frf_text, pair_lines, response_unit, warnings_of
+from ambid.report.response_figures import frf_figure
 from ambid.rig import default_rig
 from ambid.signals.response import FrequencyResponse
 from tests.job.loops import loop_record, odd_record

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.nonlinear.narmax import narmax
+from ambid.report.fit_figures import bars_of, fit_overview, traces_of
 from ambid.report.fit_text import (
     curve_line,
     curve_lines,
@@ -19,7 +20,6 @@ from ambid.report.fit_text import (
     setting_text,
     term_lines,
 )
-from ambid.report.nonlinear_figures import bars_of, nonlinear_overview, traces_of
 from ambid.validate.fits import judge
 from tests.validate.nonlinear.plants import Static, io, squared, static_fit
 
@@ -128,7 +128,7 @@ def test_a_failed_fit_shows_its_reason(fit: NonlinearFit) -> None:
 def test_the_figure_shows_what_the_fit_says(fit: NonlinearFit) -> None:
     data = squared(400, 2)
     curve = LearningCurve(method="x", seconds=np.array([0.0, 0.1]), training=np.array([1.0, 0.5]))
-    page = nonlinear_overview(replace(fit, curves=(curve,)), [data])
+    page = fit_overview(replace(fit, curves=(curve,)), [data])
     titles = [a.get_title() for a in page.axes]
     assert "e of y, u²" in titles
     assert "learning curves (dashed: held out)" in titles
@@ -151,7 +151,7 @@ def texts_of(figure) -> list[str]:
 def test_six_of_many_records_are_drawn_and_the_second_one_too(fit: NonlinearFit) -> None:
     records = [squared(120, k) for k in range(9)]
     records = [replace(x, record={**x.record, "file": f"{k}.csv"}) for k, x in enumerate(records)]
-    page = nonlinear_overview(fit, records[:8], records[8])
+    page = fit_overview(fit, records[:8], records[8])
     page.canvas.draw()
     texts = texts_of(page)
     assert any("8 records" in x and "the first 6 are drawn, 2 more are not" in x for x in texts)
@@ -178,7 +178,7 @@ def test_of_weights_without_names_the_predictions_with_their_bands_are_drawn(fit
     plain = replace(fit, details={})
     assert bars_of(plain) is None
     data = squared(400, 2)
-    page = nonlinear_overview(plain, [data])
+    page = fit_overview(plain, [data])
     page.canvas.draw()
     texts = texts_of(page)
     assert "predictions with their bands" in texts
@@ -197,4 +197,4 @@ def test_a_free_run_that_diverges_is_left_out_of_the_figure() -> None:
     data = io(rng.standard_normal(200), rng.standard_normal(200))
     fit = static_fit(Static(diverges_at=50), data)
     assert traces_of(fit, data).simulated is None
-    nonlinear_overview(fit, [data]).canvas.draw()
+    fit_overview(fit, [data]).canvas.draw()

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.blackbox.response import run_states
 from ambid.errors import EstimationError
-from ambid.report.fit_figures import stabilisation_figure
+from ambid.report.response_figures import stabilisation_figure
 from ambid.validate.stabilisation import assurance, stabilisation
 from tests.validate.blackbox.fits import DT, io
 

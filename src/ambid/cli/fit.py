@@ -140,6 +140,8 @@ def command(
                 extras.append(("physical", physics(found, bench), physics_text))
             drawn = plot if found.status != "failed" else None
             if drawn is not None or stabilisation is not None or sensitivity:
+                from ambid.report.fit_figures import fit_overview
+
                 data = [read_data(x, part=part, **columns) for x in records]
                 other = None if second is None or not nonlinear else read_data(second, part=second_part, **columns)
                 if sensitivity:
@@ -147,7 +149,7 @@ def command(
                     from ambid.validate.sensitivity import sensitivity_analysis
 
                     extras.append(("sensitivity", sensitivity_analysis(found, data[0]), sensitivity_text))
-                outputs.draw(drawn, lambda: _overview(found, data, other), show)
+                outputs.draw(drawn, lambda: fit_overview(found, data, other), show)
                 outputs.draw(stabilisation, lambda: _poles_by_order(found, data[0], show), show)
         outputs.keep(_json_text(found, extras))
     outputs.show(
@@ -184,21 +186,8 @@ def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
     return [f"it does not hold on the second record: {x}" for x in against]
 
 
-def _overview(found: Any, data: Sequence[Any], second: Any) -> Any:
-    """Draw a fit on its records, and a nonlinear one on the second record."""
-    from ambid.blackbox.fit import BlackBoxFit
-
-    if isinstance(found, BlackBoxFit):
-        from ambid.report.fit_figures import fit_overview
-
-        return fit_overview(found, data[0])
-    from ambid.report.nonlinear_figures import nonlinear_overview
-
-    return nonlinear_overview(found, data, second)
-
-
 def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
-    from ambid.report.fit_figures import stabilisation_figure
+    from ambid.report.response_figures import stabilisation_figure
     from ambid.validate.stabilisation import stabilisation
 
     method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"

@@ -67,8 +67,8 @@ def command(
     """
     from ambid.bearing.measured import measured_text
     from ambid.job import frf
-    from ambid.report.fit_figures import frf_figure
     from ambid.report.fit_text import frf_text
+    from ambid.report.response_figures import frf_figure
 
     with Outputs(record, rig, json=json, plot=plot) as outputs:
         between, wanted, n, late = opt.band_of(band), _orders(orders), _order(state_space), _delay(delay)

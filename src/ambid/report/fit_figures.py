@@ -1,45 +1,51 @@
-"""Figures of linear fits: a record beside its model, a measured frequency response, a stabilisation diagram."""
+"""Figures of fits: records beside the model, Bode diagram and poles of a linear one; of a nonlinear one coefficients,
+predictions with bands, correlations, learning curves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.measured import Measured, ModelResponse, model_responses, with_spread
+from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import pole_covariance, zero_covariance
 from ambid.blackbox.prediction import innovations_form, plant_form
 from ambid.blackbox.response import one_step, simulation
 from ambid.blackbox.transfer_model import TransferModel
+from ambid.errors import EstimationError
+from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
     BOUND,
     MEASURED,
     MOST_PAIRS,
+    NORMAL_95,
     PREDICTED,
     Complex,
-    Pair,
     Pole,
     Traces,
-    angle_ticks,
     bode_panel,
     frequency_grid,
-    magnitude_axis,
-    pair_axes,
-    phase_axis,
+    grid,
     poles_panel,
+    records_panel,
     residuals_panel,
     signals_panel,
     stacked,
-    unwrapped,
+    stems,
+    worst_stretch,
 )
-from ambid.report.fit_text import pole_lines
-from ambid.report.numbers import sized
-from ambid.validate.stabilisation import ModePole, Stabilisation
+from ambid.report.fit_text import is_weight, pole_lines
+from ambid.report.numbers import prefixed
+from ambid.report.text import coefficient_text
+from ambid.validate.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
+from ambid.validate.residuals import Correlation, correlations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,41 +53,120 @@ if TYPE_CHECKING:
 
     from ambid.report.drawing import Draw
 
-_NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
-_MODELS: tuple[tuple[str, str, str], ...] = (
-    (PREDICTED, BAND, "-"),
-    (BOUND, "#f1c4be", "--"),
-)  # line and band of the black-box fit and of the physical parameters
-_GRID = 800  # frequencies at which a model is drawn
-_STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
-_WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
+MOST_COEFFICIENTS = 25
+_ACROSS = 5  # correlations beside each other
+_MOST = 20
+_RECORDS = 6  # that are drawn
+_ROWS = 13  # of coefficients below each other
+_LEAD = 500  # samples in which derivatives that are recursions settle
 
 
-def fit_overview(fit: BlackBoxFit, data: IOData) -> Figure:
-    """Draw all figures of a fit on one page, beside the record that it came from or another."""
-    n_y, traces = data.n_outputs, fit_traces(fit, data)
-    parts: list[tuple[float, Draw]] = [
-        (2.3 * n_y, lambda place: signals_panel(place, traces)),
-        (2.2 * n_y, lambda place: residuals_panel(place, traces)),
-    ]
-    if fit.inputs:
-        parts.append((4.6, lambda place: bode_panel(place, fit_response(fit), fit.inputs, fit.outputs, fit.units, {})))
-    parts.append((3.6, lambda place: _poles(place, fit)))
-    pairs = min(MOST_PAIRS, len(fit.inputs) * n_y)
-    return stacked(f"{fit.record.get('file') or 'record'}: {fit.structure}", parts, max(11.0, 3.3 * pairs))
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bars:
+    """Coefficients as they are drawn, the most significant first."""
+
+    names: tuple[str, ...]
+    theta: Array  # (n_shown,), SI, values, and half of their 95 % intervals
+    half_width: Array
+    n_more: int  # coefficients that are not shown
+    n_others: int  # estimated numbers that are no coefficients: weights of a network
 
 
-def fit_traces(fit: BlackBoxFit, data: IOData) -> Traces:
-    """Run a record through a fit."""
+def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None = None) -> Figure:
+    """Draw all figures of a fit with a model on one page.
+
+    `second`: a further record that a nonlinear fit was judged on.
+    """
+    if not records:
+        raise EstimationError("there is no record to draw. Pass those that the fit was estimated from")
+    parts, n_y = _signals(fit, records, second), len(fit.outputs)
+    width = max(11.0, 4.5 * n_y) if len(records) > 1 or second is not None else 11.0
+    if isinstance(fit, BlackBoxFit):
+        if fit.inputs:
+            asides: dict[str, str] = {}
+            parts.append(
+                (4.6, lambda place: bode_panel(place, fit_response(fit), fit.inputs, fit.outputs, fit.units, asides))
+            )
+        parts.append((3.6, lambda place: _poles(place, fit)))
+        width = max(width, 3.3 * min(MOST_PAIRS, len(fit.inputs) * n_y))
+    else:
+        parts += _nonlinear_parts(fit, records, second)
+    return stacked(_title(fit, records, second), parts, width)
+
+
+def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[tuple[float, Draw]]:
+    """Coefficients or bands, correlations of the errors, learning curves."""
+    parts: list[tuple[float, Draw]] = []
+    bars = bars_of(fit)
+    if bars is not None:
+        rows = min(len(bars.names), _ROWS)
+        parts.append((1.1 + 0.21 * rows, lambda place: _draw_bars(place, bars)))
+    if fit.covariance is not None and (bars is None or bars.n_others):
+        where, data = ("the second record", second) if second is not None else (_name(records[0], 0), records[0])
+        parts.append((0.9 + 2.1 * data.n_outputs, lambda place: _draw_band(place, fit, data, where)))
+    shown = _correlations(fit, records)
+    if shown:
+        parts.append((1.9 * -(-len(shown) // _ACROSS) + 0.4, lambda place: _draw_correlations(place, shown)))
+    if any(c.training.size for c in fit.curves):
+        parts.append((3.0 + 0.1 * len(fit.curves), lambda place: _draw_training(place, fit)))
+    return parts
+
+
+def _title(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None) -> str:
+    what = _name(records[0], 0) if len(records) == 1 else f"{len(records)} records"
+    more = f", judged on {_name(second, 0)} too" if second is not None else ""
+    left = len(records) - _RECORDS
+    hidden = f" (the first {_RECORDS} are drawn, {left} more are not)" if left > 0 else ""
+    return f"{what}: {fit.structure}{more}{hidden}"
+
+
+def _name(data: IOData, k: int) -> str:
+    return str(data.record.get("file") or f"record {k + 1}")
+
+
+def _signals(
+    fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None
+) -> list[tuple[float, Draw]]:
+    """One record large, with a close view; several below each other."""
+    found = [traces_of(fit, x, _name(x, k)) for k, x in enumerate(records[:_RECORDS])]
+    if second is not None:
+        title = f"second record, not fitted: {second.record.get('file') or 'record'}"
+        found.append(traces_of(fit, second, title, second=True))
+    n_y, only = len(fit.outputs), found[0]
+    if len(found) == 1:
+        return [
+            (2.3 * n_y, lambda place: signals_panel(place, only)),
+            (2.2 * n_y, lambda place: residuals_panel(place, only)),
+        ]
+    return [(0.4 + 1.8 * len(found), lambda place: records_panel(place, found))]
+
+
+def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *, second: bool = False) -> Traces:
+    """Run a record through a fit, without the samples at the start that are not predicted.
+
+    Returns no simulation where it diverges, or without inputs.
+    """
+    if isinstance(fit, BlackBoxFit):
+        first, predicted = 0, one_step(innovations_form(fit), data.u, data.y, fit.offsets)
+        free = simulation(plant_form(fit), data.u, data.y, fit.offsets)
+    else:
+        found = run(fit, data)
+        first, predicted = found.lag, data.y - found.one_step
+        free = None if found.simulation is None or found.diverges_at is not None else data.y - found.simulation
     return Traces(
-        time_s=np.arange(data.n_samples, dtype=np.float64) * data.dt,
+        title=title,
+        second=second,
+        time_s=np.arange(first, data.n_samples, dtype=np.float64) * data.dt,
         names=data.outputs,
         units=tuple(fit.units[o] for o in data.outputs),
-        measured=data.y,
-        predicted=one_step(innovations_form(fit), data.u, data.y, fit.offsets),
-        simulated=simulation(plant_form(fit), data.u, data.y, fit.offsets),
-        sd=np.sqrt(np.diag(fit.noise_covariance)),
+        measured=data.y[first:],
+        predicted=predicted[first:],
+        simulated=None if free is None else free[first:],
+        sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
     )
+
+
+# --- a linear model -------------------------------------------------------------------------------------------------
 
 
 def fit_response(fit: BlackBoxFit) -> ModelResponse:
@@ -129,153 +214,193 @@ def _roots(values: Complex, covariance: Array | None, most: float) -> list[Pole]
     ]
 
 
-# --- a measured frequency response ----------------------------------------------------------------------------------
+# --- a nonlinear model ----------------------------------------------------------------------------------------------
 
 
-def frf_figure(measured: Measured) -> Figure:
-    """Draw magnitude and phase of every pair: lines with 95 % bands, noise and distortion, the models over them."""
-    from matplotlib.figure import Figure
+def _correlations(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correlation]:
+    """Correlate the errors with what the residual tests look at.
 
-    frf = measured.response
-    pairs, f = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)], frf.frequency_hz
-    models = model_responses(measured, np.geomspace(f[0], f[-1], _GRID)) if f.size > 1 else ()
-    page = Figure(figsize=(max(8.0, 5.5 * min(len(pairs), MOST_PAIRS)), 7.0), layout="constrained")
-    axes = pair_axes(page, pairs, frf.inputs, frf.outputs, frf.units)
-    for (magnitude, phase), pair in zip(axes, pairs, strict=False):
-        _magnitude(magnitude, measured, models, pair)
-        _phase(phase, measured, models, pair)
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), fontsize=9)
-    name = measured.record.get("file") or "record"
-    some = f" ({len(axes)} of {len(pairs)} pairs)" if len(pairs) > len(axes) else ""
-    page.suptitle(f"{name}: frequency response, {frf.method}{some}", fontsize=12)
-    return page
+    Returns over all records; empty where they are too short, or errors are not finite.
+    """
+    found = [run(fit, x) for x in records]
+    if not all(x.finite for x in found):
+        return []
+    prepared = nonlinear_residuals(fit, records, found, coloured=leaves_colour_open(fit, records, found))
+    return [] if prepared is None else correlations(prepared, records[0].inputs, records[0].outputs)[:_MOST]
 
 
-def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
-    """Measured lines with their band, the levels under them, the models over them."""
-    frf = measured.response
-    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
-    noise = None if frf.noise_sd is None else frf.noise_sd[:, *pair]
-    distortion = None if measured.distortion_sd is None else measured.distortion_sd[:, *pair]
-    levels = [(frf.sd[:, *pair], _NOISE, "sd of measured")] if distortion is None else []
-    levels += [(noise, _NOISE, "noise sd")] if distortion is not None and noise is not None else []
-    levels += [(distortion, _DISTORTION, "distortion sd")] if distortion is not None else []
-    drawn = [x[x > 0] for x, _, _ in levels if np.any(x > 0)]
-    bottom = 0.5 * min([float(size[size > 0].min()), *(float(np.percentile(x, 2)) for x in drawn)])
-    lower = np.maximum(size - radius, 0.1 * bottom)
-    axes.fill_between(f, lower, size + radius, color=_RANGE, linewidth=0, label="measured, 95 %")
-    for m, (line, band, style) in zip(models, _MODELS, strict=False):
-        magnitude_axis(axes, m, pair, label=m.source, band_label=f"{m.source}, 95 %", colors=(line, band), style=style)
-    dot = _marker(f.size)
-    axes.plot(f, size, ".", color=MEASURED, markersize=dot, label="measured", zorder=1.8)
-    for x, color, label in levels:
-        seen = np.where(x > 0, x, np.nan)
-        axes.plot(f, seen, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    if f.size > 1:
-        axes.set_xlim(f[0], f[-1])
-    axes.set_ylim(bottom, 2.0 * float(np.max(size)))
+def _draw_correlations(figure: Figure | SubFigure, shown: list[Correlation]) -> None:
+    rows = -(-len(shown) // _ACROSS)
+    axes = figure.subplots(rows, min(_ACROSS, len(shown)), squeeze=False, sharex=True)
+    for a in axes.flat[len(shown) :]:
+        a.axis("off")
+    for a, c in zip(axes.flat, shown, strict=False):
+        stems(a, c.lags, c.values, c.band)
+        a.set_title(c.title, fontsize=9)
+        a.tick_params(labelsize=8)
+        grid(a)
+    figure.suptitle("correlations over the lag in samples, with 99 % bounds (Billings and Voon 1986)", fontsize=10)
 
 
-def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
-    """Phase, unwrapped beginning near zero; where |G| is lost in its sd the band is all angles."""
-    frf = measured.response
-    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
-    angle = np.rad2deg(_angle(frf.G[:, *pair], f, models, pair))
-    ratio = np.minimum(radius / np.maximum(size, 1e-300), 1.0)
-    spread = np.where(ratio < 1, np.rad2deg(np.arcsin(ratio)), 180.0)
-    near = float(unwrapped(models[0].G[:, *pair])[0]) if models else 0.0  # a phase near ±180° begins on one side
-    for m, (line, band, style) in zip(models, _MODELS, strict=False):
-        phase_axis(axes, m, pair, near=near, colors=(line, band), style=style)
-    axes.fill_between(f, angle - spread, angle + spread, color=_RANGE, linewidth=0, zorder=0.5)
-    axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
-    axes.set_xscale("log")
-    lines = [np.rad2deg(unwrapped(m.G[:, *pair], near)) for m in models]
-    angle_ticks(axes, np.concatenate([angle[ratio < 0.5] if np.any(ratio < 0.5) else angle, *lines]))
+def _draw_training(figure: Figure | SubFigure, fit: NonlinearFit) -> None:
+    by_time, by_step = figure.subplots(1, 2, sharey=True)
+    positive = [float(t) for c in fit.curves for t in c.seconds if t > 0]
+    earliest = min(positive, default=1.0) / 2  # a logarithm has no zero
+    methods = [c.method for c in fit.curves]
+    names = [f"{k + 1}. {m}" if methods.count(m) > 1 else m for k, m in enumerate(methods)]
+    for k, c in enumerate(fit.curves):
+        color, seconds = f"C{k % 10}", np.maximum(c.seconds, earliest)
+        by_time.plot(seconds, c.training, ".-", color=color, markersize=3, linewidth=1.0, label=names[k])
+        by_step.plot(np.arange(c.training.size), c.training, ".-", color=color, markersize=3, linewidth=1.0)
+        if c.held_out.size == c.training.size:
+            by_time.plot(seconds, c.held_out, "--", color=color, linewidth=0.9)
+            by_step.plot(np.arange(c.training.size), c.held_out, "--", color=color, linewidth=0.9)
+    by_time.set_xlabel("time [s]")
+    by_step.set_xlabel("iteration")
+    by_step.xaxis.get_major_locator().set_params(integer=True)
+    _scaled(by_time, "x", [x for c in fit.curves for x in np.maximum(c.seconds, earliest)])
+    _scaled(by_time, "y", [x for c in fit.curves for x in (*c.training, *c.held_out)])
+    by_time.set_ylabel("rms error / sd of output")
+    by_time.set_title("learning curves (dashed: held out)", fontsize=10)
+    columns = 1 if max(map(len, names)) > 60 else 2
+    figure.legend(loc="outside lower center", fontsize=8, ncols=min(columns, len(names)), frameon=False)
+    grid(by_time, by_step)
 
 
-def _angle(G: Complex, f: Array, models: Sequence[ModelResponse], pair: Pair) -> Array:
-    """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
-    if not models:
-        return unwrapped(G)
-    near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].G[:, *pair]))
-    return np.asarray(near + np.angle(G * np.exp(-1j * near)))
+def _scaled(axes: Axes, which: Literal["x", "y"], values: list[float]) -> None:
+    """A logarithmic axis where values span more than a factor of 5; labels that do not run into each other."""
+    from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
-
-def _marker(n: int) -> float:
-    return 4.0 if n <= 300 else 2.0 if n <= 3000 else 1.0
-
-
-# --- a stabilisation diagram ----------------------------------------------------------------------------------------
-
-
-def stabilisation_figure(found: Stabilisation) -> Figure:
-    """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
-    from matplotlib.figure import Figure
-
-    page = Figure(figsize=(11, 7), layout="constrained")
-    page.suptitle(f"stabilisation diagram, {found.method}", fontsize=13)
-    (damping, empty), (diagram, values) = page.subplots(
-        2, 2, width_ratios=(4, 1), height_ratios=(1, 2), sharex="col", sharey="row"
-    )
-    empty.axis("off")
-    _frequency_axis(diagram, found)
-    _diagram(diagram, found)
-    empty.legend(*diagram.get_legend_handles_labels(), loc="center", fontsize=8, title="poles", title_fontsize=9)
-    _damping(damping, found)
-    size = np.asarray(found.singular_values)
-    values.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
-    values.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
-    values.set_xlabel("singular value")
-    values.set_title(f"least BIC: order {found.suggested}", fontsize=10)
-    for axes in (damping, diagram, values):
-        axes.grid(True, color="#dddddd", linewidth=0.6)
-        axes.tick_params(labelsize=9)
-    return page
-
-
-def _diagram(axes: Axes, found: Stabilisation) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    kinds = (
-        ("new", "x", _NEW),
-        ("stable in frequency", "^", _FREQUENCY),
-        ("stable in frequency, damping and shape", "o", _STABLE),
-    )
-    for k, (label, marker, color) in enumerate(kinds):
-        chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
-        axes.plot(*_places(chosen), marker, color=color, markersize=5, label=label, linestyle="none")
-    for mode in found.modes:
-        axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6)
-    axes.set_xlabel("frequency of the pole [Hz]")
-    axes.set_ylabel("order")
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _frequency_axis(axes: Axes, found: Stabilisation) -> None:
-    """Frequencies over several decades want a logarithmic axis."""
-    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
-    if seen.size and seen.max() > _WIDE * seen.min():
+    finite = [float(v) for v in values if np.isfinite(v) and v > 0]
+    if not finite or max(finite) < 5 * min(finite):
+        if which == "y" and finite and max(finite) < 1.01 * min(finite):  # a search that began where it ended is flat
+            axes.set_ylim(0.98 * min(finite), 1.02 * max(finite))
+        return
+    if which == "x":
         axes.set_xscale("log")
+    else:
+        axes.set_yscale("log")
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    wide = max(finite) > 100 * min(finite)
+    axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    axis.set_major_formatter(LogFormatterSciNotation() if wide else "{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
-def _damping(axes: Axes, found: Stabilisation) -> None:
-    stable = [p for p in found.poles if p.stable]
-    axes.set_ymargin(0.2)
-    axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
-    for mode in found.modes:
-        axes.annotate(
-            sized(mode.frequency_hz, "Hz"),
-            (mode.frequency_hz, mode.damping),
-            textcoords="offset points",
-            xytext=(4, 4),
-            fontsize=8,
-        )
-    axes.axhline(0, color=_NEW, linewidth=0.8)
-    axes.set_ylabel("damping (under 0: unstable)")
+def bars_of(fit: NonlinearFit) -> Bars | None:
+    """Return the coefficients that are worth a bar each.
+
+    Returns none where there are no standard deviations, or the numbers say nothing one by one: more than 25 that are
+    not named after terms, or weights of a network. Of a model with terms only these are shown.
+    """
+    sd, model = fit.sd, fit.model
+    if sd is None or model is None:
+        return None
+    worth = estimated = np.flatnonzero(sd > 0)
+    named = term_names(fit)
+    if named:
+        worth = np.array([k for k in worth if model.names[k] in named], dtype=int)
+    elif worth.size > MOST_COEFFICIENTS or any(map(is_weight, model.names)):
+        return None
+    if not worth.size:
+        return None
+    order = worth[np.argsort(-np.abs(model.theta[worth]) / sd[worth], kind="stable")]
+    shown = order[:MOST_COEFFICIENTS]
+    return Bars(
+        names=tuple(model.names[k] for k in shown),
+        theta=model.theta[shown],
+        half_width=NORMAL_95 * sd[shown],
+        n_more=int(order.size - shown.size),
+        n_others=int(estimated.size - order.size),
+    )
 
 
-def _places(poles: list[ModePole]) -> tuple[list[float], list[int]]:
-    return [p.frequency_hz for p in poles], [p.order for p in poles]
+def term_names(fit: NonlinearFit) -> set[str]:
+    """Return the names of the parameters that belong to chosen terms.
+
+    `fit`: with a model. Returns empty for a structure without terms.
+    """
+    terms = fit.details.get("terms")
+    if not isinstance(terms, Mapping) or fit.model is None:
+        return set()
+    several = len(fit.outputs) > 1
+    chosen = {
+        (f"y{o + 1}: " if several else "") + str(t["term"])
+        for o, output in enumerate(fit.outputs)
+        for t in terms.get(output, ())
+    }
+    below = {f"{x.split(': ')[0]}: " if several else "" for x in chosen}
+    return {x for x in fit.model.names if x in chosen or any(x.startswith(f"{b}1/(") for b in below)}
+
+
+def _draw_bars(figure: Figure | SubFigure, bars: Bars) -> None:
+    """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude."""
+    columns = -(-len(bars.names) // _ROWS)
+    per = -(-len(bars.names) // columns)
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    for c, a in enumerate(axes):
+        _bars(a, bars, slice(c * per, (c + 1) * per), per)
+    more = f"; {bars.n_more} more, less significant, are not shown" if bars.n_more else ""
+    title = "coefficients with 95 % intervals, each on its own scale; red: zero lies inside"
+    figure.suptitle(f"{title}{more}", fontsize=10)
+
+
+def _bars(axes: Axes, bars: Bars, part: slice, rows: int) -> None:
+    names, values, halves = bars.names[part], bars.theta[part], bars.half_width[part]
+    at = rows - 1 - np.arange(len(names))
+    for y, value, half in zip(at, values, halves, strict=True):
+        far = abs(value) + half
+        color = BOUND if abs(value) < half else PREDICTED
+        axes.errorbar(value / far, y, xerr=half / far, fmt="o", color=color, markersize=3.5, capsize=2.5, linewidth=1.2)
+    axes.axvline(0, color=MEASURED, linewidth=0.8)
+    texts = [f"{n} = {coefficient_text(float(v), float(h))}" for n, v, h in zip(names, values, halves, strict=True)]
+    axes.set_yticks(at, texts)
+    axes.set_xticks([0.0], ["0"])
+    axes.set_xlim(-1.1, 1.1)
+    axes.set_ylim(-0.7, rows - 0.3)
+    grid(axes)
+    axes.tick_params(labelsize=8)
+
+
+def _draw_band(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, where: str) -> None:
+    """Draw the predicted outputs with their 95 % bands, where the errors are largest.
+
+    `fit`: with a covariance; `where`: which record it is, for the title.
+    """
+    model = model_of(fit, data)
+    predicted = model.predict(data.u, data.y)
+    first, last = (k + model.lag for k in worst_stretch((data.y - predicted)[model.lag :]))
+    lead = max(first - _LEAD, 0)
+    slopes = model.jacobian(data.u[lead:last], data.y[lead:last])[first - lead :]
+    assert fit.covariance is not None
+    variance = np.maximum(np.einsum("tok,kl,tol->to", slopes, fit.covariance, slopes, optimize=True), 0.0)
+    noise = np.maximum(np.diag(fit.noise_covariance), 0.0)
+    outside = beyond(model.novelty(data.u, data.y)[first:last])
+    t = np.arange(first, last) * data.dt
+    axes = figure.subplots(data.n_outputs, 2, squeeze=False, sharex="col", width_ratios=(3, 2))
+    for j, name in enumerate(data.outputs):
+        y, p = data.y[first:last, j], predicted[first:last, j]
+        own, both = NORMAL_95 * np.sqrt(variance[:, j]), NORMAL_95 * np.sqrt(variance[:, j] + noise[j])
+        for a, middle, points in ((axes[j, 0], p, y), (axes[j, 1], np.zeros_like(p), y - p)):
+            scale, unit = prefixed(float(np.max(np.abs(points))), fit.units[name])
+            for half, color, label in (
+                (both, BAND, "95 % of the measured"),
+                (own, PREDICTED, "95 % of the prediction"),
+            ):
+                low, high = (middle - half) / scale, (middle + half) / scale
+                a.fill_between(t, low, high, color=color, alpha=0.5, linewidth=0, label=label)
+            a.plot(t, middle / scale, color=PREDICTED, linewidth=1.0, label="predicted one step ahead")
+            inside = np.where(outside, np.nan, points / scale)
+            a.plot(t, inside, ".", color=MEASURED, markersize=3.5, label="measured")
+            if np.any(outside):
+                far = points[outside] / scale
+                a.plot(t[outside], far, "x", color=BOUND, markersize=4, label="measured, outside the training data")
+            a.set_ylabel(f"{name} [{unit}]" if a is axes[j, 0] else f"[{unit}]")
+            grid(a)
+    for a, title in zip(axes[0], (f"{where}, where errors are largest", "measured - predicted"), strict=True):
+        a.set_title(title, fontsize=10)
+        axes[-1, 0].set_xlabel("time [s]")
+        axes[-1, 1].set_xlabel("time [s]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", fontsize=8, ncols=5, frameon=False)
+    figure.suptitle("predictions with their bands", fontsize=10)

@@ -1,0 +1,167 @@
+"""Figures of a measured frequency response and of a stabilisation diagram."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.measured import Measured, ModelResponse, model_responses
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    MEASURED,
+    MOST_PAIRS,
+    PREDICTED,
+    Complex,
+    Pair,
+    angle_ticks,
+    grid,
+    magnitude_axis,
+    pair_axes,
+    phase_axis,
+    unwrapped,
+)
+from ambid.report.numbers import sized
+from ambid.validate.stabilisation import Stabilisation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
+_MODELS: tuple[tuple[str, str, str], ...] = (
+    (PREDICTED, BAND, "-"),
+    (BOUND, "#f1c4be", "--"),
+)  # line and band of the black-box fit and of the physical parameters
+_GRID = 800  # frequencies at which a model is drawn
+_STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
+_KINDS = (
+    ("new", "x", _NEW),
+    ("stable in frequency", "^", _FREQUENCY),
+    ("stable in frequency, damping and shape", "o", _STABLE),
+)  # of poles, those that are stable in everything last
+_WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
+
+
+# --- a measured frequency response ----------------------------------------------------------------------------------
+
+
+def frf_figure(measured: Measured) -> Figure:
+    """Draw magnitude and phase of every pair: lines with 95 % bands, noise and distortion, the models over them."""
+    from matplotlib.figure import Figure
+
+    frf = measured.response
+    pairs, f = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)], frf.frequency_hz
+    models = model_responses(measured, np.geomspace(f[0], f[-1], _GRID)) if f.size > 1 else ()
+    page = Figure(figsize=(max(8.0, 5.5 * min(len(pairs), MOST_PAIRS)), 7.0), layout="constrained")
+    axes = pair_axes(page, pairs, frf.inputs, frf.outputs, frf.units)
+    for (magnitude, phase), pair in zip(axes, pairs, strict=False):
+        _magnitude(magnitude, measured, models, pair)
+        _phase(phase, measured, models, pair)
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    page.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), fontsize=9)
+    name = measured.record.get("file") or "record"
+    some = f" ({len(axes)} of {len(pairs)} pairs)" if len(pairs) > len(axes) else ""
+    page.suptitle(f"{name}: frequency response, {frf.method}{some}", fontsize=12)
+    return page
+
+
+def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
+    """Measured lines with their band, the levels under them, the models over them."""
+    frf = measured.response
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
+    noise = None if frf.noise_sd is None else frf.noise_sd[:, *pair]
+    distortion = None if measured.distortion_sd is None else measured.distortion_sd[:, *pair]
+    levels = [(frf.sd[:, *pair], _NOISE, "sd of measured")] if distortion is None else []
+    levels += [(noise, _NOISE, "noise sd")] if distortion is not None and noise is not None else []
+    levels += [(distortion, _DISTORTION, "distortion sd")] if distortion is not None else []
+    drawn = [x[x > 0] for x, _, _ in levels if np.any(x > 0)]
+    bottom = 0.5 * min([float(size[size > 0].min()), *(float(np.percentile(x, 2)) for x in drawn)])
+    lower = np.maximum(size - radius, 0.1 * bottom)
+    axes.fill_between(f, lower, size + radius, color=_RANGE, linewidth=0, label="measured, 95 %")
+    for m, (line, band, style) in zip(models, _MODELS, strict=False):
+        magnitude_axis(axes, m, pair, label=m.source, band_label=f"{m.source}, 95 %", colors=(line, band), style=style)
+    dot = _marker(f.size)
+    axes.plot(f, size, ".", color=MEASURED, markersize=dot, label="measured", zorder=1.8)
+    for x, color, label in levels:
+        seen = np.where(x > 0, x, np.nan)
+        axes.plot(f, seen, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if f.size > 1:
+        axes.set_xlim(f[0], f[-1])
+    axes.set_ylim(bottom, 2.0 * float(np.max(size)))
+
+
+def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
+    """Phase, unwrapped beginning near zero; where |G| is lost in its sd the band is all angles."""
+    frf = measured.response
+    f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
+    angle = np.rad2deg(_angle(frf.G[:, *pair], f, models, pair))
+    ratio = np.minimum(radius / np.maximum(size, 1e-300), 1.0)
+    spread = np.where(ratio < 1, np.rad2deg(np.arcsin(ratio)), 180.0)
+    near = float(unwrapped(models[0].G[:, *pair])[0]) if models else 0.0  # a phase near ±180° begins on one side
+    for m, (line, band, style) in zip(models, _MODELS, strict=False):
+        phase_axis(axes, m, pair, near=near, colors=(line, band), style=style)
+    axes.fill_between(f, angle - spread, angle + spread, color=_RANGE, linewidth=0, zorder=0.5)
+    axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
+    axes.set_xscale("log")
+    lines = [np.rad2deg(unwrapped(m.G[:, *pair], near)) for m in models]
+    angle_ticks(axes, np.concatenate([angle[ratio < 0.5] if np.any(ratio < 0.5) else angle, *lines]))
+
+
+def _angle(G: Complex, f: Array, models: Sequence[ModelResponse], pair: Pair) -> Array:
+    """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
+    if not models:
+        return unwrapped(G)
+    near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].G[:, *pair]))
+    return np.asarray(near + np.angle(G * np.exp(-1j * near)))
+
+
+def _marker(n: int) -> float:
+    return 4.0 if n <= 300 else 2.0 if n <= 3000 else 1.0
+
+
+# --- a stabilisation diagram ----------------------------------------------------------------------------------------
+
+
+def stabilisation_figure(found: Stabilisation) -> Figure:
+    """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    page = Figure(figsize=(11, 7), layout="constrained")
+    page.suptitle(f"stabilisation diagram, {found.method}", fontsize=13)
+    (damping, empty), (diagram, values) = page.subplots(
+        2, 2, width_ratios=(4, 1), height_ratios=(1, 2), sharex="col", sharey="row"
+    )
+    empty.axis("off")
+    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
+    if seen.size and seen.max() > _WIDE * seen.min():
+        diagram.set_xscale("log")
+    for k, (label, marker, color) in enumerate(_KINDS):
+        chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
+        frequency, orders = [p.frequency_hz for p in chosen], [p.order for p in chosen]
+        diagram.plot(frequency, orders, marker, color=color, markersize=5, label=label, linestyle="none")
+    damping.set_ymargin(0.2)
+    damping.plot(frequency, [p.damping for p in chosen], "o", color=_STABLE, markersize=4)
+    for mode in found.modes:
+        diagram.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6)
+        at, words = (mode.frequency_hz, mode.damping), sized(mode.frequency_hz, "Hz")
+        damping.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
+    damping.axhline(0, color=_NEW, linewidth=0.8)
+    damping.set_ylabel("damping (under 0: unstable)")
+    diagram.set_xlabel("frequency of the pole [Hz]")
+    diagram.set_ylabel("order")
+    diagram.yaxis.set_major_locator(MaxNLocator(integer=True))
+    empty.legend(*diagram.get_legend_handles_labels(), loc="center", fontsize=8, title="poles", title_fontsize=9)
+    size = np.asarray(found.singular_values)
+    values.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
+    values.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
+    values.set_xlabel("singular value")
+    values.set_title(f"least BIC: order {found.suggested}", fontsize=10)
+    grid(damping, diagram, values)
+    return page
