@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Literal, Protocol
@@ -260,6 +261,15 @@ class Attempt:
     warnings: list[str] = field(default_factory=list)
     timing_s: dict[str, float] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of what is done inside to a stage."""
+        began = perf_counter()
+        try:
+            yield
+        finally:
+            self.timed(name, began)
 
     def timed(self, stage: str, began: float) -> float:
         """Add what a stage took since `began`, and return when the next one begins."""

@@ -10,9 +10,8 @@ states by Bayes' criterion -> number of odd hidden units by how the free run goe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions, silent
 from ambid.nonlinear.fit import NonlinearFit, Settings
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import choice, number, read_settings, whole
+from ambid.nonlinear.settings import choice, read_settings, whole
 from ambid.nonlinear.state_start import (
     LARGEST,
     NO_START,
@@ -32,7 +31,6 @@ from ambid.nonlinear.state_start import (
     guess_delay,
     matrices_json,
     search_start,
-    shift_inputs,
     start_free,
     start_one_axis,
     train_one_step,
@@ -50,9 +48,8 @@ from ambid.nonlinear.state_training import (
     train_each,
 )  # fmt: skip
 
-_SIGNED: Mapping[str, object] = {"neurons": 0, "prior": 3.0, "starts": 3, "evaluations": 2000}
-_MAGNITUDE: Mapping[str, object] = {"prior": 1.0, "starts": 20}
-_MAGNITUDE_ALWAYS: Mapping[str, object] = {
+_SIGNED: Mapping[str, object] = {"neurons": 0, "starts": 3, "evaluations": 2000}
+_MAGNITUDE: Mapping[str, object] = {
     "form": "free", "noise": "output", "delay": 0, "descent": 0, "evaluations": 0, "uncertainty": "laplace",
 }  # fmt: skip
 _UNITS = {"m": 0, "m/s": 1, "A": 2}
@@ -93,9 +90,6 @@ class NnSettings:
     neurons: int | None = whole(
         "hidden units of G(x, u); 0; with output=magnitude chosen by how runs go on behind training", 0, 40
     )
-    prior: float | None = number(
-        "standard deviation of G's weights before the data, scaled; 3, with output=magnitude 1", 0.01, 1e6
-    )
     starts: int | None = whole("random starts of G; 3, with output=magnitude 20", 1, 20)
     noise: str = choice(
         "output, innovations (predictor gain), auto (gain where errors are not white); auto",
@@ -124,21 +118,19 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     unsigned = chosen["output"] == "magnitude"
     if unsigned:
         _check_magnitude(records, {k: v for k, v in chosen.items() if k in settings})
-    s: dict[str, Any] = {**_MAGNITUDE, **chosen, **_MAGNITUDE_ALWAYS} if unsigned else {**_SIGNED, **chosen}
+    s: dict[str, Any] = {"starts": 20, **chosen, **_MAGNITUDE} if unsigned else {**_SIGNED, **chosen}
     data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
-    fitting, reason = Fitting(data=data), NO_START
+    s["form"] = _choose_form(str(s["form"]), records[0])
+    fitting, reason = Fitting(records=records, settings=s, seed=seed, whole=data, data=data), NO_START
     try:
         if unsigned:
-            _train_magnitude(s, records[0].dt, fitting, seed, tick)
+            _train_magnitude(fitting, tick)
         else:
-            s["form"] = _choose_form(str(s["form"]), records[0])
-            reason = _start(s, data, records[0], fitting, tick)
+            reason = _start(fitting, tick)
             if not reason:
-                _train_all(s, fitting, seed, part_of(tick, *_TRAINING))
-            asked = bool("evaluations" in settings and s["evaluations"])
-            reason = _rescue(s, data, records[0], fitting, seed, tick, reason, asked=asked)
-            if fitting.state is not None:
-                fitting.warnings += _suspect(s, fitting)
+                _train_all(fitting, part_of(tick, *_TRAINING))
+            reason = _rescue(fitting, tick, reason, asked="evaluations" in settings)
+            _caution(fitting)
     except KeyboardInterrupt:
         fitting.interrupt()
         if reason in ("", NO_START):
@@ -150,8 +142,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     if state is not None and not unsigned and s["form"] == "free":
         m = state.layout.matrices(state.theta)
         fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B, sampled=True)
-    used = {**s, "delay": fitting.delay, "neurons": 0 if state is None else state.layout.neurons}
-    return finish(records, used, fitting, reason, seed=seed, how=s["uncertainty"], tick=part_of(tick, *_SPREAD))
+    return finish(fitting, reason, part_of(tick, *_SPREAD))
 
 
 def _choose_form(asked: str, first: IOData) -> str:
@@ -170,55 +161,53 @@ def _choose_form(asked: str, first: IOData) -> str:
     return "one-axis" if fits and asked != "free" else "free"
 
 
-def _heads(record: IOData) -> tuple[int, ...]:
-    return tuple(_UNITS[record.units[x]] for x in record.outputs)
+def _heads(fitting: Fitting) -> tuple[int, ...]:
+    first = fitting.records[0]
+    return tuple(_UNITS[first.units[x]] for x in first.outputs)
 
 
 # --- start -----------------------------------------------------------------------------------------------------------
 
 
-def _start(s: Mapping[str, Any], whole: Scaled, record: IOData, fitting: Fitting, tick: Tick | None) -> str:
+def _start(fitting: Fitting, tick: Tick | None) -> str:
     """Find the delay and a first network; return the reason where there is none."""
-    began = perf_counter()
-    fitting.delay = int(s["delay"]) if "delay" in s else guess_delay(whole)
-    fitting.data = shift_inputs(whole, fitting.delay)
-    reason = _find_first(s, record, fitting)
-    began = fitting.timed("start", began)
-    if "delay" in s or fitting.state is None:
+    given = fitting.settings.get("delay")
+    with fitting.stage("start"):
+        fitting.shift(guess_delay(fitting.whole) if given is None else int(given))
+        reason = _find_first(fitting)
+    if given is not None or fitting.state is None:
         return reason
-    begun: State | str = fitting.state
-    if s["form"] == "free" and "states" not in s:  # more than are needed: fewer would pass for a delay
-        begun = start_free(fitting.data, record.dt, fitting.data.y_level.size + _MORE)
-    if isinstance(begun, str):
-        return reason
-    before = fitting.delay
-    _find_delay(s, begun, whole, fitting, part_of(tick, *_DELAY))
-    if fitting.delay != before:
-        fitting.state = None
-        reason = _find_first(s, record, fitting)
-    fitting.timed("delay", began)
+    with fitting.stage("delay"):
+        begun: State | str = fitting.state
+        if fitting.counts_states:  # more than are needed: fewer would pass for a delay
+            begun = start_free(fitting.data, fitting.dt, fitting.data.n_outputs + _MORE)
+        if isinstance(begun, str):
+            return reason
+        before = fitting.delay
+        _find_delay(fitting, begun, part_of(tick, *_DELAY))
+        if fitting.delay != before:
+            fitting.state = None
+            reason = _find_first(fitting)
     return reason
 
 
-def _find_delay(s: Mapping[str, Any], state: State, whole: Scaled, fitting: Fitting, tick: Tick | None) -> None:
+def _find_delay(fitting: Fitting, state: State, tick: Tick | None) -> None:
     """Find the delay by short trainings from a first network."""
-    rather_late = s["form"] == "free" and "states" not in s
-    fitting.delay = find_delay(state, whole, fitting.delay, tick, rather_late=rather_late)
-    fitting.data = shift_inputs(whole, fitting.delay)
+    fitting.shift(find_delay(state, fitting.whole, fitting.delay, tick, rather_late=fitting.counts_states))
     if fitting.delay == LARGEST:
         fitting.warnings.append(
             f"the delay that fits best is the largest looked for, {LARGEST} samples: give delay if inputs act later"
         )
 
 
-def _find_first(s: Mapping[str, Any], record: IOData, fitting: Fitting) -> str:
+def _find_first(fitting: Fitting) -> str:
     """Find a first network; return the reason where there is none."""
-    reason, data = "", fitting.data
+    reason, data, s = "", fitting.data, fitting.settings
     for past in (SHORT, *_LONG):
         if s["form"] == "one-axis":
-            found = start_one_axis(data, record.dt, _heads(record), past)
+            found = start_one_axis(data, fitting.dt, _heads(fitting), past)
         else:
-            found = start_free(data, record.dt, s.get("states") or data.y_level.size, past)
+            found = start_free(data, fitting.dt, s.get("states") or data.n_outputs, past)
         if isinstance(found, str):
             reason = reason or found
             continue
@@ -233,69 +222,74 @@ def _find_first(s: Mapping[str, Any], record: IOData, fitting: Fitting) -> str:
 # --- training --------------------------------------------------------------------------------------------------------
 
 
-def _train_all(s: Mapping[str, Any], fitting: Fitting, seed: int, tick: Tick | None) -> None:
-    """Train the first network: number of states, physics, hidden layer, gain."""
-    chosen, starts, most = s["form"] == "free" and "states" not in s, int(s["starts"]), int(s["iterations"])
+def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> None:
+    """Train the first network: number of states, the thesis's `descent`, physics, hidden layer, gain."""
+    s, data = fitting.settings, fitting.data
+    most = int(s["iterations"])
     choice, physics, hidden, gain = portions(
-        tick, (_LARGEST if chosen else 0, 3, 3 * starts * (s["neurons"] > 0), 3)
-    )  # fmt: skip
-    began, data = perf_counter(), fitting.data
+        tick, (_LARGEST * fitting.counts_states, 3, 3 * int(s["starts"]) * (s["neurons"] > 0), 3)
+    )
     assert fitting.state is not None
-    if chosen:
-        p, dt = data.y_level.size, fitting.state.layout.dt
-
-        def starts_of(n: int) -> list[State]:
-            begun = start_free(data, dt, n)
-            return [] if isinstance(begun, str) else [begun]
-
-        found = _choose_states(
-            fitting, range(p, p + _LARGEST + 1), starts_of, choice, patience=2, stage="choice of states", iterations=6
-        )
+    if fitting.counts_states:
+        p = data.n_outputs
+        starts = {n: [start_free(data, fitting.dt, n)] for n in range(p, p + _LARGEST + 1)}
+        found = _choose_states(fitting, starts, choice, patience=2, stage="choice of states", iterations=6)
         fitting.state = found.state if found is not None else fitting.state
     first = fitting.state
-    if s["descent"]:
-        curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
-        fitting.curves.extend(curves)
-        began = fitting.timed("one-step training", began)
-    if s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
-        bare = first.widen(gain=False)
-        train(bare, data, stage="simulation errors", iterations=most, tick=physics, fitting=fitting)
-    if s["neurons"]:
-        begun = [add_units(fitting.state, int(s["neurons"]), float(s["prior"]), [seed, k]) for k in range(starts)]
-        trained = train_each(begun, data, hidden, stage="hidden layer", iterations=most, fitting=fitting)
-        fitting.rivals = [x.state for x in trained]
-    _train_gain(s, fitting, first, gain)
-    fitting.timed("training", began)
+    if s["descent"] and descent:
+        with fitting.stage("one-step training"):
+            curves, fitting.details["one_step_training"] = train_one_step(first, data, int(s["descent"]))
+            fitting.curves.extend(curves)
+    with fitting.stage("training"):
+        if s["noise"] == "output" or (s["noise"] == "auto" and first.stable):
+            bare = first.widen(gain=False)
+            train(bare, data, stage="simulation errors", iterations=most, tick=physics, fitting=fitting)
+        if s["neurons"]:
+            neurons = int(s["neurons"])
+            trained = _train_units(s, fitting.state, data, neurons, [fitting.seed], hidden, fitting=fitting)
+            fitting.rivals = [x.state for x in trained]
+        _train_gain(fitting, first, gain)
 
 
-def _train_gain(s: Mapping[str, Any], fitting: Fitting, first: State, tick: Tick | None) -> None:
+def _train_gain(fitting: Fitting, first: State, tick: Tick | None) -> None:
     """Go on with a predictor gain where the simulation errors are not white (the simplest noise that does)."""
-    state, data = fitting.state, fitting.data
+    state, data, noise = fitting.state, fitting.data, fitting.settings["noise"]
     assert state is not None
-    if s["noise"] == "output" or (s["noise"] == "auto" and not state.layout.gain and is_white(state, data)):
+    if noise == "output" or (noise == "auto" and not state.layout.gain and is_white(state, data)):
         return
     wide = state if state.layout.gain else add_gain(state, data, first.K)
     if wide is None:
         fitting.warnings.append("no predictor gain was found that keeps the predictor finite")
         return
-    train(wide, data, stage="prediction errors", iterations=int(s["iterations"]), tick=tick, fitting=fitting)
+    most = int(fitting.settings["iterations"])
+    train(wide, data, stage="prediction errors", iterations=most, tick=tick, fitting=fitting)
+
+
+def _train_units(
+    s: Mapping[str, Any], base: State, data: Scaled, neurons: int, seed: list[int], tick: Tick | None, **how: Any
+) -> list[Training]:
+    """Several random starts of a hidden layer, the best first; units have no effect at first."""
+    begun = [add_units(base, neurons, [*seed, k]) for k in range(int(s["starts"]))]
+    return train_each(begun, data, tick, stage="hidden layer", iterations=int(s["iterations"]), **how)
 
 
 def _choose_states(
     fitting: Fitting,
-    tried: Sequence[int],
-    starts: Callable[[int], Sequence[State]],
+    starts: Mapping[int, Sequence[State | str]],
     tick: Tick | None,
     *,
     patience: int,
     clear: float = 0.0,
     **how: Any,
 ) -> Training | None:
-    """The network with the number of states that Bayes' criterion likes best; a larger one has to be `clear` of it."""
+    """The network with the number of states that Bayes' criterion likes best; a larger one has to be `clear` of it.
+
+    `starts` are the first networks by number of states.
+    """
     best: Training | None = None
     values: list[dict[str, Any]] = []
-    for n, own in zip(tried, portions(tick, [1.0] * len(tried)), strict=True):
-        trained = train_each(starts(n), fitting.data, own, **how)
+    for (n, begun), own in zip(starts.items(), portions(tick, [1.0] * len(starts)), strict=True):
+        trained = train_each([x for x in begun if isinstance(x, State)], fitting.data, own, **how)
         if not trained:
             continue
         at = trained[0].state
@@ -312,9 +306,9 @@ def _choose_states(
 
 
 def _check_magnitude(records: Sequence[IOData], given: Mapping[str, object]) -> None:
-    used = ("output", *_MAGNITUDE, "iterations", "states", "neurons")
+    used = ("output", "starts", "iterations", "states", "neurons")
     for name, value in given.items():
-        if name not in used and value not in ("auto", _MAGNITUDE_ALWAYS[name]):
+        if name not in used and value not in ("auto", _MAGNITUDE[name]):
             raise EstimationError(
                 f"nn: {name} = {value!r} means nothing with output = magnitude; what does: {', '.join(used)}. Leave "
                 "it out"
@@ -332,35 +326,34 @@ def _check_magnitude(records: Sequence[IOData], given: Mapping[str, object]) -> 
             )
 
 
-def _train_magnitude(s: Mapping[str, Any], dt: float, fitting: Fitting, seed: int, tick: Tick | None) -> None:
+def _train_magnitude(fitting: Fitting, tick: Tick | None) -> None:
     """Train a network behind a sensor without sign: number of states, number of units, training on all."""
-    began, starts, data, most = perf_counter(), int(s["starts"]), fitting.data, int(s["iterations"])
+    s, data = fitting.settings, fitting.data
+    most, runs = int(s["iterations"]), int(s["starts"])
     tried = range(1, MOST_STATES + 1) if "states" not in s else (int(s["states"]),)
     units = range(_MOST_UNITS + 1) if "neurons" not in s else (int(s["neurons"]),)
-    linear, choice, last = portions(
-        tick, (4.0, len(_FOLDS) * sum(units) * starts * (len(units) > 1), units[-1] * starts)
-    )  # fmt: skip
-    base = _choose_states(
-        fitting, tried, lambda n: [State.of(*x, data) for x in grid_starts(data.parts, n, _REFINED, dt)], linear,
-        patience=MOST_STATES, clear=_CLEAR, stage="linear part", iterations=most,
-    )  # fmt: skip
-    began = fitting.timed("linear", began)
-    if base is None:
-        return
-    fitting.take(base)
-    neurons = _choose_units(s, fitting, base.state, seed, choice) if len(units) > 1 else units[0]
-    began = fitting.timed("choice of units", began)
-    trained = _train_units(base.state, data, neurons, s, seed, last) if neurons else []
-    if trained and not train(trained[0].state, data, stage="hidden layer", iterations=_LAST * most, fitting=fitting):
-        fitting.take(trained[0])
+    linear, choice, last = portions(tick, (4.0, len(_FOLDS) * sum(units) * runs * (len(units) > 1), units[-1] * runs))
+    with fitting.stage("linear"):
+        starts = {n: [State.of(*x, data) for x in grid_starts(data.parts, n, _REFINED, fitting.dt)] for n in tried}
+        base = _choose_states(
+            fitting, starts, linear, patience=MOST_STATES, clear=_CLEAR, stage="linear part", iterations=most
+        )
+        if base is None:
+            return
+        fitting.take(base)
+    with fitting.stage("choice of units"):
+        neurons = _choose_units(fitting, base.state, choice) if len(units) > 1 else units[0]
+    with fitting.stage("training"):
+        trained = _train_units(s, base.state, data, neurons, [fitting.seed, neurons], last) if neurons else []
+        if trained:
+            train(trained[0].state, data, stage="hidden layer", iterations=_LAST * most, fitting=fitting)
     size = float(np.std(np.concatenate([y for y, _ in data.parts])))
     fitting.curves = [replace(c, training=c.training / max(size, 1e-300)) for c in fitting.curves]
-    fitting.timed("training", began)
 
 
-def _choose_units(s: Mapping[str, Any], fitting: Fitting, linear: State, seed: int, tick: Tick | None) -> int:
+def _choose_units(fitting: Fitting, linear: State, tick: Tick | None) -> int:
     """Number of hidden units by the runs that go on behind the parts of the records that are trained on."""
-    data, squares = fitting.data, np.zeros(_MOST_UNITS + 1)
+    s, data, squares = fitting.settings, fitting.data, np.zeros(_MOST_UNITS + 1)
     parts = iter(portions(tick, [k for _ in _FOLDS for k in range(1, _MOST_UNITS + 1)]))
     for share in _FOLDS:
         cut = [round(share * y.shape[0]) for y, _ in data.parts]
@@ -369,7 +362,7 @@ def _choose_units(s: Mapping[str, Any], fitting: Fitting, linear: State, seed: i
         base = linear if found is None else found.state
         squares[0] += _error_ahead(base, data, cut) ** 2
         for neurons in range(1, _MOST_UNITS + 1):
-            trained = _train_units(base, fewer, neurons, s, seed, next(parts))
+            trained = _train_units(s, base, fewer, neurons, [fitting.seed, neurons], next(parts))
             squares[neurons] += _error_ahead(trained[0].state, data, cut) ** 2 if trained else np.inf
     errors = np.sqrt(squares / len(_FOLDS))
     fitting.details["held_out"] = [{"neurons": k, "error": float(e)} for k, e in enumerate(errors) if np.isfinite(e)]
@@ -392,56 +385,38 @@ def _error_ahead(at: State, data: Scaled, cut: list[int]) -> float:
     return size if np.isfinite(size) else np.inf
 
 
-def _train_units(
-    base: State, data: Scaled, neurons: int, s: Mapping[str, Any], seed: int, tick: Tick | None
-) -> list[Training]:
-    """Several random starts of a hidden layer, the best first; units have no effect at first."""
-    begun = [add_units(base, neurons, float(s["prior"]), [seed, neurons, k]) for k in range(int(s["starts"]))]
-    return train_each(begun, data, tick, stage="hidden layer", iterations=int(s["iterations"]))
-
-
 # --- rescue ----------------------------------------------------------------------------------------------------------
 
 
-def _rescue(
-    s: Mapping[str, Any],
-    whole: Scaled,
-    record: IOData,
-    fitting: Fitting,
-    seed: int,
-    tick: Tick | None,
-    reason: str,
-    *,
-    asked: bool,
-) -> str:
+def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, asked: bool) -> str:
     """Search globally where ordinary starts failed, and train what was found; return what is left of the reason.
 
     Where the search was `asked` for, errors that are suspect are enough.
     """
-    before, why = fitting.state, reason
+    s, before, why = fitting.settings, fitting.state, reason
     if before is not None:
         left = misfit(before, fitting.data)
         if left.failed or (asked and left.suspect):
             why = str(left)
     if not why or s["form"] != "one-axis" or not s["evaluations"]:
         return reason
-    began, second = perf_counter(), Fitting(data=fitting.data, delay=fitting.delay)
+    second = replace(fitting, state=None, rivals=[], curves=[], details={}, timing_s={})
     try:
-        second.state, found = search_start(
-            fitting.data, record.dt, _heads(record), seed=seed, evaluations=int(s["evaluations"]),
-            tick=part_of(tick, *_RESCUE) or silent,
-        )  # fmt: skip
-        if second.state is not None:
-            if "delay" not in s:
-                _find_delay(s, second.state, whole, second, None)
-                if second.delay != fitting.delay:
-                    again = State.of(second.state.layout, second.state.theta, second.data)
-                    second.state = add_gain(again, second.data, second.state.K) or second.state
-            _train_all({**s, "descent": 0}, second, seed, part_of(tick, *_AGAIN))
+        with fitting.stage("global search"):
+            second.state, found = search_start(
+                fitting.data, fitting.dt, _heads(fitting), seed=fitting.seed, evaluations=int(s["evaluations"]),
+                tick=part_of(tick, *_RESCUE) or silent,
+            )  # fmt: skip
+            if second.state is not None:
+                if "delay" not in s:
+                    _find_delay(second, second.state, None)
+                    if second.delay != fitting.delay:
+                        again = State.of(second.state.layout, second.state.theta, second.data)
+                        second.state = add_gain(again, second.data, second.state.K) or second.state
+                _train_all(second, part_of(tick, *_AGAIN), descent=False)
     except KeyboardInterrupt:
         fitting.state = second.state if _is_better(second.state, before) else before
         raise
-    fitting.timed("global search", began)
     after = second.state
     better = _is_better(after, before)
     fitting.details["global_search"] = {
@@ -461,18 +436,17 @@ def _rescue(
     return ""
 
 
-def _suspect(s: Mapping[str, Any], fitting: Fitting) -> list[str]:
-    """Say so where a linear regression finds more in the errors than chance puts there."""
-    assert fitting.state is not None
-    left = misfit(fitting.state, fitting.data)
-    if not left.suspect:
-        return []
-    searchable = s["form"] == "one-axis" and "global_search" not in fitting.details
-    return [
-        f"{left}: the training ended in a wrong minimum, or the plant has more to it than this network"
-        + (". Say evaluations=2000 for a global search" if searchable else "")
-    ]
-
-
 def _is_better(after: State | None, before: State | None) -> bool:
     return after is not None and (before is None or after.score < before.score - _BETTER)
+
+
+def _caution(fitting: Fitting) -> None:
+    """Warn where a linear regression finds more in the errors than chance puts there."""
+    left = None if fitting.state is None else misfit(fitting.state, fitting.data)
+    if left is None or not left.suspect:
+        return
+    searchable = fitting.settings["form"] == "one-axis" and "global_search" not in fitting.details
+    more = ". Say evaluations=2000 for a global search" if searchable else ""
+    fitting.warnings.append(
+        f"{left}: the training ended in a wrong minimum, or the plant has more to it than this network{more}"
+    )

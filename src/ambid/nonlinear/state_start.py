@@ -25,7 +25,7 @@ from ambid.estimation.progress import Tick, guessed, silent
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Parts, Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout
-from ambid.nonlinear.state_training import State, add_gain, train
+from ambid.nonlinear.state_training import State, add_gain, shift_inputs, train
 from ambid.signals.delay import find_delay as delay
 
 NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
@@ -235,13 +235,6 @@ def pole_grid(n: int) -> list[Array]:
 
 
 # --- delay -----------------------------------------------------------------------------------------------------------
-
-
-def shift_inputs(data: Scaled, delay: int) -> Scaled:
-    """Put each output beside the input that acts at its time, `delay` samples late."""
-    if not delay:
-        return data
-    return replace(data, parts=tuple((y[delay:], u[:-delay]) for y, u in data.parts))
 
 
 def guess_delay(data: Scaled) -> int:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ _SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
 _FIRST = 3  # iterations for what units put out, before what they see is searched for
 _ENOUGH = 1e-3  # gain that ends a search: a step of 0.03 standard deviations
 _PAST = 10  # samples of errors and inputs that a regression of the errors looks at
+_PRIOR, _PRIOR_MAGNITUDE = 3.0, 1.0  # deviation of hidden weights before the data, scaled; the second without sign
 _LEAST = 1e-7  # deviation of errors, in that of the outputs: less is rounding
 _FAR = 0.3  # part of the errors' variance that a linear regression may explain before a fit counts as failed ..
 _SUSPECT = 0.005  # .. and from which it is worth a warning, if it is more than chance
@@ -132,10 +132,28 @@ class Training:
 class Fitting(Attempt):
     """What a fit has come to."""
 
+    records: Sequence[IOData]
+    settings: Mapping[str, Any]
+    seed: int
+    whole: Scaled
     data: Scaled  # each output beside the input that acts at its time
     delay: int = 0
     state: State | None = None  # the best network so far; None before the first
     rivals: list[State] = field(default_factory=list)  # what every start of a hidden layer came to
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in s."""
+        return self.records[0].dt
+
+    @property
+    def counts_states(self) -> bool:
+        """Whether the number of states is to be chosen."""
+        return self.settings["form"] == "free" and "states" not in self.settings
+
+    def shift(self, delay: int) -> None:
+        """Put each output beside the input that acts at its time, `delay` samples late."""
+        self.delay, self.data = delay, shift_inputs(self.whole, delay)
 
     def take(self, found: Training) -> None:
         """Take over a learning curve, and the network if it is better, or has units or a gain that the last had not."""
@@ -144,6 +162,13 @@ class Fitting(Attempt):
         kinds = [(x.layout.neurons, x.layout.gain) for x in (at, now) if x is not None]
         if now is None or kinds[0] != kinds[1] or at.score < now.score:
             self.state, self.status = at, "converged" if found.converged else "stalled"
+
+
+def shift_inputs(data: Scaled, delay: int) -> Scaled:
+    """Put each output beside the input that acts at its time, `delay` samples late."""
+    if not delay:
+        return data
+    return replace(data, parts=tuple((y[delay:], u[:-delay]) for y, u in data.parts))
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -240,7 +265,7 @@ def add_gain(state: State, data: Scaled, K: Array) -> State | None:
     return best
 
 
-def add_units(state: State, neurons: int, prior: float, seed: list[int]) -> State:
+def add_units(state: State, neurons: int, seed: list[int]) -> State:
     """Put a hidden layer on the physics, in place of one that may be there, with random directions and no effect."""
     new = state.widen(neurons=0).widen(neurons=neurons)
     layout, rng = new.layout, np.random.default_rng(seed)
@@ -248,7 +273,7 @@ def add_units(state: State, neurons: int, prior: float, seed: list[int]) -> Stat
     size = 1.0 if layout.sensor else np.sqrt(layout.n + layout.n_inputs)
     new.theta[k : k + n_W1] = rng.standard_normal(n_W1) / size
     new.theta[k + n_W1 : k + n_W1 + n_b1] = rng.standard_normal(n_b1)
-    return replace(new, prior=prior)
+    return replace(new, prior=_PRIOR_MAGNITUDE if layout.sensor else _PRIOR)
 
 
 # --- judgement -------------------------------------------------------------------------------------------------------
@@ -311,14 +336,12 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
 # --- standard deviations ---------------------------------------------------------------------------------------------
 
 
-def _estimate_spread(
-    fitting: Fitting, state: State, how: str, seed: int, tick: Tick | None
-) -> tuple[Array | None, str]:
+def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple[Array | None, str]:
     """Covariance of trained weights in the units of the model's, the first states counted, and where it is from.
 
     What a reader must be told of it goes to the warnings.
     """
-    data = fitting.data
+    data, how = fitting.data, fitting.settings["uncertainty"]
     problem, v = state.problem(data), state.vector
     P, fitting.details["condition"] = information_inverse(problem.triangle(v)[:, :-1])
     reason = ""
@@ -341,7 +364,7 @@ def _estimate_spread(
     assert P is not None
     origin = "laplace" if state.layout.neurons else "information"
     if how == "bootstrap":
-        P, origin = bootstrapped(problem.sample_rows(v), problem.prior_rows(v), seed, tick), "bootstrap"
+        P, origin = bootstrapped(problem.sample_rows(v), problem.prior_rows(v), fitting.seed, tick), "bootstrap"
     elif how == "sandwich" or (how == "auto" and not is_white(state, data)):
         robust = sandwich_at(problem, v)
         assert robust is not None
@@ -385,24 +408,16 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
 # --- the fit ---------------------------------------------------------------------------------------------------------
 
 
-def finish(
-    records: Sequence[IOData],
-    used: Mapping[str, Any],
-    fitting: Fitting,
-    reason: str,
-    *,
-    seed: int,
-    how: str = "laplace",
-    tick: Tick | None = None,
-) -> NonlinearFit:
+def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
     """Return the fit of a trained network; failed where there is none, or none that runs on its own records.
 
-    `used` are the settings, `how` is where standard deviations come from, `reason` why there is no network.
+    `reason` says why there is no network.
     """
-    state, data = fitting.state, fitting.data
+    state, data, records, seed = fitting.state, fitting.data, fitting.records, fitting.seed
+    used = {"states": 0, "neurons": 0, **fitting.settings, "delay": fitting.delay}
     if state is None:
-        return failed_fit("nn", records, {"states": 0, **used}, seed, reason, fitting.timing_s)
-    used = {**used, "states": state.layout.n}
+        return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
+    used |= {"states": state.layout.n, "neurons": state.layout.neurons}
     state = state.at(state.problem(data), state.vector)
     model = None if state is None else _make_model(records, data, state, fitting.delay)
     if state is None or model is None:
@@ -414,9 +429,8 @@ def finish(
             "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
             f"records are open loop: {way_out}--open-loop if there was no feedback"
         )
-    began = perf_counter()
-    covariance, origin = _estimate_spread(fitting, state, how, seed, tick)
-    fitting.timed("standard deviations", began)
+    with fitting.stage("standard deviations"):
+        covariance, origin = _estimate_spread(fitting, state, tick)
     fitting.timing_s["all"] = sum(fitting.timing_s.values())
     freedom = max(state.n_rows - state.layout.n_theta / state.layout.p, 1.0)
     noise = state.noise * state.n_rows / freedom
