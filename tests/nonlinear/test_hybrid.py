@@ -10,8 +10,7 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.estimation.search import search
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.hybrid import hybrid
-from ambid.nonlinear.hybrid_choice import HybridFunction, choose_noise, hybrid_problem
+from ambid.nonlinear.hybrid import HybridFunction, choose_noise, hybrid, hybrid_problem
 from ambid.nonlinear.lagged import LaggedModel
 from ambid.nonlinear.lagged_problem import laplace
 from ambid.nonlinear.narmax import narmax
@@ -104,8 +103,8 @@ def test_standard_deviations_are_those_of_repeated_records() -> None:
 
 def test_without_neurons_it_is_narmax() -> None:
     data = polynomial(1500, 0)
-    settings = {"ny": 2, "nu": 2, "ne": 1, "selection": "frols"}
-    one, same = narmax([data], settings), hybrid([data], {**settings, "neurons": 0})
+    settings = {"ny": 2, "nu": 2, "ne": 1}
+    one, same = narmax([data], {**settings, "selection": "frols"}), hybrid([data], {**settings, "neurons": 0})
     a, b = coefficients(one), coefficients(same)
     assert set(a) == set(b)
     for name, (value, sd) in a.items():
@@ -129,15 +128,15 @@ def test_a_polynomial_truth_gets_no_neurons_and_is_told() -> None:
     assert [x["neurons"] for x in found.details["tried"]][:3] == [0, 1, 2]
 
 
-@pytest.mark.parametrize(("p", "m", "deep"), [(1, 1, False), (1, 1, True), (2, 1, False), (2, 2, True)])
-def test_slopes_through_the_innovations_are_exact(p: int, m: int, deep: bool) -> None:
+@pytest.mark.parametrize(("p", "m"), [(1, 1), (2, 1), (2, 2)])
+def test_slopes_through_the_innovations_are_exact(p: int, m: int) -> None:
     rng = np.random.default_rng(3)
     y1, y2, u1 = Factor("y", 0, 1), Factor("y", p - 1, 2), Factor("u", m - 1, 3)  # a lag that the network does not see
     terms = tuple((tuple(sorted((y1, y1))), (u1,), tuple(sorted((y2, u1))))[: 3 - o] for o in range(p))
-    of = HybridFunction(terms=terms, ne=2, p=p, m=m, ny=2, nu=2, nk=0, neurons=3, deep=deep)
+    of = HybridFunction(terms=terms, ne=2, p=p, m=m, ny=2, nu=2, nk=0, neurons=3)
     theta, y, u = 0.3 * rng.standard_normal(of.n_theta), rng.standard_normal((200, p)), rng.standard_normal((200, m))
     rows = of.rows(y, u)
-    assert of.affine != deep
+    assert of.affine
     assert len(set(of.names)) == of.n_theta
     D = of.slopes(theta, of.predict(theta, rows)[1], free=False)
     for k in range(of.n_theta):
@@ -197,7 +196,7 @@ def test_the_order_of_the_noise_model_pays_for_all_outputs_and_is_paid_by_all() 
     for c in (0.15, 0.0):
         for seed in range(6):
             problem = hybrid_problem(two_lags(ne=0), (two_axes(1000, seed, c * np.eye(2), 0.0),), start, 3.0)
-            orders.append(choose_noise(problem, start, 3.0, "ebic", None)[0].ne)
+            orders.append(choose_noise(problem, start, 3.0, None)[0].ne)
     assert orders[:6].count(1) >= 5  # gain about 2 n c^2 = 45, price 4 log n = 28
     assert orders[6:].count(0) == 6
 
@@ -209,7 +208,7 @@ def test_feedback_does_no_harm_where_the_noise_model_is_right() -> None:
     assert not any("biased" in w for w in found.warnings)
     for name, truth in TRUTH.items():
         assert abs(values[name][0] - truth) < 4 * values[name][1], name
-    without = hybrid([data], {"neurons": 1, "ne": 0, "pruning": "none", "selection": "all"})
+    without = hybrid([data], {"neurons": 1, "ne": 0})
     assert any("biased" in w for w in without.warnings)
     value, sd = readable(without)["y(t-2)"]
     assert abs(value + 0.2) > 4 * sd  # the bias that the noise model takes away
@@ -259,21 +258,6 @@ def test_spare_neurons_take_no_term_away_and_leave_no_deviations() -> None:
         assert any("units to spare" in w for w in found.warnings)
         assert lean.covariance is not None
         np.testing.assert_allclose(found.noise_covariance, lean.noise_covariance, rtol=0.05)
-
-
-def test_innovations_may_enter_the_network() -> None:
-    """Noise that saturates: C alone sees its mean slope."""
-    rng = np.random.default_rng(5)
-    n = 3000
-    u, y, e = rng.uniform(-1, 1, n), np.zeros(n), rng.standard_normal(n)
-    for t in range(1, n):
-        y[t] = 0.4 * y[t - 1] + u[t - 1] + e[t] + 0.9 * np.tanh(3 * e[t - 1])
-    data = record(u, y)
-    told = {"ne": 1, "neurons": 1, "ny": 1, "nu": 1}
-    linear, deep = hybrid([data], told), hybrid([data], {**told, "innovations": "network"})
-    assert deep.noise_covariance[0, 0] == pytest.approx(1.0, rel=0.08)
-    assert linear.noise_covariance[0, 0] > 1.05 * deep.noise_covariance[0, 0]
-    assert "unit 1: e(t-1)" in model_of(deep).names
 
 
 def test_two_outputs_two_inputs_and_two_records() -> None:
@@ -355,9 +339,6 @@ def test_settings_that_make_no_sense_are_refused() -> None:
         hybrid([data], {"ny": 0, "nu": 0})
     with pytest.raises(EstimationError, match="neurons"):
         hybrid([data], {"neurons": "many"})
-    for void in ("ne", "neurons"):
-        with pytest.raises(EstimationError, match="innovations"):
-            hybrid([data], {"innovations": "network", void: 0})
     with pytest.raises(EstimationError, match="no record"):
         hybrid([], {})
     with pytest.raises(EstimationError, match="hybrid: record 1"):

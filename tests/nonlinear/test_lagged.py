@@ -157,20 +157,19 @@ def test_a_linear_filter_of_the_innovations_is_the_recursion() -> None:
 @pytest.mark.parametrize("free", [False, True])
 def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior(free: bool) -> None:
     f = Rational(bends=False)
-    theta, (y, u), held = gentle(f), signals(f, 5000), np.arange(5000) < 4950
+    theta, (y, u) = gentle(f), signals(f, 5000)
     precision = np.arange(f.n_theta) / 3.0
-    counted = (held, np.ones(50, dtype=bool))
-    at = problem_at(f, ((y, u), (y[:50], u[:50])), theta, precision, free=free, counted=counted)
+    at = problem_at(f, ((y, u), (y[:50], u[:50])), theta, precision, free=free)
     at = replace(at, weight=np.array([[0.5, 0.0], [-1.5, 2.0]]))
     R, whole = at.triangle(theta), []
-    for (ys, us), counts in zip(at.parts, counted, strict=True):
+    for ys, us in at.parts:
         if free:
             run, z = f.free_run(theta, ys, us)
             rows, left = f.rows_of(z, ys), (ys - run)[f.lag :]
         else:
             found, rows = f.predict(theta, f.rows(ys, us))
             left = ys[f.lag :] - found
-        both = np.dstack([f.slopes(theta, rows, free=free), left])[counts[f.lag :]]
+        both = np.dstack([f.slopes(theta, rows, free=free), left])
         whole.append(np.einsum("op,tpk->tok", at.weight, both).reshape(-1, theta.size + 1))
     whole.append(np.hstack([np.diag(precision), -(precision * theta)[:, None]]))
     rows_ = np.concatenate(whole)

@@ -9,8 +9,8 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.lagged_problem import problem_at
-from ambid.nonlinear.narx import NarxFunction, narx, solve_linear
+from ambid.nonlinear.lagged_problem import problem_at, solve_linear
+from ambid.nonlinear.narx import NarxFunction, narx
 
 
 def data(u: np.ndarray, y: np.ndarray) -> IOData:
@@ -40,7 +40,8 @@ def test_the_linear_numbers_are_at_their_best_for_the_units() -> None:
     parts = tuple((rng.standard_normal((n, 2)), rng.standard_normal((n, 1))) for n in (50, 5000))
     theta = rng.standard_normal(function.n_theta)
     problem = replace(problem_at(function, parts, theta, function.precision(0.2)), weight=np.diag([1.5, 0.3]))
-    best, n = solve_linear(problem, theta), function.n_linear
+    n = function.n_linear
+    best = solve_linear(problem, n, theta)
     np.testing.assert_array_equal(best[n:], theta[n:])
     R = problem.triangle(best)
     slope = R[:, :-1].T @ R[:, -1]

@@ -87,7 +87,7 @@ def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.nonlinear.polynomial:PolynomialFunction.read_model",
-        "hybrid": "ambid.nonlinear.hybrid_choice:HybridFunction.read_model",
+        "hybrid": "ambid.nonlinear.hybrid:HybridFunction.read_model",
         "rbf": "ambid.nonlinear.rbf_network:read_model",
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",

@@ -1,50 +1,239 @@
 """Hybrid NARMAX and network from records, by prediction errors (thesis eqs 3.23, 3.24).
 
+yhat(t) = P(y, u) theta + W2 tanh(W1 z + b1) + (C(q^-1) - 1) e(t), z = [y(t-1).., u(t-nk)..], with C the polynomial
+1 + C1 q^-1 + .. of `ne` matrices.
+
 Polynomial and noise terms by orthogonal least squares (`narmax`) -> number of neurons by held-out errors -> network on
 what they leave, from several starts -> all numbers together by Levenberg-Marquardt with exact slopes through the
 innovations -> terms that no longer pay, order of C -> covariance by Laplace's approximation.
+
+The hidden layer's weights are N(0, prior^2) before the data (scaled signals), coefficients of the polynomial and of C
+have no prior: what the polynomial can do costs nothing, so that it is not left to the network. C keeps its roots inside
+the unit circle because a vector with a root outside has an infinite cost: such a step is refused, and a shorter one
+tried.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.progress import Tick, portions
+from ambid.estimation.criteria import penalty
+from ambid.estimation.linear import information_inverse
+from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.blocks import Tanh
+from ambid.nonlinear.blocks import Block, Linear, Table, Tanh
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.hybrid_choice import (
-    SHARED,
-    HybridFunction,
-    HybridSettings,
-    choose_neurons,
-    choose_noise,
-    hybrid_problem,
-    hybrid_settings,
-    inflation,
-    make_invertible,
-    revise,
-    train_network,
-    transfer,
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
+from ambid.nonlinear.lagged_problem import (
+    Draft,
+    LaggedProblem,
+    Laplace,
+    choose_smallest,
+    column_gains,
+    draw_start,
+    finish,
+    guarded,
+    laplace,
+    problem_at,
+    rms_error,
+    solve_linear,
+    split,
 )
-from ambid.nonlinear.lagged import LaggedModel
-from ambid.nonlinear.lagged_problem import Draft, LaggedProblem, Laplace, finish, guarded, laplace
-from ambid.nonlinear.narmax import narmax
-from ambid.nonlinear.polynomial import PolynomialFunction, is_noisy, lagged, term_name
-from ambid.nonlinear.records import Scaled, scaled_records
+from ambid.nonlinear.narmax import DIVERGED, narmax
+from ambid.nonlinear.polynomial import (
+    Factor,
+    PolynomialFunction,
+    Term,
+    block_of,
+    column_of,
+    is_noisy,
+    lagged,
+    products,
+    term_name,
+    terms_from_json,
+    terms_to_json,
+    unit_of,
+)
+from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.settings import number, read_settings, whole
 
+MOST_NOISE = 4  # largest order of C that is tried where it is left open
+_NEURONS = (0, 1, 2, 4, 8)
+_AS_GOOD = 1.01
+_FEWEST = 20  # held-out samples by which neurons are chosen
+_MOST_ROWS = 6000  # that the choice of neurons looks at
+_STARTED_ON = 12000  # rows from which starts are trained
+_ROUGH: dict[str, Any] = {"most": 12, "enough": 0.01}  # iterations, and a gain of the cost that no choice depends on
 _ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
+_MOST_STEPS = 40  # of a revision of the terms
+_MOST_CANDIDATES = 400  # beyond, nothing is added: slopes by all of them at once would be too many
+_SHARED = 10.0  # times a standard deviation grows by the network, from which on a term's value is not its own
 _NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
-_DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HybridSettings:
+    """Settings of a hybrid fit."""
+
+    ny: int = whole("largest lag of the outputs; 2", 0, 50, 2)
+    nu: int = whole("number of lags of each input; 2", 0, 50, 2)
+    nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
+    ne: int | None = whole("order of C; chosen by ebic, 4 at most", 0, 20)
+    degree: int = whole("of the polynomial; 2", 1, 9, 2)
+    neurons: int | None = whole("hidden units, 0 for none; chosen by held-out error, 8 at most", 0, 60)
+    starts: int = whole("random starts of the network; 3", 1, 50, 3)
+    held_out: float = number(
+        "part at the end of each record by which the number of neurons is chosen; 0.2", 0.05, 0.5, 0.2
+    )
+    prior: float = number(
+        "standard deviation of the network's weights before the data, scaled signals; 3", 0.01, 1e6, 3.0
+    )
+    iterations: int = whole("of each training, at most; 60", 1, 2000, 60)
+
+    @property
+    def lag(self) -> int:
+        """Samples of the past that a model may look at."""
+        ne = MOST_NOISE if self.ne is None else self.ne
+        return max(self.ny, self.nk + self.nu - 1 if self.nu else 0, ne, 1)
+
+    @property
+    def polynomial(self) -> dict[str, int | float | str | tuple[int, ...]]:
+        """Settings of the polynomial's estimator."""
+        same = {k: getattr(self, k) for k in ("ny", "nu", "nk", "degree")}
+        return {**same, "ne": 2 if self.ne is None else self.ne, "selection": "frols"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HybridFunction(LaggedFunction):
+    """Terms and sizes of a hybrid model."""
+
+    kind: ClassVar[str] = "hybrid"
+    title: ClassVar[str] = "hybrid"
+    terms: tuple[tuple[Term, ...], ...]  # of the polynomial, by output, without innovations
+    ne: int  # order of C
+    p: int  # outputs
+    m: int  # inputs
+    ny: int  # lags of every output and of every input, and the first lag of the inputs, that the hidden layer sees
+    nu: int
+    nk: int
+    neurons: int
+
+    @cached_property
+    def width(self) -> int:
+        """Regressors that the hidden layer sees, which come first."""
+        return self.p * self.ny + self.m * self.nu
+
+    @cached_property
+    def regressors(self) -> Regressors:
+        """What the network sees, innovations, then whatever else the terms look at."""
+        x = lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk, ne=self.ne)
+        known = set(zip(x.column.tolist(), x.back.tolist(), strict=True))
+        factors = {(column_of(f, self.p, self.m), f.lag) for _, _, term in self.owned for f in term}
+        more = np.array(sorted(factors - known), dtype=np.int64).reshape(-1, 2)
+        column, back = np.append(x.column, more[:, 0]), np.append(x.back, more[:, 1])
+        return Regressors(n_outputs=self.p, n_inputs=self.m, column=column, back=back)
+
+    @property
+    def owned(self) -> tuple[tuple[int, int, Term], ...]:
+        """Output, 0, and term of each coefficient of the polynomial."""
+        return tuple((o, 0, term) for o, one in enumerate(self.terms) for term in one)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Polynomial, C, hidden layer."""
+        return (
+            block_of(self.regressors, self.owned),
+            Linear.over(self.p, slice(self.width, self.width + self.p * self.ne), constant=False),
+            Tanh(n_outputs=self.p, width=self.width, neurons=self.neurons),
+        )
+
+    @property
+    def in_cloud(self) -> slice | Table:
+        """What the hidden layer sees."""
+        return slice(0, self.width)
+
+    @property
+    def n_terms(self) -> int:
+        """Numbers of the polynomial, which come first."""
+        return int(self.edges[1])
+
+    @property
+    def n_linear(self) -> int:
+        """Numbers of the polynomial and of C."""
+        return int(self.edges[2])
+
+    @property
+    def noise_terms(self) -> tuple[Term, ...]:
+        """Past innovations as terms, in the order of the columns of C."""
+        return tuple((Factor("e", q, k),) for k in range(1, self.ne + 1) for q in range(self.p))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        out = channel_names("y", self.p)
+        before = [f"{name}: " if self.p > 1 else "" for name in out]
+        found = [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.terms[o]]
+        found += [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.noise_terms]
+        z = self.regressors.names[: self.width]
+        found += [f"{name}: unit {k + 1}" for name in out for k in range(self.neurons)]
+        found += [f"unit {k + 1}: {x}" for k in range(self.neurons) for x in z]
+        return (*found, *(f"unit {k + 1}: 1" for k in range(self.neurons)))
+
+    def unit(self, y_scale: Array, u_scale: Array) -> Array:
+        """Coefficients of the polynomial and of C are in SI; weights of the network stay scaled."""
+        owned = (*self.owned, *((o, 0, x) for o in range(self.p) for x in self.noise_terms))
+        return np.concatenate([unit_of(owned, y_scale, u_scale), np.ones(self.n_theta - self.n_linear)])
+
+    def noise_radius(self, theta: Array) -> float:
+        """Return the largest magnitude of a root of C: below 1 the predictor forgets how it began."""
+        p, m = self.p, self.p * self.ne
+        if not m:
+            return 0.0
+        F = np.zeros((m, m))
+        F[:p] = -theta[self.n_terms : self.n_linear].reshape(p, m)
+        F[p:, : m - p] = np.eye(m - p)
+        return float(np.max(np.abs(np.linalg.eigvals(F)))) if np.all(np.isfinite(F)) else float("inf")
+
+    def is_stable(self, theta: Array) -> bool:
+        """Whether the roots of C are inside the unit circle."""
+        return self.noise_radius(theta) < 1.0
+
+    def make_invertible(self, theta: Array) -> Array:
+        """Return numbers whose C is invertible: where it is not, all its roots are drawn in by one factor."""
+        if self.is_stable(theta):
+            return theta
+        radius, out = self.noise_radius(theta), theta.copy()
+        C = theta[self.n_terms : self.n_linear].reshape(self.p, -1)
+        factor = (0.95 / radius) ** (1 + np.arange(C.shape[1]) // self.p) if np.isfinite(radius) else 0.0
+        out[self.n_terms : self.n_linear] = np.where(np.isfinite(C), C, 0.0).ravel() * np.tile(factor, self.p)
+        return out
+
+    def precision(self, prior: float) -> Array:
+        """Return one over the prior's standard deviation of every number; 0 for the polynomial and C."""
+        return np.where(np.arange(self.n_theta) < self.n_linear, 0.0, 1.0 / prior)
+
+    def as_json(self) -> dict[str, Any]:
+        """As `LaggedFunction.as_json`."""
+        sizes = {"n_outputs": self.p, "n_inputs": self.m, "ny": self.ny, "nu": self.nu, "nk": self.nk}
+        return {"terms": terms_to_json(self.terms), "ne": self.ne, "sizes": {**sizes, "neurons": self.neurons}}
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back."""
+        sizes = {k: int(v) for k, v in found["sizes"].items()}
+        p, m, ne = sizes.pop("n_outputs"), sizes.pop("n_inputs"), found["ne"]
+        if not isinstance(ne, int) or ne < 0:
+            raise ValueError("ne is no order")
+        return cls(terms=terms_from_json(found["terms"], p, m), ne=ne, p=p, m=m, **sizes)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -72,9 +261,15 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     """
     if not records:
         raise EstimationError("hybrid: no record is given. Pass one at least")
-    s = hybrid_settings(settings, n_inputs=records[0].n_inputs)
+    s = read_settings(HybridSettings, "hybrid", settings)
+    if not records[0].n_inputs:
+        s = replace(s, nu=0, nk=1)
+    if not s.ny and not s.nu:
+        raise EstimationError("hybrid: ny and nu are both 0; nothing is left to predict from. Raise one of them")
     data = scaled_records("hybrid", records, lag=s.lag, levels="auto", fewest=10)
-    ticks = portions(tick, _costs(s))
+    h = float(s.neurons if s.neurons is not None else 4)
+    choice, order = 100.0 * (s.neurons is None), 3.0 * (s.ne is None)
+    ticks = portions(tick, (3.0, 1.0, choice, 2 + h, 2 + h, 2 + h, order, 1 + h))
     began = perf_counter()
     first = narmax(records, s.polynomial, seed=seed, tick=ticks[0])
     timing = {"polynomial": perf_counter() - began}
@@ -82,10 +277,9 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
         return failed_fit("hybrid", records, asdict(s), seed, first.reason, timing)
     draft = _polynomial(s, first, first.model)
     draft.timing_s.update(timing)
-    interrupted = any(w.startswith("interrupted") for w in first.warnings)
 
     def identify() -> None:
-        if interrupted:
+        if any(w.startswith("interrupted") for w in first.warnings):
             raise KeyboardInterrupt
         _identify(s, data, draft, seed, ticks[1:])
         if draft.status == "stalled":
@@ -95,12 +289,6 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     return failed or _finish(s, records, data, draft, seed)
 
 
-def _costs(s: HybridSettings) -> tuple[float, ...]:
-    """What the parts of a fit are expected to take, of each other: as `_identify` goes through them."""
-    h = float(s.neurons if s.neurons is not None else 4)
-    return 3.0, 1.0, 100.0 if s.neurons is None else 0.0, 2 + h, 2 + h, 2 + h, 3.0 if s.ne is None else 0.0, 1 + h
-
-
 def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _Hybrid:
     """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
     assert isinstance(model.function, PolynomialFunction)
@@ -108,22 +296,18 @@ def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _
     ne = max((f.lag for _, _, x in model.function.owned for f in x if f.kind == "e"), default=0)
     function = HybridFunction(
         terms=terms, ne=ne if s.ne is None else s.ne, p=model.n_outputs, m=model.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk,
-        neurons=0, deep=s.innovations == "network",
+        neurons=0,
     )  # fmt: skip
     known = dict(zip(model.names, model.scaled_theta, strict=True))
     start = np.array([known.get(name, 0.0) for name in function.names], dtype=np.float64)
-    theta, factor = make_invertible(function, start)
     chosen: Any = first.details["terms"]
     return _Hybrid(
         function=function,
-        theta=theta,
+        theta=function.make_invertible(start),
         err={(out, x["term"]): x["err"] for out, own in chosen.items() for x in own},
         curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
-        details={
-            "candidates": first.details["candidates"], "added_beside_the_network": [],
-            "left_out_beside_the_network": [], "tried": [], "drawn_in": factor,
-        },
-    )  # fmt: skip
+        details={"candidates": first.details["candidates"], "tried": []},
+    )
 
 
 def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks: list[Tick | None]) -> None:
@@ -131,44 +315,33 @@ def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks:
     lean = _lean(draft.model)
     draft.function = lean
     _search(s, data, draft, "polynomial and noise model", ticks[0])
-    full, start = _prepare(s, lean, draft.theta)
+    # all regressors of the network are in the polynomial too: it shall not do what is linear
+    linear = tuple((f,) for f in lagged(lean.p, lean.m, ny=s.ny, nu=s.nu, nk=s.nk, ne=0))
+    full = replace(lean, ny=s.ny, nu=s.nu, terms=tuple((*t, *(x for x in linear if x not in t)) for t in lean.terms))
+    start = transfer(lean, draft.theta, full)
     neurons = s.neurons
     if neurons is None:
-        neurons, tried = choose_neurons(s, full, start, data.parts, seed, ticks[1])
-        draft.details["tried"] = tried
+        neurons = _choose_neurons(s, full, start, data.parts, draft, seed, ticks[1])
         if not neurons:
-            why = "predicts held-out data as well as with a network" if tried else "is all that so few samples carry"
-            draft.warnings.append(f"the polynomial alone {why}: no neurons were added")
+            few, as_well = "is all that so few samples carry", "predicts held-out data as well as with a network"
+            draft.warnings.append(
+                f"the polynomial alone {as_well if draft.details['tried'] else few}: no neurons were added"
+            )
     began = draft.timed("choice of neurons", began)
     if neurons:
         function = replace(full, neurons=neurons)
-        theta, found, alone = train_network(s, function, start, data.parts, seed, ticks[2])
+        theta = train(s, function, start, data.parts, seed, s.starts, ticks[2], draft)
         draft.take(function, theta)
-        draft.note(found, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
         problem = _search(s, data, draft, "all together", ticks[3])
-        if s.pruning == "prediction":
-            revise(s, problem.at(draft.theta), draft.theta, draft.take, ticks[4])
-            old, new = (x.names[: x.n_terms] for x in (lean, draft.model))
-            draft.details["added_beside_the_network"] = [x for x in new if x not in old]
-            draft.details["left_out_beside_the_network"] = [x for x in old if x not in new]
+        _revise(s, problem.at(draft.theta), draft, ticks[4])
     if s.ne is None:
         problem = hybrid_problem(draft.model, data.parts, draft.theta, s.prior)
-        draft.take(*choose_noise(problem, draft.theta, s.prior, s.criterion, ticks[5]))
+        draft.take(*choose_noise(problem, draft.theta, s.prior, ticks[5]))
         if not neurons:
             function = _lean(draft.model)
             draft.take(function, transfer(draft.model, draft.theta, function))
     _search(s, data, draft, "all together", ticks[6])
     draft.timed("all together", began)
-
-
-def _prepare(s: HybridSettings, lean: HybridFunction, theta: Array) -> tuple[HybridFunction, Array]:
-    """The function that a network joins, all its regressors in the polynomial too: it shall not do what is linear."""
-    function = replace(lean, ny=s.ny, nu=s.nu)
-    if s.pruning == "none":
-        return function, theta
-    linear = tuple((f,) for f in lagged(function.p, function.m, ny=s.ny, nu=s.nu, nk=s.nk, ne=0))
-    function = replace(function, terms=tuple((*t, *(x for x in linear if x not in t)) for t in function.terms))
-    return function, transfer(lean, theta, function)
 
 
 def _lean(function: HybridFunction) -> HybridFunction:
@@ -177,6 +350,20 @@ def _lean(function: HybridFunction) -> HybridFunction:
     for f in (f for one in function.terms for x in one for f in x):
         reach[f.kind] = max(reach[f.kind], f.lag - (function.nk - 1 if f.kind == "u" else 0))
     return replace(function, ny=reach["y"], nu=reach["u"]) if any(reach.values()) else function
+
+
+def hybrid_problem(function: HybridFunction, parts: Parts, theta: Array, prior: float) -> LaggedProblem:
+    """Return the problem whose errors have unit covariance at given numbers."""
+    return problem_at(function, parts, theta, function.precision(prior), joint=True)
+
+
+def transfer(old: HybridFunction, theta: Array, new: HybridFunction) -> Array:
+    """Return the numbers of another function: those with the same names are taken over, new ones are zero.
+
+    C is drawn towards zero where it would not be invertible.
+    """
+    known = dict(zip(old.names, theta, strict=True))
+    return new.make_invertible(np.array([known.get(name, 0.0) for name in new.names], dtype=np.float64))
 
 
 def _search(s: HybridSettings, data: Scaled, draft: _Hybrid, stage: str, tick: Tick | None) -> LaggedProblem:
@@ -202,16 +389,201 @@ def _search(s: HybridSettings, data: Scaled, draft: _Hybrid, stage: str, tick: T
     return problem
 
 
+# --- network ----------------------------------------------------------------------------------------------------------
+
+
+def train(
+    s: HybridSettings, function: HybridFunction, linear: Array, parts: Parts, seed: int, starts: int,
+    tick: Tick | None, draft: _Hybrid | None = None,
+) -> Array:  # fmt: skip
+    """Train a network on what polynomial and C (`linear`) leave, then all numbers for a while; the best of the starts.
+
+    Only the beginning of a long record is looked at. Every other start takes C as 1: what the polynomial could not do
+    alone has coloured the errors, and gone into the first C. The training of the network alone is noted in `draft`.
+    """
+    most = max(_STARTED_ON // len(parts), 10 * function.lag + 60)
+    level = np.concatenate([linear, np.zeros(function.n_theta - linear.size)])
+    every = hybrid_problem(function, tuple((y[:most], u[:most]) for y, u in parts), level, s.prior)
+    live = np.ones(function.n_theta, dtype=np.bool_)
+    live[function.n_terms : function.n_linear] = False  # C
+    rng, n, best, least = np.random.default_rng(seed), function.n_terms + function.p * function.neurons, level, np.inf
+    shares = portions(tick, (1.0,) * (2 * starts))
+    for k in range(starts):
+        alone = every.at(level if k % 2 else np.where(live, level, 0.0), live)
+        start = draw_start(alone, n, alone.base[live], function.neurons, function.width, rng)
+        found = search(
+            alone, start, stage="network on the residual", tick=shares[2 * k], n_linear=n,
+            solved=partial(solve_linear, alone, n), **_ROUGH,
+        )  # fmt: skip
+        both = search(every, alone.whole(found.theta), stage="starts of all together", tick=shares[2 * k + 1], **_ROUGH)
+        if not k and draft is not None:
+            draft.note(found, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
+        if both.cost < least:
+            best, least = both.theta, both.cost
+    return best
+
+
+def _choose_neurons(
+    s: HybridSettings, function: HybridFunction, linear: Array, parts: Parts, draft: _Hybrid, seed: int,
+    tick: Tick | None,
+) -> int:  # fmt: skip
+    """Choose the number of hidden units by one-step errors behind the parts of the records that are trained on."""
+    most = max(_MOST_ROWS // len(parts), 10 * function.lag + 60)
+    training, held = split(tuple((y[:most], u[:most]) for y, u in parts), s.held_out, function.lag)
+    if sum(y.shape[0] - function.lag for y, _ in held) < _FEWEST:
+        return 0
+
+    def score(of: dict[str, Any], tick: Tick | None) -> float:
+        one, theta = replace(function, neurons=of["neurons"]), linear
+        if one.neurons:
+            theta = train(s, one, linear, training, seed, 2, part_of(tick, 0.0, 0.8))
+        problem = hybrid_problem(one, training, theta, s.prior)
+        theta = search(problem, theta, stage="choice of neurons", tick=part_of(tick, 0.8, 1.0), **_ROUGH).theta
+        return rms_error(one, theta, held)
+
+    sizes = [{"neurons": h} for h in _NEURONS]
+    found = choose_smallest(sizes, score, draft.details["tried"], _AS_GOOD, tick)
+    return int(found["neurons"])
+
+
+# --- noise model and terms --------------------------------------------------------------------------------------------
+
+
+def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick | None) -> tuple[HybridFunction, Array]:
+    """Choose the order of C by an information criterion of the one-step errors, all numbers searched anew for each.
+
+    `theta` is the optimum for the order there is. Orders are nested, not chosen out of many; all outputs' errors count,
+    as all their numbers do.
+    """
+    old = _function_of(problem)
+    first, found = max(old.lag, MOST_NOISE), list[tuple[float, HybridFunction, Array]]()
+    for ne, share in enumerate(portions(tick, (1.0,) * (MOST_NOISE + 1))):
+        of = replace(old, ne=ne)
+        if not of.n_theta:  # a polynomial without terms: only the noise model is left
+            continue
+        parts = tuple((y[first - of.lag :], u[first - of.lag :]) for y, u in problem.parts)  # for all the same errors
+        at = replace(hybrid_problem(of, parts, transfer(old, theta, of), prior), weight=problem.weight)
+        ended = search(at, at.base, stage="order of the noise model", tick=share, **_ROUGH)
+        value = at.n_errors * np.log(max(ended.cost / at.n_errors, 1e-26))
+        found.append((value + penalty("bic", of.n_linear, max(at.n_errors // of.p, 2), 1), of, ended.theta))
+    return min(found, key=lambda x: x[0])[1:]
+
+
+def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tick | None) -> None:
+    """Revise the terms of the polynomial until the criterion gains by none.
+
+    Terms were chosen before there was a network, so that some only imitate it, and others were hidden by what it does.
+    One at a time, the term goes or comes that the criterion gains most by, all numbers searched anew. A term that the
+    network could take over stays: otherwise units that are to spare would swallow it, and what can be read would become
+    what cannot.
+    """
+    of, theta = _function_of(problem), draft.theta
+    candidates = products(lagged(of.p, of.m, ny=s.ny, nu=s.nu, nk=s.nk), s.degree)
+    n = max(problem.n_errors // of.p, 2)
+
+    def price(count: int) -> float:
+        """What the last of `count` numbers of polynomial and C costs, in squared errors of unit variance."""
+        m = max(of.p * len(candidates), count)
+        return penalty("ebic", count, n, m) - penalty("ebic", count - 1, n, m)
+
+    for k in range(_MOST_STEPS):
+        if tick is not None:
+            tick("terms beside the network", guessed(k, 4.0))
+        cost, count, better = problem.cost(theta), _function_of(problem).n_linear, None
+        for gain, step in ((-price(count), _without_one), (price(count + 1), _with_one)):
+            terms = step(problem, theta, candidates, abs(gain), s.prior)
+            if terms is None:
+                continue
+            at = _with_terms(problem, theta, terms, s.prior)
+            found = search(at, at.base, stage="", damping=1e-4, **_ROUGH)
+            if cost - found.cost > gain:
+                better = at, found.theta
+                break
+        if better is None:
+            return
+        problem, theta = better
+        draft.take(_function_of(problem), theta)
+
+
+AllTerms = tuple[tuple[Term, ...], ...]
+
+
+def _function_of(problem: LaggedProblem) -> HybridFunction:
+    assert isinstance(problem.function, HybridFunction)
+    return problem.function
+
+
+def _with_terms(problem: LaggedProblem, theta: Array, terms: AllTerms, prior: float) -> LaggedProblem:
+    """The same errors, equally weighted, of a function with other terms."""
+    old = _function_of(problem)
+    new = replace(old, terms=terms)
+    found = hybrid_problem(new, problem.parts, transfer(old, theta, new), prior)
+    return replace(found, weight=problem.weight)
+
+
+def _inflation(R: Array, P: Array, n_linear: int) -> Array:
+    """By what the network multiplies the standard deviations of polynomial and C, the first `n_linear` numbers.
+
+    `R` is the triangle of the slopes, `P` the inverse of R'R. Ones where they are not determined at all.
+    """
+    alone, _ = information_inverse(R[:, :n_linear])
+    return np.ones(n_linear) if alone is None else np.sqrt(np.diag(P)[:n_linear] / np.diag(alone))
+
+
+def _without_one(
+    problem: LaggedProblem, theta: Array, candidates: tuple[Term, ...], price: float, prior: float
+) -> AllTerms | None:
+    """Terms without the one that is missed least, if it does not pay and the network could not take it over."""
+    del candidates, prior
+    function, R = _function_of(problem), problem.triangle(theta)[:, :-1]
+    P, _ = information_inverse(R)
+    if P is None or not function.n_terms:
+        return None
+    shared = _inflation(R, P, function.n_linear)[: function.n_terms] > _SHARED
+    alone = np.array([len(function.terms[o]) == 1 for o, _, _ in function.owned])
+    loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: function.n_terms])
+    worst = int(np.argmin(loss))
+    if not loss[worst] < price:
+        return None
+    o, _, term = function.owned[worst]
+    return tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(function.terms))
+
+
+def _with_one(
+    problem: LaggedProblem, theta: Array, candidates: tuple[Term, ...], price: float, prior: float
+) -> AllTerms | None:
+    """Terms with the one whose slope, orthogonal to all there are, explains most of the errors, if it pays."""
+    function = _function_of(problem)
+    more = [(o, x) for o, t in enumerate(function.terms) for x in candidates if x not in t]
+    if not more or len(more) > _MOST_CANDIDATES:
+        return None
+    richer = tuple((*t, *(x for q, x in more if q == o)) for o, t in enumerate(function.terms))
+    wide = _with_terms(problem, theta, richer, prior)
+    known = set(function.names)
+    gain = column_gains(wide.triangle(wide.base), np.array([name in known for name in wide.function.names]))
+    best = int(np.argmax(gain))
+    if not gain[best] > price:
+        return None
+    return tuple((*t, more[best][1]) if more[best][0] == o else t for o, t in enumerate(function.terms))
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
 def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _Hybrid, seed: int) -> NonlinearFit:
     of = draft.model
     used = {**asdict(s), "ne": of.ne, "neurons": of.neurons}
     problem = hybrid_problem(of, data.parts, draft.theta, s.prior)
     if not np.isfinite(problem.cost(draft.theta)):
-        return failed_fit("hybrid", records, used, seed, _DIVERGED, draft.timing_s)
+        return failed_fit("hybrid", records, used, seed, DIVERGED, draft.timing_s)
     found = laplace(problem, draft.theta)
     draft.warnings += _cautions(draft, found)
     spare = _spare_units(of, draft.theta, problem, found)
-    draft.details |= _details(records, data, draft, problem)
+    terms: dict[str, list[dict[str, object]]] = {}
+    for o, out in enumerate(records[0].outputs):
+        named = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
+        terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in named]
+    draft.details |= {"terms": terms, "levels": data.levels(records[0])}
     why_not = (
         f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and intervals "
         f"beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
@@ -230,9 +602,7 @@ def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found
     """
     if found.covariance is None:
         return 0
-    layer = of.blocks[2]
-    assert isinstance(layer, Tanh)
-    price = (of.p + layer.width + 1) * np.log(problem.n_errors / of.p)
+    price = (of.p + of.width + 1) * np.log(problem.n_errors / of.p)
     spare = 0
     for k in range(of.neurons):
         own = of.n_linear + k + of.neurons * np.arange(of.p)
@@ -244,41 +614,18 @@ def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found
 def _cautions(draft: _Hybrid, found: Laplace) -> list[str]:
     of, out = draft.model, []
     radius = of.noise_radius(draft.theta)
-    if not of.deep and radius > _NEAR:
+    if radius > _NEAR:
         out.append(
             f"C has a root at {radius:.4g}, nearly on the unit circle, where the search must not cross: its standard "
             "deviation is not to be trusted, and the predictor forgets its beginning slowly. A differenced or "
             "detrended output does this"
         )
     if found.covariance is not None:
-        inflated = inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
-        names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > SHARED)
+        inflated = _inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
+        names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > _SHARED)
         if names:
             out.append(
                 f"the network can take over these terms, so that their values are not theirs alone: {names}. Fewer "
                 "neurons or a smaller prior"
             )
     return out
-
-
-def _details(records: Sequence[IOData], data: Scaled, draft: _Hybrid, problem: LaggedProblem) -> dict[str, object]:
-    of, y_all = draft.model, np.concatenate([y for y, _ in data.parts])
-    terms: dict[str, list[dict[str, object]]] = {}
-    for o, out in enumerate(records[0].outputs):
-        named = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
-        terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in named]
-    layer, own = of.blocks[2], of.split(draft.theta)[2]
-    assert isinstance(layer, Tanh)
-    rows = [of.predict(draft.theta, r)[1] for r in problem.rows()]
-    hidden = np.concatenate([layer.values(own, r.prepared[2]) for r in rows])
-    by_netdraft = np.std(hidden, axis=0) / np.maximum(np.std(y_all, axis=0), 1e-300)
-    return {
-        "terms": terms,
-        "network_share": dict(zip(records[0].outputs, by_netdraft.tolist(), strict=True)),
-        "noise_model": {
-            "largest_root": of.noise_radius(draft.theta),
-            "coefficients": draft.theta[of.n_terms : of.n_linear].tolist(),
-            "start_drawn_in_by": draft.details.pop("drawn_in"),
-        },
-        "levels": data.levels(records[0]),
-    }

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.linear import information_inverse, triangle_of
+from ambid.estimation.linear import information_inverse, least_squares, triangle_of
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
@@ -29,6 +29,9 @@ _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled
 _APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
 _DEPENDENT = 1e-10  # squared length left of a column that others hold already
+_DRAWS = 10  # of a random hidden layer
+_DRAWN_ON = 1000  # rows by which they are compared
+_LAGS = (1, 2, 3, 4, 6)  # that are compared
 _CROWDED = 0.8  # part of the errors that numbers may take up
 
 
@@ -45,7 +48,6 @@ class LaggedProblem:
     precision: Array
     free: bool = False  # errors of the free run instead of the predictions
     joint: bool = False  # whether weights take correlation of the outputs' errors into account
-    counted: tuple[Mask, ...] | None = None  # (n_samples,), samples of each record whose errors count; all without
     _rows: list[Rows] = field(default_factory=list)
 
     def rows(self) -> list[Rows]:
@@ -54,14 +56,10 @@ class LaggedProblem:
             self._rows.extend(self.function.rows(y, u) for y, u in self.parts)
         return self._rows
 
-    def counts(self, record: int) -> Mask | slice:
-        """Return which rows of a record count."""
-        return slice(None) if self.counted is None else self.counted[record][self.function.lag :]
-
     @property
     def n_errors(self) -> int:
         """Errors in all."""
-        return sum(y[self.function.lag :][self.counts(k)].size for k, (y, _) in enumerate(self.parts))
+        return sum(y[self.function.lag :].size for y, _ in self.parts)
 
     def whole(self, v: Array) -> Array:
         """Return all parameters."""
@@ -72,16 +70,11 @@ class LaggedProblem:
         return out
 
     def errors(self, v: Array) -> list[Array]:
-        """Return the errors of each record that count, scaled, shape (n, n_outputs); NaN from a divergence on."""
-        return [e[self.counts(k)] for k, e in enumerate(self._all_errors(self.whole(v)))]
-
-    def _all_errors(self, theta: Array) -> Iterator[Array]:
-        of = self.function
-        for k, (y, u) in enumerate(self.parts):
-            if self.free:
-                yield (y - of.free_run(theta, y, u)[0])[of.lag :]
-            else:
-                yield of.errors(theta, self.rows()[k])
+        """Return the errors of each record, scaled, shape (n_samples - lag, n_outputs); NaN from a divergence on."""
+        of, theta = self.function, self.whole(v)
+        if self.free:
+            return [(y - of.free_run(theta, y, u)[0])[of.lag :] for y, u in self.parts]
+        return [of.errors(theta, rows) for rows in self.rows()]
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squared weighted errors and of the prior's rows; infinite where the model diverges."""
@@ -114,8 +107,6 @@ class LaggedProblem:
                 predicted, rows = of.predict(theta, self.rows()[k])
                 left = rows.y - predicted
             before: Array | None = None
-            counts = self.counts(k)
-            counts = np.ones(left.shape[0], dtype=np.bool_) if isinstance(counts, slice) else counts
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
                 some, past = rows.part(part), before
@@ -123,8 +114,7 @@ class LaggedProblem:
                 if reach:
                     before = J[-reach:].copy() if past is None else np.concatenate([past, J])[-reach:]
                 J = of.fold(J, some, free=self.free, before=past)
-                both = np.concatenate([J, left[part, :, None]], axis=2)[counts[part]]
-                yield k, np.matmul(self.weight, both)
+                yield k, np.matmul(self.weight, np.concatenate([J, left[part, :, None]], axis=2))
 
     def sample_rows(self, v: Array) -> list[Array]:
         """Return slopes and errors of every sample, of unit variance, (n_samples - lag, n_outputs, n_live + 1)."""
@@ -186,7 +176,6 @@ def problem_at(
     live: Mask | None = None,
     free: bool = False,
     joint: bool = False,
-    counted: tuple[Mask, ...] | None = None,
 ) -> LaggedProblem:
     """Return the problem around given parameters, of which the live ones are searched.
 
@@ -196,7 +185,7 @@ def problem_at(
     found = LaggedProblem(
         function=function, parts=parts, weight=np.eye(function.n_outputs) if weight is None else weight, base=theta,
         live=np.ones(none.size, dtype=np.bool_) if live is None else live, mean=none if mean is None else mean,
-        precision=none if precision is None else precision, free=free, joint=joint, counted=counted,
+        precision=none if precision is None else precision, free=free, joint=joint,
     )  # fmt: skip
     return found.at(theta) if weight is None else found
 
@@ -239,6 +228,70 @@ def rms_error(function: LaggedFunction, theta: Array, parts: Parts, *, free: boo
     with np.errstate(over="ignore", invalid="ignore"):
         found = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
     return found if np.isfinite(found) else np.inf
+
+
+Size = dict[str, Any]
+"""What a model may be, by the names of its settings."""
+
+
+def choose_smallest(
+    sizes: Sequence[Size], score: Callable[[Size, Tick | None], float], tried: list[Size], near: float,
+    tick: Tick | None,
+) -> Size:  # fmt: skip
+    """Return the first of some sizes, the smallest first, that does about as well as the best: within `near` times.
+
+    `score` is its error on data held out; it is added to `tried` for the report. One size alone is not scored.
+    """
+    if len(sizes) == 1:
+        return sizes[0]
+    found = list[float]()
+    for one, share in zip(sizes, portions(tick, (1.0,) * len(sizes)), strict=True):
+        if share is not None:
+            share(f"choice of {' and '.join(one)}", 0.0)
+        found.append(score(one, share))
+        tried.append({**one, "held_out_rms": found[-1]})
+    return sizes[next((k for k, x in enumerate(found) if x <= near * min(found)), 0)]
+
+
+def lag_sizes(ny: int | None, nu: int | None, nk: int, parts: Parts, share: float) -> list[Size]:
+    """Return the lags that are compared where they are left open, each once; none too many for what is held out."""
+    short, some = min(y.shape[0] for y, _ in parts), bool(parts[0][1].shape[1])
+    tries = [k for k in _LAGS if 3 * (k + nk) < short * share] or [1]
+    found = [{"ny": k if ny is None else ny, "nu": (k if nu is None else nu) * some} for k in tries]
+    return [x for i, x in enumerate(found) if x not in found[:i]]
+
+
+def solve_linear(problem: LaggedProblem, n: int, v: Array) -> Array:
+    """Return what is searched with its first `n` numbers, in which errors are linear, at their best for the others.
+
+    As given where errors are not finite.
+    """
+    place = np.flatnonzero(problem.live)[:n]
+    part = replace(problem, base=problem.whole(v), live=np.isin(np.arange(problem.base.size), place))
+    R, out = part.triangle(v[:n]), v.copy()
+    if np.all(np.isfinite(R)):
+        out[:n] += least_squares(R[:, :-1], R[:, -1])
+    return out
+
+
+def draw_start(problem: LaggedProblem, n: int, v: Array, neurons: int, width: int, rng: np.random.Generator) -> Array:
+    """Return what is searched with a random hidden layer, its last numbers, whose units bend inside the data.
+
+    Of several draws the one is taken with the least errors over the beginning of the records, `solve_linear` for each.
+    """
+    most = problem.function.lag + _DRAWN_ON // len(problem.parts)
+    few = replace(problem, parts=tuple((y[:most], u[:most]) for y, u in problem.parts), _rows=[])
+    best, least = v, np.inf
+    for _ in range(_DRAWS):
+        trial = v.copy()
+        trial[v.size - neurons * (width + 1) :] = np.concatenate(
+            [rng.standard_normal(neurons * width) / np.sqrt(max(width, 1)), rng.standard_normal(neurons)]
+        )
+        trial = solve_linear(few, n, trial)
+        cost = few.cost(trial)
+        if cost < least:
+            best, least = trial, cost
+    return best
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

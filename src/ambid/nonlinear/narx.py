@@ -20,9 +20,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.linear import triangle_of
-from ambid.estimation.progress import Tick, part_of, portions
-from ambid.estimation.search import search
+from ambid.estimation.progress import Tick, portions
+from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.blocks import Block, Linear, Tanh
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
@@ -30,12 +29,17 @@ from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, la
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
+    Size,
+    choose_smallest,
+    draw_start,
     finish,
     guarded,
+    lag_sizes,
     laplace,
     problem_at,
     refine,
     rms_error,
+    solve_linear,
     split,
 )
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
@@ -44,13 +48,11 @@ from ambid.nonlinear.settings import choice, number, read_settings, whole
 _LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
 _ENOUGH = 1e-2  # gain that ends a search: a step of 0.1 standard deviations
 _FIRST = 12  # iterations of every start; only the best goes on
-_LAGS = (1, 2, 3, 4, 6)
 _NEURONS = (2, 4, 8, 12)
 _FIRST_NEURONS = 4  # with which lags are compared
 _AS_GOOD = 1.02
 _MOST_ROWS = 6000  # that a comparison looks at
 _ITERATIONS = 15  # of a comparison
-_BLOCK = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,7 +174,7 @@ def _identify(s: NarxSettings, data: Scaled, draft: Draft, spread: list[Array], 
     began = perf_counter()
     function = _choose_sizes(s, data.parts, draft, seed, choosing)
     began = draft.timed("choice", began)
-    _train(s, function, data, draft, seed, training)
+    _train_all(s, function, data, draft, seed, training)
     began = draft.timed("training", began)
     if free:
         refine(
@@ -188,89 +190,79 @@ def _identify(s: NarxSettings, data: Scaled, draft: Draft, spread: list[Array], 
 
 
 def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: Tick | None) -> NarxFunction:
-    """Choose what is left open of lags and neurons: the smallest that predict held-out data nearly as well as the best.
-
-    Each candidate is trained for a while on part of the data.
-    """
-    tried: list[dict[str, Any]] = []
+    """Choose what is left open of lags and neurons; each candidate is trained for a while on part of the data."""
+    share, tried = s.held_out or 0.2, list[Size]()
     draft.details["tried"] = tried
-    share = s.held_out or 0.2
 
-    def run(ny: int, nu: int, neurons: int) -> None:
-        if tick is not None:
-            tick("choice of lags and neurons", len(tried) / (len(_LAGS) + len(_NEURONS)))
-        function = _function(parts, ny, nu, s.nk, neurons)
-        error = _compare(function, parts, share, s.prior, seed)
-        tried.append({"ny": ny, "nu": function.nu, "neurons": neurons, "held_out_rms": error})
+    def score(of: Size, tick: Tick | None) -> float:
+        function = _function(parts, of["ny"], of["nu"], s.nk, of["neurons"])
+        most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
+        training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
+        problem = narx_problem(function, training, linear_start(function, training), s.prior)
+        start = _random_start(problem, function, np.random.default_rng(seed))
+        watch = partial(_error, function, held)
+        return min(
+            _train(problem, function, start, stage="choice", most=_ITERATIONS, held_out=watch, tick=tick).held_out
+        )
 
-    def smallest(first: int) -> dict[str, Any]:
-        best = min(x["held_out_rms"] for x in tried[first:])
-        return next((x for x in tried[first:] if x["held_out_rms"] <= _AS_GOOD * best), tried[first])
-
-    ny, nu, neurons = s.ny, s.nu, s.neurons
-    if ny is None or nu is None:
-        short = min(y.shape[0] for y, _ in parts)
-        for k in [k for k in _LAGS if 3 * (k + s.nk) < short * share] or [1]:
-            run(ny or k, k if nu is None else nu, neurons or _FIRST_NEURONS)
-        one = smallest(0)
-        ny, nu = one["ny"], one["nu"]
-    if neurons is None:
-        first = len(tried)
-        for h in _NEURONS:
-            run(ny, nu, h)
-        neurons = smallest(first)["neurons"]
-    return _function(parts, ny, nu, s.nk, neurons)
+    few = {"neurons": _FIRST_NEURONS if s.neurons is None else s.neurons}
+    sizes = [{**x, **few} for x in lag_sizes(s.ny, s.nu, s.nk, parts, share)]
+    lags_tick, units_tick = portions(tick, (1.0, 1.0))
+    found = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
+    sizes = [{**found, "neurons": h} for h in (_NEURONS if s.neurons is None else (s.neurons,))]
+    found = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
+    return _function(parts, found["ny"], found["nu"], s.nk, found["neurons"])
 
 
-def _compare(function: NarxFunction, parts: Parts, share: float, prior: float, seed: int) -> float:
-    most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
-    training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
-    start = random_start(function, linear_start(function, training), np.random.default_rng(seed))
-    problem = narx_problem(function, training, start, prior)
-    found = search(
-        problem, start, stage="", most=_ITERATIONS, held_out=partial(_error, function, held), slack=0.0,
-        solved=partial(solve_linear, problem), n_linear=function.n_linear,
-    )  # fmt: skip
-    return min(found.held_out)
+def _random_start(problem: LaggedProblem, function: NarxFunction, rng: np.random.Generator) -> Array:
+    width = function.regressors.column.size
+    return draw_start(problem, function.n_linear, problem.base, function.neurons, width, rng)
 
 
 def _error(function: NarxFunction, parts: Parts, theta: Array) -> float:
     return rms_error(function, theta, parts)
 
 
-def _train(s: NarxSettings, function: NarxFunction, data: Scaled, draft: Draft, seed: int, tick: Tick | None) -> None:
+def _train(problem: LaggedProblem, function: NarxFunction, start: Array, **options: Any) -> Found:
+    """Search for the hidden layer, everything linear at its best for it (Golub and Pereyra 1973)."""
+    n = function.n_linear
+    return search(
+        problem, start, slack=options.pop("slack", 0.0), solved=partial(solve_linear, problem, n), n_linear=n, **options
+    )
+
+
+def _train_all(
+    s: NarxSettings, function: NarxFunction, data: Scaled, draft: Draft, seed: int, tick: Tick | None
+) -> None:
     """Train from several starts, go on with the best, and end on all data."""
     training, held = split(data.parts, s.held_out, function.lag)
-    best = linear_start(function, training)
-    draft.function, draft.theta = function, best
-    rng, linear, least = np.random.default_rng(seed), best, np.inf
+    linear = linear_start(function, training)
+    draft.function, draft.theta = function, linear
+    rng, least = np.random.default_rng(seed), np.inf
     watch = partial(_error, function, held) if held else None
     starts = s.starts if function.neurons else 1
     first, second, third = portions(tick, (starts * _FIRST, 2 * _FIRST, 2 * _FIRST * bool(held)))
-
-    def run(parts: Parts, start: Array, **options: Any) -> Any:
-        problem = narx_problem(function, parts, start, s.prior)
-        solved = partial(solve_linear, problem)
-        return problem, search(problem, start, solved=solved, n_linear=function.n_linear, **options)
-
-    for k in range(starts):
-        share = part_of(first, k / starts, (k + 1) / starts)
-        start = random_start(function, linear, rng)
+    problem = narx_problem(function, training, linear, s.prior)
+    for share in portions(first, (1.0,) * starts):
+        start = _random_start(problem, function, rng)
         most = min(_FIRST, s.iterations)
-        _, found = run(training, start, stage="starts", most=most, held_out=watch, slack=0.0, tick=share)
+        found = _train(problem, function, start, stage="starts", most=most, held_out=watch, tick=share)
         error = min(found.held_out) if held else found.cost
         if error < least:
-            best, least = found.theta, error
-            draft.keep(best)
-    usual: dict[str, Any] = {"most": s.iterations, "enough": _ENOUGH, "keep": draft.keep}
-    problem, found = run(training, best, stage="training", held_out=watch, tick=second, **usual)
+            least = error
+            draft.keep(found.theta)
+    usual: dict[str, Any] = {"most": s.iterations, "enough": _ENOUGH, "slack": 0.02}
+    problem = narx_problem(function, training, draft.theta, s.prior)
+    found = _train(
+        problem, function, draft.theta, stage="training", held_out=watch, tick=second, keep=draft.keep, **usual
+    )
     draft.keep(found.theta)
     draft.note(found, problem, "Levenberg-Marquardt, prediction errors")
     draft.stopped_early = found.stopped_early
     draft.held_out = watch(found.theta) if watch else float("nan")
     if held and not found.stopped_early:  # nothing is overfitted: the held-out part may teach as well
-        usual.pop("keep")
-        _, found = run(data.parts, found.theta, stage="all data", tick=third, **usual)
+        problem = narx_problem(function, data.parts, found.theta, s.prior)
+        found = _train(problem, function, found.theta, stage="all data", tick=third, **usual)
         draft.keep(found.theta)
     draft.status = "converged" if found.converged else "stalled"
     if not found.converged and len(found.costs) > s.iterations:  # a valley of networks that differ little
@@ -290,41 +282,6 @@ def linear_start(function: NarxFunction, parts: Parts) -> Array:
     theta = np.zeros(function.n_theta)
     theta[: found.size] = np.concatenate([found[:-1].T.ravel(), found[-1]])
     return theta
-
-
-def random_start(function: NarxFunction, linear: Array, rng: np.random.Generator) -> Array:
-    """Return weights with a random hidden layer whose units bend inside the data, beside those of `linear_start`."""
-    h, d = function.neurons, function.regressors.column.size
-    hidden = rng.standard_normal(h * d) / np.sqrt(max(d, 1))
-    bias = rng.standard_normal(h)
-    out = 0.01 * rng.standard_normal(function.p * h)
-    return np.concatenate([linear[: function.edges[1]], out, hidden, bias])
-
-
-def solve_linear(problem: LaggedProblem, theta: Array) -> Array:
-    """Return the weights with L, c and W2 at their best for these hidden units, for one-step errors.
-
-    As given where the units are not finite.
-    """
-    of = problem.function
-    assert isinstance(of, NarxFunction)
-    layer, p, d = of.blocks[1], of.p, of.regressors.column.size
-    assert isinstance(layer, Tanh)
-    own, blocks = of.split(theta)[1], []
-    for rows in problem.rows():
-        for k in range(0, rows.x.shape[0], _BLOCK):
-            x = rows.x[k : k + _BLOCK]
-            blocks.append(np.hstack([x, np.ones((x.shape[0], 1)), layer.hidden(own, x), rows.y[k : k + _BLOCK]]))
-    R = triangle_of(blocks)
-    if not np.all(np.isfinite(R)):
-        return theta
-    width = R.shape[1] - p
-    pull = np.concatenate([problem.precision[: d + 1], problem.precision[of.edges[1] :][: width - d - 1]])
-    found = np.empty((width, p))
-    for o in range(p):
-        rows_o = np.concatenate([R[:, :width], np.diag(pull / problem.weight[o, o])])
-        found[:, o] = np.linalg.lstsq(rows_o, np.concatenate([R[:, width + o], np.zeros(width)]), rcond=1e-15)[0]
-    return np.concatenate([found[:d].T.ravel(), found[d], found[d + 1 :].T.ravel(), theta[of.n_linear :]])
 
 
 def _finish(

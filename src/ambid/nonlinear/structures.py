@@ -82,7 +82,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     NonlinearStructure(
         name="hybrid",
         summary="polynomial, network for what it leaves, noise model C (thesis eqs 3.23-3.24)",
-        options="ambid.nonlinear.hybrid_choice:HybridSettings",
+        options="ambid.nonlinear.hybrid:HybridSettings",
         home="ambid.nonlinear.hybrid:hybrid",
         feedback="with noise model",
     ),
