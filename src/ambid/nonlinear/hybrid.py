@@ -38,7 +38,6 @@ from ambid.nonlinear.lagged_problem import (
     LaggedProblem,
     Laplace,
     choose_smallest,
-    column_gains,
     draw_start,
     finish,
     guarded,
@@ -74,8 +73,7 @@ _MOST_ROWS = 6000  # that the choice of neurons looks at
 _STARTED_ON = 12000  # rows from which starts are trained
 _ROUGH: dict[str, Any] = {"most": 12, "enough": 0.01}  # iterations, and a gain of the cost that no choice depends on
 _ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
-_MOST_STEPS = 40  # of a revision of the terms
-_MOST_CANDIDATES = 400  # beyond, nothing is added: slopes by all of them at once would be too many
+_FEW = 20  # candidates, all of which can stand beside the network
 _SHARED = 10.0  # times a standard deviation grows by the network, from which on a term's value is not its own
 _NEAR = 0.98  # magnitude of a root of C from which on its standard deviation is not to be trusted
 
@@ -315,9 +313,11 @@ def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks:
     lean = _lean(draft.model)
     draft.function = lean
     _search(s, data, draft, "polynomial and noise model", ticks[0])
-    # all regressors of the network are in the polynomial too: it shall not do what is linear
-    linear = tuple((f,) for f in lagged(lean.p, lean.m, ny=s.ny, nu=s.nu, nk=s.nk, ne=0))
-    full = replace(lean, ny=s.ny, nu=s.nu, terms=tuple((*t, *(x for x in linear if x not in t)) for t in lean.terms))
+    # all regressors of the network are in the polynomial too: it shall not do what is linear, nor hide a term
+    factors = lagged(lean.p, lean.m, ny=s.ny, nu=s.nu, nk=s.nk)
+    few = draft.details["candidates"] <= _FEW
+    more = products(factors, s.degree if few else 1, constant=few)
+    full = replace(lean, ny=s.ny, nu=s.nu, terms=tuple((*t, *(x for x in more if x not in t)) for t in lean.terms))
     start = transfer(lean, draft.theta, full)
     neurons = s.neurons
     if neurons is None:
@@ -455,7 +455,8 @@ def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick 
     `theta` is the optimum for the order there is. Orders are nested, not chosen out of many; all outputs' errors count,
     as all their numbers do.
     """
-    old = _function_of(problem)
+    old = problem.function
+    assert isinstance(old, HybridFunction)
     first, found = max(old.lag, MOST_NOISE), list[tuple[float, HybridFunction, Array]]()
     for ne, share in enumerate(portions(tick, (1.0,) * (MOST_NOISE + 1))):
         of = replace(old, ne=ne)
@@ -470,55 +471,36 @@ def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick 
 
 
 def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tick | None) -> None:
-    """Revise the terms of the polynomial until the criterion gains by none.
+    """Leave out terms of the polynomial, one at a time, as long as the criterion gains; all numbers are searched anew.
 
-    Terms were chosen before there was a network, so that some only imitate it, and others were hidden by what it does.
-    One at a time, the term goes or comes that the criterion gains most by, all numbers searched anew. A term that the
-    network could take over stays: otherwise units that are to spare would swallow it, and what can be read would become
-    what cannot.
+    Terms were chosen before there was a network, so that some only imitate it. One that the network could take over
+    stays: otherwise units that are to spare would swallow it, and what can be read would become what cannot.
     """
-    of, theta = _function_of(problem), draft.theta
-    candidates = products(lagged(of.p, of.m, ny=s.ny, nu=s.nu, nk=s.nk), s.degree)
-    n = max(problem.n_errors // of.p, 2)
-
-    def price(count: int) -> float:
-        """What the last of `count` numbers of polynomial and C costs, in squared errors of unit variance."""
-        m = max(of.p * len(candidates), count)
-        return penalty("ebic", count, n, m) - penalty("ebic", count - 1, n, m)
-
-    for k in range(_MOST_STEPS):
+    n = max(problem.n_errors // draft.model.p, 2)
+    for k in range(draft.model.n_terms):
         if tick is not None:
             tick("terms beside the network", guessed(k, 4.0))
-        cost, count, better = problem.cost(theta), _function_of(problem).n_linear, None
-        for gain, step in ((-price(count), _without_one), (price(count + 1), _with_one)):
-            terms = step(problem, theta, candidates, abs(gain), s.prior)
-            if terms is None:
-                continue
-            at = _with_terms(problem, theta, terms, s.prior)
-            found = search(at, at.base, stage="", damping=1e-4, **_ROUGH)
-            if cost - found.cost > gain:
-                better = at, found.theta
-                break
-        if better is None:
+        of, theta = draft.model, draft.theta
+        R = problem.triangle(theta)[:, :-1]
+        P, _ = information_inverse(R)
+        if P is None:
             return
-        problem, theta = better
-        draft.take(_function_of(problem), theta)
-
-
-AllTerms = tuple[tuple[Term, ...], ...]
-
-
-def _function_of(problem: LaggedProblem) -> HybridFunction:
-    assert isinstance(problem.function, HybridFunction)
-    return problem.function
-
-
-def _with_terms(problem: LaggedProblem, theta: Array, terms: AllTerms, prior: float) -> LaggedProblem:
-    """The same errors, equally weighted, of a function with other terms."""
-    old = _function_of(problem)
-    new = replace(old, terms=terms)
-    found = hybrid_problem(new, problem.parts, transfer(old, theta, new), prior)
-    return replace(found, weight=problem.weight)
+        m = max(draft.details["candidates"] * of.p, of.n_linear)
+        price = penalty("ebic", of.n_linear, n, m) - penalty("ebic", of.n_linear - 1, n, m)
+        shared = _inflation(R, P, of.n_linear)[: of.n_terms] > _SHARED
+        alone = np.array([len(of.terms[o]) == 1 for o, _, _ in of.owned])
+        loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: of.n_terms])
+        worst = int(np.argmin(loss))
+        if not loss[worst] < price:
+            return
+        o, _, term = of.owned[worst]
+        fewer = replace(of, terms=tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(of.terms)))
+        at = replace(hybrid_problem(fewer, problem.parts, transfer(of, theta, fewer), s.prior), weight=problem.weight)
+        found = search(at, at.base, stage="", damping=1e-4, **_ROUGH)
+        if not found.cost - problem.cost(theta) < price:
+            return
+        problem = at
+        draft.take(fewer, found.theta)
 
 
 def _inflation(R: Array, P: Array, n_linear: int) -> Array:
@@ -528,43 +510,6 @@ def _inflation(R: Array, P: Array, n_linear: int) -> Array:
     """
     alone, _ = information_inverse(R[:, :n_linear])
     return np.ones(n_linear) if alone is None else np.sqrt(np.diag(P)[:n_linear] / np.diag(alone))
-
-
-def _without_one(
-    problem: LaggedProblem, theta: Array, candidates: tuple[Term, ...], price: float, prior: float
-) -> AllTerms | None:
-    """Terms without the one that is missed least, if it does not pay and the network could not take it over."""
-    del candidates, prior
-    function, R = _function_of(problem), problem.triangle(theta)[:, :-1]
-    P, _ = information_inverse(R)
-    if P is None or not function.n_terms:
-        return None
-    shared = _inflation(R, P, function.n_linear)[: function.n_terms] > _SHARED
-    alone = np.array([len(function.terms[o]) == 1 for o, _, _ in function.owned])
-    loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: function.n_terms])
-    worst = int(np.argmin(loss))
-    if not loss[worst] < price:
-        return None
-    o, _, term = function.owned[worst]
-    return tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(function.terms))
-
-
-def _with_one(
-    problem: LaggedProblem, theta: Array, candidates: tuple[Term, ...], price: float, prior: float
-) -> AllTerms | None:
-    """Terms with the one whose slope, orthogonal to all there are, explains most of the errors, if it pays."""
-    function = _function_of(problem)
-    more = [(o, x) for o, t in enumerate(function.terms) for x in candidates if x not in t]
-    if not more or len(more) > _MOST_CANDIDATES:
-        return None
-    richer = tuple((*t, *(x for q, x in more if q == o)) for o, t in enumerate(function.terms))
-    wide = _with_terms(problem, theta, richer, prior)
-    known = set(function.names)
-    gain = column_gains(wide.triangle(wide.base), np.array([name in known for name in wide.function.names]))
-    best = int(np.argmax(gain))
-    if not gain[best] > price:
-        return None
-    return tuple((*t, more[best][1]) if more[best][0] == o else t for o, t in enumerate(function.terms))
 
 
 # --- the fit ----------------------------------------------------------------------------------------------------------
