@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.nonlinear.blocks import UNITS, Block, Terms
+from ambid.nonlinear.blocks import Block, Terms
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit_file import model_from_json, model_to_json
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, Rows, lags
 from ambid.nonlinear.lagged_problem import problem_at
 from ambid.nonlinear.narx import NarxFunction
-from ambid.nonlinear.rbf_network import RbfFunction
+from ambid.nonlinear.rbf import RbfFunction
 from tests.nonlinear.rbf.systems import network
 
 METRIC = np.array([[1.0, -1.0, 0.0, 0.5], [0.3, 0.0, 2.0, 0.0]])
@@ -27,8 +27,8 @@ NARX = {
 }
 RBF = {
     "rbf, 2 outputs": network(2, 1, ny=2, nu=2, nk=0),
-    "rbf, 2 inputs": network(1, 2, ny=2, nu=2, nk=3, unit="inverse-multiquadric", linear=False),
-    "rbf, time series": network(2, 0, ny=3, unit="thin-plate"),
+    "rbf, 2 inputs": network(1, 2, ny=2, nu=2, nk=3, linear=False),
+    "rbf, time series": network(2, 0, ny=3),
     "rbf, metric": network(1, 1, ny=2, nu=2, metric=METRIC),
 }
 
@@ -88,8 +88,7 @@ def signals(f: LaggedFunction, n: int, seed: int = 1) -> tuple[np.ndarray, np.nd
 
 
 def gentle(f: LaggedFunction) -> np.ndarray:
-    thin = isinstance(f, RbfFunction) and f.unit_name == "thin-plate"
-    return numbers(f, size=0.01 if thin else 0.15)
+    return numbers(f, size=0.15)
 
 
 @named
@@ -177,18 +176,12 @@ def test_the_triangle_is_that_of_weighted_slopes_errors_and_prior(free: bool) ->
     assert at.cost(theta) == pytest.approx(float(np.sum(rows_[:, -1] ** 2)))
 
 
-@pytest.mark.parametrize("unit", UNITS)
-def test_a_unit_has_its_textbook_value_and_no_slope_at_its_centre(unit: str) -> None:
-    f = network(1, 1, neurons=1, unit=unit, linear=False)
+def test_a_unit_has_its_textbook_value_and_no_slope_at_its_centre() -> None:
+    f = network(1, 1, neurons=1, linear=False)
     theta = np.array([0.0, 1.0, 0.5, -0.5, np.log(2.0)])  # c, weight, centre, log width
     at = np.array([[0.5, -0.5], [2.5, 1.5]])  # r = 0 and r^2 = 8, two widths squared: q = 2
     rows = f.rows(np.append(at[:, :1], [[0.0]], axis=0), np.append(at[:, 1:], [[0.0]], axis=0))
-    wanted = {
-        "gaussian": (1.0, np.exp(-1.0)),
-        "inverse-multiquadric": (1.0, 1 / np.sqrt(3.0)),
-        "thin-plate": (0.0, np.log(2.0)),
-    }
-    np.testing.assert_allclose(f.values(theta, rows)[:, 0], wanted[unit], rtol=1e-14)
+    np.testing.assert_allclose(f.values(theta, rows)[:, 0], (1.0, np.exp(-1.0)), rtol=1e-14)
     assert not np.any(f.slopes(theta, rows, free=False)[0, 0, 2:])
 
 

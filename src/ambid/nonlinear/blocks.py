@@ -18,8 +18,6 @@ from ambid.arrays import Array
 Table = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_NONE = 1e-300  # squared distance below which a thin plate is at its centre
-
 
 class Block(Protocol):
     """One summand of a lagged function, with `n_theta` parameters; `x` (n, n_regressors) stands for the rows."""
@@ -261,13 +259,9 @@ class Tanh:
         numbers.update(zip(("W2", "W1", "b1"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
 
 
-UNITS: tuple[str, ...] = ("gaussian", "inverse-multiquadric", "thin-plate")
-"""exp(-q/2), 1/sqrt(1 + q), (q log q)/2 = r^2 log r; the place of a name is its number in the compiled loops."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Radial:
-    """W phi, phi_k = unit(|M x - C_k|^2 / width_k^2): W (p, h), C (h, n_seen), logarithms of the widths (h,).
+    """W phi, phi_k = exp(-|M x - C_k|^2 / (2 width_k^2)): W (p, h), C (h, n_seen), logarithms of the widths (h,).
 
     M, no parameter, says which regressors the units see, and in which metric.
     """
@@ -275,7 +269,6 @@ class Radial:
     n_outputs: int
     metric: Array  # (n_seen, n_regressors), M
     neurons: int
-    unit: str  # one of `UNITS`
 
     @property
     def n_seen(self) -> int:
@@ -318,7 +311,7 @@ class Radial:
 
     def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
         """As `Block.values`."""
-        return np.asarray(unit_values(self.unit, self.squared(theta, rows[0])) @ self.parts(theta)[0].T)
+        return np.asarray(np.exp(-0.5 * self.squared(theta, rows[0])) @ self.parts(theta)[0].T)
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
         """As `Block.derivatives`."""
@@ -326,17 +319,17 @@ class Radial:
         W, C, s = self.parts(theta)
         n, (a, b, _) = seen.shape[0], np.cumsum(self.sizes)
         q = self.squared(theta, seen)
-        phi, by_q = unit_values(self.unit, q), unit_slopes(self.unit, q)
+        phi = np.exp(-0.5 * q)
         geometry, bends = bool(np.any(live[a:])), self.bends(at)
         out = np.zeros((n, p, self.n_theta if geometry else a))
         by_x = np.zeros((n if bends else 1, p, at.size))
         if geometry or bends:
-            by_seen = 2.0 * (by_q * np.exp(-2.0 * s))[:, :, None] * (seen[:, None, :] - C)
+            by_seen = -(phi * np.exp(-2.0 * s))[:, :, None] * (seen[:, None, :] - C)
         for o in range(p):
             out[:, o, o * h : (o + 1) * h] = phi
             if geometry:
                 out[:, o, a:b] = (-W[o, :, None] * by_seen).reshape(n, -1)
-                out[:, o, b:] = -2.0 * W[o] * by_q * q
+                out[:, o, b:] = W[o] * phi * q
             if bends:
                 by_x[:, o] = np.einsum("k,nkj->nj", W[o], by_seen) @ self.metric[:, at]
         return out if np.all(live) else out[:, :, live[: out.shape[2]]], by_x
@@ -344,27 +337,4 @@ class Radial:
     def fill(self, theta: Array, numbers: dict[str, Any]) -> None:
         """As `Block.fill`."""
         numbers.update(zip(("W", "C", "s"), map(np.ascontiguousarray, self.parts(theta)), strict=True))
-        numbers.update(M=np.ascontiguousarray(self.metric), unit=UNITS.index(self.unit))
-
-
-def unit_values(unit: str, q: NDArray[Any]) -> NDArray[Any]:
-    """Return the values of radial units at squared distances, in widths, from their centres."""
-    if unit == "gaussian":
-        return np.exp(-0.5 * q)
-    if unit == "inverse-multiquadric":
-        return 1.0 / np.sqrt(1.0 + q)
-    safe = np.where(q.real > _NONE, q, 1.0)
-    return 0.5 * safe * np.log(safe)
-
-
-def unit_slopes(unit: str, q: NDArray[Any]) -> NDArray[Any]:
-    """Return their derivatives by the squared distance; zero at the centre of a thin plate.
-
-    There it is infinite, but multiplies a distance of zero.
-    """
-    if unit == "gaussian":
-        return -0.5 * np.exp(-0.5 * q)
-    if unit == "inverse-multiquadric":
-        return -0.5 * (1.0 + q) ** -1.5
-    inside = q.real > _NONE
-    return np.where(inside, 0.5 * (np.log(np.where(inside, q, 1.0)) + 1.0), 0.0)
+        numbers.update(M=np.ascontiguousarray(self.metric))

@@ -88,7 +88,7 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
     {
         "narmax": "ambid.nonlinear.polynomial:PolynomialFunction.read_model",
         "hybrid": "ambid.nonlinear.hybrid:HybridFunction.read_model",
-        "rbf": "ambid.nonlinear.rbf_network:read_model",
+        "rbf": "ambid.nonlinear.rbf:RbfFunction.read_model",
         "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
         "narx": "ambid.nonlinear.narx:NarxFunction.read_model",

@@ -70,6 +70,7 @@ _NEURONS = (0, 1, 2, 4, 8)
 _AS_GOOD = 1.01
 _FEWEST = 20  # held-out samples by which neurons are chosen
 _MOST_ROWS = 6000  # that the choice of neurons looks at
+_DRAWS = 20  # of the hidden layer of a start
 _STARTED_ON = 12000  # rows from which starts are trained
 _ROUGH: dict[str, Any] = {"most": 12, "enough": 0.01}  # iterations, and a gain of the cost that no choice depends on
 _ENOUGH = 1e-4  # gain of the cost, errors of unit variance (squared standard deviations), below which a search is over
@@ -410,7 +411,7 @@ def train(
     shares = portions(tick, (1.0,) * (2 * starts))
     for k in range(starts):
         alone = every.at(level if k % 2 else np.where(live, level, 0.0), live)
-        start = draw_start(alone, n, alone.base[live], function.neurons, function.width, rng)
+        start = draw_start(alone, n, alone.base[live], function.neurons, function.width, rng, _DRAWS)
         found = search(
             alone, start, stage="network on the residual", tick=shares[2 * k], n_linear=n,
             solved=partial(solve_linear, alone, n), **_ROUGH,

@@ -295,7 +295,7 @@ class LaggedFunction(ABC):
         numbers: dict[str, Any] = {
             "terms": np.zeros((0, 0), dtype=np.int64),
             "place": np.zeros((0, 2), dtype=np.int64), "theta": np.zeros(0), "W2": none, "W1": none, "b1": np.zeros(0),
-            "W": none, "M": none, "C": none, "s": np.zeros(0), "unit": 0,
+            "W": none, "M": none, "C": none, "s": np.zeros(0),
         }  # fmt: skip
         for block, own in zip(self.blocks, self.split(theta), strict=True):
             block.fill(own, numbers)

@@ -12,7 +12,6 @@ from ambid.compiled import compiled
 Table = NDArray[np.int64]
 
 _FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
-_NONE = 1e-300  # squared distance below which a thin plate is at its centre
 
 
 @compiled(error_model="numpy")
@@ -37,32 +36,10 @@ def propagate(out: Array, gain: Array, source: Table, back: Table, first: int) -
 
 
 @compiled(error_model="numpy")
-def radial_units(x: Array, C: Array, s: Array, unit: int, phi: Array, by_q: Array, q: Array) -> None:
-    """Write value, slope by the squared distance, and squared distance (in widths) of every radial unit."""
-    for k in range(s.size):
-        r = 0.0
-        for j in range(x.size):
-            r += (x[j] - C[k, j]) ** 2
-        r *= np.exp(-2.0 * s[k])
-        q[k] = r
-        if unit == 0:
-            phi[k] = np.exp(-0.5 * r)
-            by_q[k] = -0.5 * phi[k]
-        elif unit == 1:
-            phi[k] = 1.0 / np.sqrt(1.0 + r)
-            by_q[k] = -0.5 * phi[k] ** 3
-        elif r > _NONE:
-            phi[k] = 0.5 * r * np.log(r)
-            by_q[k] = 0.5 * (np.log(r) + 1.0)
-        else:
-            phi[k], by_q[k] = 0.0, 0.0
-
-
-@compiled(error_model="numpy")
 def run(
     z: Array, column: Table, back: Table, shape: Table, out: Array,
     terms: Table, place: Table, theta: Array, W2: Array, W1: Array, b1: Array,
-    W: Array, M: Array, C: Array, s: Array, unit: int,
+    W: Array, M: Array, C: Array, s: Array,
 ) -> None:  # fmt: skip
     """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on.
 
@@ -75,7 +52,7 @@ def run(
     lag, p, n_e, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
     x, f, num, den = np.zeros(D), np.zeros(p), np.zeros(p), np.ones(p)
-    seen, phi, by_q, q = np.zeros(Q), np.zeros(s.size), np.zeros(s.size), np.zeros(s.size)
+    seen = np.zeros(Q)
     innovations = z.shape[1] > n_e
     recursive = free == 1
     for d in range(D):
@@ -110,10 +87,13 @@ def run(
                 seen[j] = 0.0
                 for d in range(D):
                     seen[j] += M[j, d] * x[d]
-            radial_units(seen, C, s, unit, phi, by_q, q)
-            for o in range(p):
-                for k in range(s.size):
-                    f[o] += W[o, k] * phi[k]
+            for k in range(s.size):
+                v = 0.0
+                for j in range(Q):
+                    v += (seen[j] - C[k, j]) ** 2
+                v = np.exp(-0.5 * v * np.exp(-2.0 * s[k]))
+                for o in range(p):
+                    f[o] += W[o, k] * v
         for o in range(p):
             if recursive and not abs(f[o]) < _FAR:
                 out[t:] = np.nan
@@ -136,10 +116,10 @@ def run(
 
 
 @compiled(error_model="numpy")
-def descent_pass(F: Array, Y: Array, rate: float, bounded: int, W: Array) -> int:
-    """Take one step W <- W + eta e f' for each row f of F (n, d); W (p, d) changes. Return where it diverged, or -1.
+def descent_pass(F: Array, Y: Array, rate: float, W: Array) -> None:
+    """Take one step W <- W + eta e f' for each row f of F (n, d); W (p, d) changes.
 
-    `bounded`: eta is no larger than one over the squared slope of all errors, with which none of them grows.
+    eta is `rate`, or one over the squared slope of all errors where that is less, with which none of them grows.
     """
     (n, d), p = F.shape, Y.shape[1]
     e = np.zeros(p)
@@ -147,7 +127,7 @@ def descent_pass(F: Array, Y: Array, rate: float, bounded: int, W: Array) -> int
         size = 0.0
         for j in range(d):
             size += p * F[t, j] * F[t, j]
-        eta = min(rate, 1.0 / size) if bounded == 1 and size > 0.0 else rate
+        eta = min(rate, 1.0 / size) if size > 0.0 else rate
         for o in range(p):
             e[o] = Y[t, o]
             for j in range(d):
@@ -155,9 +135,6 @@ def descent_pass(F: Array, Y: Array, rate: float, bounded: int, W: Array) -> int
         for o in range(p):
             for j in range(d):
                 W[o, j] += eta * e[o] * F[t, j]
-                if not abs(W[o, j]) < 1e12:
-                    return t
-    return -1
 
 
 @compiled(error_model="numpy")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from time import perf_counter
 from typing import Any, Protocol, Self
 
@@ -29,7 +30,6 @@ _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled
 _APART = 1e-8  # of correlation: errors of two outputs are never taken as the same
 _DEPENDENT = 1e-10  # squared length left of a column that others hold already
-_DRAWS = 10  # of a random hidden layer
 _DRAWN_ON = 1000  # rows by which they are compared
 _LAGS = (1, 2, 3, 4, 6)  # that are compared
 _CROWDED = 0.8  # part of the errors that numbers may take up
@@ -274,15 +274,17 @@ def solve_linear(problem: LaggedProblem, n: int, v: Array) -> Array:
     return out
 
 
-def draw_start(problem: LaggedProblem, n: int, v: Array, neurons: int, width: int, rng: np.random.Generator) -> Array:
+def draw_start(
+    problem: LaggedProblem, n: int, v: Array, neurons: int, width: int, rng: np.random.Generator, draws: int
+) -> Array:
     """Return what is searched with a random hidden layer, its last numbers, whose units bend inside the data.
 
-    Of several draws the one is taken with the least errors over the beginning of the records, `solve_linear` for each.
+    Of some draws the one is taken with the least errors over the beginning of the records, `solve_linear` for each.
     """
     most = problem.function.lag + _DRAWN_ON // len(problem.parts)
     few = replace(problem, parts=tuple((y[:most], u[:most]) for y, u in problem.parts), _rows=[])
     best, least = v, np.inf
-    for _ in range(_DRAWS):
+    for _ in range(draws):
         trial = v.copy()
         trial[v.size - neurons * (width + 1) :] = np.concatenate(
             [rng.standard_normal(neurons * width) / np.sqrt(max(width, 1)), rng.standard_normal(neurons)]
@@ -382,6 +384,46 @@ def guarded(identify: Callable[[], None], draft: Attempt, failed: Callable[[str]
         draft.timing_s["all"] = perf_counter() - began
         return failed(f"the training broke down: {error}")
     return None
+
+
+def train_watched(
+    draft: Draft,
+    problem_of: Callable[[Parts, Array], LaggedProblem],
+    parts: Parts,
+    share: float,
+    method: str,
+    tick: Tick | None,
+    *,
+    n_linear: int,
+    **options: Any,
+) -> Found:
+    """Train a draft watched on the `share` of each record that is held out; all data teach where nothing is overfitted.
+
+    `problem_of` gives the problem of some records about parameters, `n_linear` see `solve_linear`.
+    """
+    training, held = split(parts, share, draft.function.lag)
+    first, second = portions(tick, (1.0, 1.0 * bool(held)))
+
+    def run(some: Parts, **more: Any) -> tuple[LaggedProblem, Found]:
+        problem = problem_of(some, draft.theta)
+        solved = partial(solve_linear, problem, n_linear)
+        return problem, search(
+            problem, draft.theta, keep=draft.keep, solved=solved, n_linear=n_linear, **options, **more
+        )
+
+    def watch(theta: Array) -> float:
+        return rms_error(draft.function, theta, held)
+
+    problem, found = run(training, stage="training", held_out=watch if held else None, tick=first)
+    draft.keep(found.theta)
+    draft.note(found, problem, method)
+    draft.stopped_early = found.stopped_early
+    draft.held_out = watch(found.theta) if held else float("nan")
+    if held and not found.stopped_early:
+        _, found = run(parts, stage="all data", tick=second)
+        draft.keep(found.theta)
+    draft.status = "converged" if found.converged else "stalled"
+    return found
 
 
 def refine(

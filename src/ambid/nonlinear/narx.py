@@ -41,11 +41,13 @@ from ambid.nonlinear.lagged_problem import (
     rms_error,
     solve_linear,
     split,
+    train_watched,
 )
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, whole
 
 _LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
+_DRAWS = 5  # of the hidden layer of a start
 _ENOUGH = 1e-2  # gain that ends a search: a step of 0.1 standard deviations
 _FIRST = 12  # iterations of every start; only the best goes on
 _NEURONS = (2, 4, 8, 12)
@@ -216,7 +218,7 @@ def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: 
 
 def _random_start(problem: LaggedProblem, function: NarxFunction, rng: np.random.Generator) -> Array:
     width = function.regressors.column.size
-    return draw_start(problem, function.n_linear, problem.base, function.neurons, width, rng)
+    return draw_start(problem, function.n_linear, problem.base, function.neurons, width, rng, _DRAWS)
 
 
 def _error(function: NarxFunction, parts: Parts, theta: Array) -> float:
@@ -224,47 +226,33 @@ def _error(function: NarxFunction, parts: Parts, theta: Array) -> float:
 
 
 def _train(problem: LaggedProblem, function: NarxFunction, start: Array, **options: Any) -> Found:
-    """Search for the hidden layer, everything linear at its best for it (Golub and Pereyra 1973)."""
+    """Search for a while, everything linear at its best for the hidden layer (Golub and Pereyra 1973)."""
     n = function.n_linear
-    return search(
-        problem, start, slack=options.pop("slack", 0.0), solved=partial(solve_linear, problem, n), n_linear=n, **options
-    )
+    return search(problem, start, slack=0.0, solved=partial(solve_linear, problem, n), n_linear=n, **options)
 
 
 def _train_all(
     s: NarxSettings, function: NarxFunction, data: Scaled, draft: Draft, seed: int, tick: Tick | None
 ) -> None:
-    """Train from several starts, go on with the best, and end on all data."""
+    """Train from several starts, and go on with the best."""
     training, held = split(data.parts, s.held_out, function.lag)
-    linear = linear_start(function, training)
-    draft.function, draft.theta = function, linear
+    draft.function, draft.theta = function, linear_start(function, training)
+    problem = narx_problem(function, training, draft.theta, s.prior)
     rng, least = np.random.default_rng(seed), np.inf
     watch = partial(_error, function, held) if held else None
     starts = s.starts if function.neurons else 1
-    first, second, third = portions(tick, (starts * _FIRST, 2 * _FIRST, 2 * _FIRST * bool(held)))
-    problem = narx_problem(function, training, linear, s.prior)
+    first, second = portions(tick, (starts * _FIRST, 2 * _FIRST * (1 + bool(held))))
     for share in portions(first, (1.0,) * starts):
-        start = _random_start(problem, function, rng)
-        most = min(_FIRST, s.iterations)
+        start, most = _random_start(problem, function, rng), min(_FIRST, s.iterations)
         found = _train(problem, function, start, stage="starts", most=most, held_out=watch, tick=share)
         error = min(found.held_out) if held else found.cost
         if error < least:
             least = error
             draft.keep(found.theta)
-    usual: dict[str, Any] = {"most": s.iterations, "enough": _ENOUGH, "slack": 0.02}
-    problem = narx_problem(function, training, draft.theta, s.prior)
-    found = _train(
-        problem, function, draft.theta, stage="training", held_out=watch, tick=second, keep=draft.keep, **usual
-    )
-    draft.keep(found.theta)
-    draft.note(found, problem, "Levenberg-Marquardt, prediction errors")
-    draft.stopped_early = found.stopped_early
-    draft.held_out = watch(found.theta) if watch else float("nan")
-    if held and not found.stopped_early:  # nothing is overfitted: the held-out part may teach as well
-        problem = narx_problem(function, data.parts, found.theta, s.prior)
-        found = _train(problem, function, found.theta, stage="all data", tick=third, **usual)
-        draft.keep(found.theta)
-    draft.status = "converged" if found.converged else "stalled"
+    found = train_watched(
+        draft, lambda parts, theta: narx_problem(function, parts, theta, s.prior), data.parts, s.held_out,
+        "Levenberg-Marquardt, prediction errors", second, most=s.iterations, enough=_ENOUGH, n_linear=function.n_linear,
+    )  # fmt: skip
     if not found.converged and len(found.costs) > s.iterations:  # a valley of networks that differ little
         lately = 50.0 * (1.0 - found.costs[-1] / found.costs[-min(11, len(found.costs))])
         draft.warnings.append(

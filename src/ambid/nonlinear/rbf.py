@@ -1,66 +1,75 @@
 """Networks of radial basis functions: a linear part beside units about centres (thesis eqs 1.13, 1.14; Billings 2013).
 
 Scale -> lags, what the units see, their number and width (where left open) -> centres -> output weights by regularised
-least squares -> all numbers by Levenberg-Marquardt, or recursively, or by steepest descent (options) -> simulation
-errors. Lags and units are compared by their error on held-out data, of the free run where the model is to simulate.
+least squares -> all numbers by Levenberg-Marquardt, or weights recursively, or by steepest descent (options) ->
+simulation errors. What is left open is compared by errors on held-out data, of the free run where the model is to
+simulate.
+
+Recursive Gauss-Newton is R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e (thesis eq. 1.14), with R kept as its
+triangle, to which blocks of rows are joined by orthogonal rotations; with mu = 1/(t + 1) and R_0 the prior's it is
+recursive least squares, and ends at the solution of all samples. Steepest descent is w <- w + rate phi e (thesis
+eq. 3.22, printed as W <- W eta e Phi', its plus sign lost). One sample's error after a step is (1 - rate |phi|^2) e, so
+that it grows where the rate is over 2/|phi|^2; the rate is kept at 1/|phi|^2 at most, as in NLMS.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, cached_property, partial
+from itertools import pairwise
 from time import perf_counter
+from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.linear import directions
+from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick, portions
-from ambid.estimation.search import search
-from ambid.nonlinear.blocks import UNITS, unit_values
+from ambid.nonlinear.blocks import Block, Linear, Radial
 from ambid.nonlinear.fit import NO_WEIGHTS, LearningCurve, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction
+from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
+    Size,
+    choose_smallest,
     finish,
     guarded,
+    lag_sizes,
     laplace,
+    problem_at,
     refine,
     rms_error,
     split,
+    train_watched,
 )
-from ambid.nonlinear.rbf_network import (
-    DESCENT,
-    GAUSS_NEWTON,
-    UNBOUNDED,
-    RbfFunction,
-    k_means,
-    neighbour_widths,
-    ols_order,
-    rbf_problem,
-    solve_weights,
-    train_by_sample,
-    typical_size,
-)
-from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.records import Parts, Scaled, finite, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, whole
 
 _NEURONS = (2, 4, 8, 16, 32, 48)  # that are compared
 _WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
-_LAGS = (1, 2, 3, 4, 6)
 _FIRST = 12  # units with which lags are compared
 _MIDDLE = 1.4  # width, where it is not the question
 _AS_GOOD = 1.01
+_FAR = 1e6  # times as bad as one step ahead: a free run that diverges
 _NEIGHBOURS = 2
 _MOST_ROWS = 4000  # on which units are placed
 _CANDIDATES = 200  # of the data that may become a centre
 _PASSES = 20  # of steepest descent over the records
+_CHUNKS = 8  # of a pass, after each of which the error is looked at
 _NEAR = 1.0  # squared standard deviations from the optimum, of all that is trained together
 _HELD = 0.01  # part of the variance before the data that is left of a number of the linear part
+_DEPENDENT = 1e-10  # squared length left of a candidate that the chosen ones hold already
+_BLOCK = 4096
+_OPEN = 1e-4  # one over the standard deviation of the linear part and the constant before the data: next to no prior
+_GRID = 10.0 ** np.arange(-15.0, 4.0, 0.25)  # of sigma^2 / alpha^2, in squared singular values
+_BLIND = 1e-12  # part of the largest singular value of the linear part below which a direction is not there
+_FLOOR = 1e-14  # least variance of errors, scaled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +81,6 @@ class RbfSettings:
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
     linear: int = whole("1 for a linear part beside the units, 0 for none; 1", 0, 1, 1)
     neurons: int | None = whole("units; chosen by held-out error", 0, 200)
-    unit: str = choice("gaussian, inverse-multiquadric, thin-plate; gaussian", *UNITS)
     centres: str = choice("ols (orthogonal least squares among the data) or kmeans; ols", "ols", "kmeans")
     width: float | None = number(
         "in sizes of the data, with centres=kmeans in distances of neighbours; chosen by held-out error", 0.01, 100.0
@@ -82,17 +90,14 @@ class RbfSettings:
         "standard deviation of the units' weights before the data, scaled; by restricted likelihood", 1e-6, 1e9
     )
     training: str = choice(
-        "linear (least squares), recursive (Gauss-Newton by sample), descent (3.18-3.22); linear",
+        "linear (least squares), recursive (Gauss-Newton by sample), descent (3.22); linear",
         "linear", "recursive", "descent",
     )  # fmt: skip
     trained: str = choice(
         "weights, or all (centres, widths too, by Levenberg-Marquardt; with training=linear); weights",
         "weights", "all",
     )  # fmt: skip
-    rate: float | None = number(
-        "descent: of the steps, 0.02; recursive: least gain, 0 to count all samples alike", 0.0, 1e6
-    )
-    bounded: int = whole("descent: 1 to bound the rate so that no sample's error grows, 0 as in the thesis; 1", 0, 1, 1)
+    rate: float = number("of the steps of the descent, bounded so that no sample's error grows; 0.02", 1e-9, 1e6, 0.02)
     iterations: int = whole("of Levenberg-Marquardt, at most; 60", 1, 2000, 60)
     focus: str = choice(
         "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
@@ -103,13 +108,120 @@ class RbfSettings:
     )  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RbfFunction(LaggedFunction):
+    """yhat(t) = L z + c + W phi, z = [y(t-1), .., y(t-ny), u(t-nk), .., u(t-nk-nu+1)], phi as in `blocks.Radial`."""
+
+    kind: ClassVar[str] = "rbf"
+    title: ClassVar[str] = "radial basis network"
+    p: int  # outputs
+    m: int  # inputs
+    ny: int
+    nu: int
+    nk: int
+    linear: bool  # whether there is a linear part L z beside the units; the constant c is always there
+    neurons: int
+    metric: Array  # (n_seen, n_regressors), which regressors the units see
+
+    @cached_property
+    def regressors(self) -> Regressors:
+        """What it looks at."""
+        return lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk)
+
+    @cached_property
+    def line(self) -> Linear:
+        """The linear part."""
+        width = self.regressors.column.size if self.linear else 0
+        return Linear.over(self.p, slice(0, width), constant=True)
+
+    @cached_property
+    def units(self) -> Radial:
+        """The units."""
+        return Radial(n_outputs=self.p, metric=self.metric, neurons=self.neurons)
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """What it is the sum of."""
+        return self.line, self.units
+
+    @property
+    def n_line(self) -> int:
+        """Numbers of the linear part."""
+        return self.line.n_theta
+
+    @property
+    def n_weights(self) -> int:
+        """Numbers in L, c and W: those in which the function is linear. They come first."""
+        return self.n_line + self.units.sizes[0]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        channel, h = channel_names("y", self.p), self.neurons
+        out = [f"{o}: {x}" for o in channel for x in self.regressors.names if self.linear]
+        out += [f"{o}: 1" for o in channel] + [f"{o}: unit {k + 1}" for o in channel for k in range(h)]
+        out += [f"unit {k + 1}: centre {j + 1}" for k in range(h) for j in range(self.units.n_seen)]
+        return (*out, *(f"unit {k + 1}: log width" for k in range(h)))
+
+    def activations(self, theta: NDArray[Any], x: Array) -> NDArray[Any]:
+        """Return what the units give for regressors `x`, shape (n, neurons)."""
+        own = np.split(theta, self.edges[1:-1])[1]
+        return np.exp(-0.5 * self.units.squared(own, x @ self.metric.T))
+
+    def features(self, theta: Array, x: Array) -> Array:
+        """Return what weights multiply: regressors, if there is a linear part, one, and activations."""
+        return np.hstack([x[:, : self.line.width], np.ones((x.shape[0], 1)), self.activations(theta, x)])
+
+    def matrix(self, theta: Array) -> Array:
+        """Return the weights, (n_outputs, n_features)."""
+        (L, c), W = self.line.parts(theta[: self.n_line]), theta[self.n_line : self.n_weights].reshape(self.p, -1)
+        return np.hstack([L, c[:, None], W])
+
+    def with_matrix(self, theta: Array, W: Array) -> Array:
+        """Return the parameters with other weights."""
+        d = self.line.width
+        return np.concatenate([W[:, :d].ravel(), W[:, d], W[:, d + 1 :].ravel(), theta[self.n_weights :]])
+
+    def as_json(self) -> dict[str, Any]:
+        """As `LaggedFunction.as_json`."""
+        sizes = {"n_outputs": self.p, "n_inputs": self.m, "ny": self.ny, "nu": self.nu, "nk": self.nk}
+        sizes |= {"neurons": self.neurons, "linear": int(self.linear)}
+        return {"sizes": sizes, "unit": "gaussian", "metric": self.metric.tolist()}
+
+    @classmethod
+    def from_json(cls, found: dict[str, Any]) -> Self:
+        """Read it back."""
+        sizes = {k: int(v) for k, v in found["sizes"].items()}
+        p, m, linear = sizes.pop("n_outputs"), sizes.pop("n_inputs"), bool(sizes.pop("linear"))
+        width = p * sizes["ny"] + m * sizes["nu"]
+        metric = finite(found["metric"], np.size(found["metric"]), "metric").reshape(-1, width)
+        if found["unit"] != "gaussian":
+            raise ValueError(f"units are {found['unit']!r}, not gaussian")
+        return cls(p=p, m=m, linear=linear, metric=metric, **sizes)
+
+
+def rbf_problem(
+    function: RbfFunction, parts: Parts, theta: Array, prior: Array, start: Array, *, all_numbers: bool,
+    free: bool = False,
+) -> LaggedProblem:  # fmt: skip
+    """Return the problem with priors for weights (standard deviation `prior`), centres and widths (about `start`)."""
+    n, n_w, of = function.n_theta, function.n_weights, function.units
+    widths = np.exp(of.parts(function.split(start)[1])[2])
+    precision = np.concatenate(
+        [np.full(function.n_line, _OPEN), np.repeat(1.0 / prior, function.neurons),
+         np.repeat(1.0 / widths, of.n_seen), np.ones(function.neurons)]
+    )  # fmt: skip
+    mean = np.concatenate([np.zeros(n_w), start[n_w:]])
+    live = np.arange(n) < (n if all_numbers else n_w)
+    return problem_at(function, parts, theta, precision, mean=mean, live=live, free=free)
+
+
 @dataclass(slots=True, kw_only=True)
 class _Work(Draft):
     """A draft with what is known of its units."""
 
     start: Array  # (n_theta,), where centres and widths were put
     prior: Array  # (n_outputs,), standard deviation of the units' weights before the data
-    noise: Array | None = None  # (n_outputs,), where the weights' own solution has it
     all_numbers: bool = False  # whether centres and widths are trained
     at_optimum: bool = True  # so that a covariance makes sense
     width: float = float("nan")
@@ -122,10 +234,7 @@ class _Work(Draft):
 
     def problem(self, parts: Parts, theta: Array, *, free: bool = False) -> LaggedProblem:
         """Return what is trained, its errors of unit variance at `theta`."""
-        found = rbf_problem(self.network, parts, theta, self.prior, self.start, all_numbers=self.all_numbers, free=free)
-        if free or self.all_numbers or self.noise is None:
-            return found
-        return replace(found, weight=found.weight_of(np.diag(self.noise)))
+        return rbf_problem(self.network, parts, theta, self.prior, self.start, all_numbers=self.all_numbers, free=free)
 
 
 def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -137,11 +246,17 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     k-means; `tick` is called with the stage and may raise KeyboardInterrupt.
     """
     s = read_settings(RbfSettings, "rbf", settings)
-    if s.rate is None:
-        s = replace(s, rate=0.02 if s.training == "descent" else 0.0)
     if s.ny == 0 and s.nu == 0:
         raise EstimationError("rbf: ny and nu are both 0; nothing is left to predict from. Raise one of them")
-    _check_consistent(s)
+    if s.training != "linear" and s.trained == "all":
+        raise EstimationError(
+            f"rbf: training = {s.training} goes for the output weights alone, but trained = all. Leave one out"
+        )
+    if None in (s.ny, s.nu, s.neurons, s.width) and not s.held_out > 0:
+        raise EstimationError(
+            "rbf: held_out is 0, and what is left open is to be chosen by held-out errors. Raise it, or give ny, nu, "
+            "neurons and width"
+        )
     data = scaled_records("rbf", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
     work = _linear(s, data)
     failed = guarded(
@@ -153,34 +268,13 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     return failed or _finish(s, records, data, work, seed)
 
 
-def _check_consistent(s: RbfSettings) -> None:
-    """Refuse settings of which one makes the other void."""
-    if s.training == "recursive" and not (s.rate or 0.0) < 1.0:
-        raise EstimationError(
-            f"rbf: rate is {s.rate:g}; recursive training takes the least gain by it, which must be below 1. "
-            "Say 0 to count all samples alike"
-        )
-    if s.training != "linear" and s.trained == "all":
-        raise EstimationError(
-            f"rbf: training = {s.training} goes for the output weights alone, but trained = all. Leave one out"
-        )
-    if s.training == "descent" and not (s.rate or 0.0) > 0.0:
-        raise EstimationError("rbf: rate is 0, with which steepest descent does not move. Raise it")
-    if None in (s.ny, s.nu, s.neurons, s.width) and not s.held_out > 0:
-        raise EstimationError(
-            "rbf: held_out is 0, and what is left open is to be chosen by held-out errors. Raise it, or give ny, nu, "
-            "neurons and width"
-        )
-
-
 def _function(s: RbfSettings, parts: Parts, ny: int, nu: int, neurons: int, seen: str = "all") -> RbfFunction:
     p, m = parts[0][0].shape[1], parts[0][1].shape[1]
     nu = nu if m else 0
     outputs = np.arange(p * ny + m * nu) < p * ny
     rows = {"all": np.ones_like(outputs), "outputs": outputs, "inputs": ~outputs}[seen]
     return RbfFunction(
-        p=p, m=m, ny=ny, nu=nu, nk=s.nk, linear=bool(s.linear), neurons=neurons, unit_name=s.unit,
-        metric=np.eye(outputs.size)[rows],
+        p=p, m=m, ny=ny, nu=nu, nk=s.nk, linear=bool(s.linear), neurons=neurons, metric=np.eye(outputs.size)[rows],
     )  # fmt: skip
 
 
@@ -216,13 +310,16 @@ def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick |
     began = work.timed("choice", began)
     if ticks[1] is not None:
         ticks[1]("output weights", 0.0)
-    _solve(s, function, start, data, work)
+    noise = _solve(s, function, start, data, work)
     began = work.timed("output weights", began)
     work.all_numbers = s.trained == "all" and function.neurons > 0
     if s.training != "linear":
-        _recur(s, data, work, ticks[2])
+        _recur(s, data, work, noise, ticks[2])
     elif work.all_numbers:
-        _tune(s, data, work, ticks[2])
+        train_watched(
+            work, work.problem, data.parts, s.held_out, "Levenberg-Marquardt, all numbers, one-step errors", ticks[2],
+            most=s.iterations, n_linear=function.n_weights,
+        )  # fmt: skip
     began = work.timed("training", began)
     if free:
         refine(work, partial(work.problem, data.parts, free=True), s.iterations, ticks[3], "units")
@@ -230,86 +327,44 @@ def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick |
         work.timed("simulation errors", began)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Tried:
-    """One candidate."""
-
-    ny: int
-    nu: int
-    neurons: int
-    width: float
-    seen: str
-    score: float  # root mean square error on held-out data, in deviations of the outputs
-    one_step: float  # the same of the predictions, where `score` is that of the free run
+# --- choice of lags and units ----------------------------------------------------------------------------------------
 
 
 def _choose(s: RbfSettings, parts: Parts, work: _Work, seed: int, tick: Tick | None) -> tuple[RbfFunction, Array]:
     """Choose what is left open, and place the units, weights of zero: the least that do about as well as the best."""
-    ny, nu, tried = _choose_lags(s, parts, seed, tick)
-    both = ny > 0 and nu > 0 and parts[0][1].shape[1] > 0
-    questions = [
-        (seen, width)
+    tried, counts = list[Size](), _NEURONS if s.neurons is None else (s.neurons,)
+
+    @cache
+    def placing(ny: int, nu: int, seen: str) -> tuple[Placing, Parts]:
+        function = _function(s, parts, ny, nu, 0, seen)
+        training, held = split(parts, s.held_out, function.lag)
+        return Placing(s, function, training, seed, most=max(counts)), held
+
+    def score(of: Size, tick: Tick | None) -> float:
+        del tick
+        at, held = placing(of["ny"], of["nu"], of["seen"])
+        function, start = at.start(of["neurons"], of["width"])
+        theta = solve_weights(function, start, at.x, at.y, s.prior).theta
+        one_step = rms_error(function, theta, held)
+        run = rms_error(function, theta, held, free=True) if s.focus == "simulation" else one_step
+        return run if np.isfinite(run) else _FAR * one_step
+
+    few = {"neurons": min(max(counts), _FIRST), "width": s.width or _MIDDLE, "seen": "all"}
+    sizes = [{**x, **few} for x in lag_sizes(s.ny, s.nu, s.nk, parts, s.held_out)]
+    lags_tick, units_tick = portions(tick, (0.2, 0.8))
+    found = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
+    both = found["ny"] > 0 and found["nu"] > 0 and s.held_out > 0
+    sizes = [
+        {**found, "neurons": h, "seen": seen, "width": width}
+        for h in counts
         for seen in (("outputs", "inputs", "all") if both else ("all",))
         for width in (_WIDTHS if s.width is None else (s.width,))
     ]
-    neurons, width, seen = s.neurons, s.width, questions[0][0]
-    if (neurons is None or width is None or both) and s.held_out > 0:
-        found: list[_Tried] = []
-        for i, (which, w) in enumerate(questions):
-            if tick is not None:
-                tick("choice of units", 0.2 + 0.8 * i / len(questions))
-            found += _scores(s, parts, ny, nu, _NEURONS if neurons is None else (neurons,), w, which, seed)
-        tried += found
-        one = _least(sorted(found, key=lambda t: t.neurons))
-        neurons, width, seen = (one.neurons if neurons is None else neurons), one.width, one.seen
-    else:
-        seen = "all"
-    assert neurons is not None
-    assert width is not None
-    work.width = width
-    work.details.update(seen=seen, tried=[asdict(x) for x in tried])
-    placing = Placing(s, _function(s, parts, ny, nu, neurons, seen), parts, seed, most=neurons)
-    return placing.start(neurons, width)
-
-
-def _choose_lags(s: RbfSettings, parts: Parts, seed: int, tick: Tick | None) -> tuple[int, int, list[_Tried]]:
-    """Choose the lags with few units of middle width that see all of them."""
-    if s.ny is not None and s.nu is not None:
-        return s.ny, s.nu, []
-    short = min(y.shape[0] for y, _ in parts)
-    tries = [k for k in _LAGS if 3 * (k + s.nk) < short * (s.held_out or 0.2)] or [1]
-    few, tried = min(_FIRST if s.neurons is None else s.neurons, _FIRST), list[_Tried]()
-    for i, k in enumerate(tries):
-        if tick is not None:
-            tick("choice of lags", 0.2 * i / len(tries))
-        ny, nu = (k if s.ny is None else s.ny), (k if s.nu is None else s.nu)
-        tried += _scores(s, parts, ny, nu, (few,), s.width or _MIDDLE, "all", seed)
-    one = _least(tried)
-    return one.ny, one.nu if s.nu is None else s.nu, tried
-
-
-def _scores(
-    s: RbfSettings, parts: Parts, ny: int, nu: int, counts: Sequence[int], width: float, seen: str, seed: int
-) -> list[_Tried]:
-    function = _function(s, parts, ny, nu, 0, seen)
-    training, held = split(parts, s.held_out, function.lag)
-    placing, out = Placing(s, function, training, seed, most=max(counts)), list[_Tried]()
-    for count in counts:
-        at, start = placing.start(count, width)
-        theta = solve_weights(at, start, placing.x, placing.y, s.prior).theta
-        score = one_step = rms_error(at, theta, held)
-        if s.focus == "simulation":
-            score = rms_error(at, theta, held, free=True)
-        out.append(_Tried(ny=ny, nu=at.nu, neurons=at.neurons, width=width, seen=seen, score=score, one_step=one_step))
-    return out
-
-
-def _least(tried: Sequence[_Tried]) -> _Tried:
-    """Return the first that is about as good as the best."""
-    scores = [x.score for x in tried]
-    if not np.any(np.isfinite(scores)):  # every free run diverges
-        scores = [x.one_step for x in tried]
-    return tried[next((k for k, x in enumerate(scores) if x <= _AS_GOOD * min(scores)), 0)]
+    found = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
+    work.width = found["width"]
+    work.details.update(seen=found["seen"], tried=tried)
+    function = _function(s, parts, found["ny"], found["nu"], found["neurons"], found["seen"])
+    return Placing(s, function, parts, seed, most=found["neurons"]).start(found["neurons"], found["width"])
 
 
 class Placing:
@@ -330,7 +385,7 @@ class Placing:
     def start(self, neurons: int, width: float) -> tuple[RbfFunction, Array]:
         """Return units with weights of zero; fewer than asked for where the data have no place for more."""
         C = self._centres(neurons, width)
-        function = self.function.with_neurons(C.shape[0])
+        function = replace(self.function, neurons=C.shape[0])
         widths = np.full(C.shape[0], width * self.size)
         if self.s.centres == "kmeans":
             widths = width * neighbour_widths(C, _NEIGHBOURS, self.size)
@@ -358,78 +413,227 @@ class Placing:
         for j in range(C.shape[1]):
             squares += (self.seen[:, j, None] - C[:, j]) ** 2
         known = np.hstack([self.x if self.s.linear else self.x[:, :0], np.ones((n, 1))])
-        order, _ = ols_order(unit_values(self.s.unit, squares / (width * self.size) ** 2), known, self.y, self.most)
+        order, _ = ols_order(np.exp(-0.5 * squares / (width * self.size) ** 2), known, self.y, self.most)
         return C[order]
 
 
-def _solve(s: RbfSettings, function: RbfFunction, start: Array, data: Scaled, work: _Work) -> None:
-    """Find the output weights; the error on held-out data is that of weights that have not seen them."""
+def typical_size(x: Array) -> float:
+    """Return the root mean square distance from the middle of the data."""
+    found = float(np.sqrt(np.sum(np.var(x, axis=0))))
+    return found if found > 0 else 1.0
+
+
+def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
+    """Return at most `k` centres by k-means++ and Lloyd's iterations; fewer where there are fewer different points."""
+    from scipy.cluster.vq import kmeans2
+
+    k = min(k, np.unique(x, axis=0).shape[0])
+    with warnings.catch_warnings():  # an empty cluster keeps its centre
+        warnings.simplefilter("ignore", UserWarning)
+        return np.asarray(kmeans2(x, k, iter=50, minit="++", seed=rng)[0])
+
+
+def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDArray[np.int64], Array]:
+    """Choose regressors by orthogonal least squares, beside some that are in the model in any case.
+
+    It takes, again and again, that candidate which explains most of what is left of all outputs (Chen, Cowan and Grant
+    1991), by Gram-Schmidt on the candidates themselves: units that overlap are nearly dependent, and their Gram matrix
+    has too few digits to tell them apart. Returns their order, and the part of what the known regressors leave of the
+    outputs' energy that each explains.
+    """
+    free = y.shape[0] - known.shape[1] - 1
+    m, d = candidates.shape[1], known.shape[1]
+    R = triangle_of([np.hstack([known, candidates, y])])  # the same lengths and angles in fewer rows
+    length = np.sum(R[:, d : d + m] ** 2, axis=0)
+    left, _ = _beyond(R[:, :d], R[:, d:])
+    P, rest = left[:, :m], left[:, m:]
+    energy = max(float(np.sum(rest**2)), 1e-300)
+    order: list[int] = []
+    err: list[float] = []
+    alive = np.ones(P.shape[1], dtype=bool)
+    while len(order) < min(most, free):
+        squared = np.sum(P**2, axis=0)
+        alive &= squared > _DEPENDENT * length
+        if not np.any(alive):
+            break
+        gain = np.where(alive, np.sum((P.T @ rest) ** 2, axis=1) / np.where(alive, squared, 1.0), -1.0)
+        pick = int(np.argmax(gain))
+        w = P[:, pick] / np.sqrt(squared[pick])
+        P -= np.outer(w, w @ P)
+        rest -= np.outer(w, w @ rest)
+        alive[pick] = False
+        order.append(pick)
+        err.append(float(gain[pick]) / energy)
+    return np.array(order, dtype=np.int64), np.array(err)
+
+
+def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
+    """Return the root mean square distance of each centre to its nearest ones (Moody and Darken 1989)."""
+    if C.shape[0] < 2:
+        return np.full(C.shape[0], otherwise)
+    squares = np.sum((C[:, None, :] - C) ** 2, axis=2)
+    near = np.sort(squares, axis=1)[:, 1 : 1 + among]
+    found = np.sqrt(np.mean(near, axis=1))
+    return np.where(found > 1e-6 * otherwise, found, otherwise)
+
+
+# --- output weights ---------------------------------------------------------------------------------------------------
+
+
+def _solve(s: RbfSettings, function: RbfFunction, start: Array, data: Scaled, work: _Work) -> Array:
+    """Find the output weights; returns the variance of the errors of each output."""
     began = perf_counter()
     x, y = _measured(function, data.parts)
     found = solve_weights(function, start, x, y, s.prior)
-    took = perf_counter() - began
-    training, held = split(data.parts, s.held_out, function.lag)
-    if held:
-        part = solve_weights(function, start, *_measured(function, training), s.prior)
-        work.held_out = rms_error(function, part.theta, held)
-    work.function, work.theta, work.start, work.prior, work.noise = (
-        function, found.theta, start, found.prior, found.noise
-    )  # fmt: skip
-    training_error = rms_error(function, found.theta, data.parts)
-    work.curves.append(
-        LearningCurve(
-            method="linear least squares, output weights",
-            seconds=np.array([0.0, took]),
-            training=np.array([float(np.sqrt(np.mean(y**2))), training_error]),
-        )
-    )
+    seconds = np.array([0.0, perf_counter() - began])
+    work.function, work.theta, work.start, work.prior = function, found.theta, start, found.prior
+    error = rms_error(function, found.theta, data.parts)
+    training = np.array([float(np.sqrt(np.mean(y**2))), error])
+    work.curves.append(LearningCurve(method="linear least squares, output weights", seconds=seconds, training=training))
+    return found.noise
 
 
-def _tune(s: RbfSettings, data: Scaled, work: _Work, tick: Tick | None) -> None:
-    """Go on with centres and widths as well, watched on held-out data, and end on all data."""
-    function = work.network
-    training, held = split(data.parts, s.held_out, function.lag)
-    method = "Levenberg-Marquardt, all numbers, one-step errors"
-    if held:
-        part = solve_weights(function, work.start, *_measured(function, training), s.prior)
-        problem = rbf_problem(function, training, part.theta, part.prior, work.start, all_numbers=True)
-        first, tick = portions(tick, (1.0, 1.0))
-        watch: Callable[[Array], float] = lambda theta: rms_error(function, theta, held)  # noqa: E731
-        found = search(problem, part.theta, stage="training", most=s.iterations, held_out=watch, tick=first)
-        work.note(found, problem, method)
-        work.held_out, work.stopped_early = watch(found.theta), found.stopped_early
-        if found.stopped_early:  # more would learn the noise
-            work.theta = found.theta
-            return
-    for round_ in range(2):  # the errors' sizes are known only afterwards
-        problem = work.problem(data.parts, work.theta)
-        found = search(problem, work.theta, stage="all data", most=s.iterations, tick=tick)
-        work.theta = found.theta
-        if not held and not round_:
-            work.note(found, problem, method)
-    work.status = "converged" if found.converged else "stalled"
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weights:
+    """Weights with what they came from."""
+
+    theta: Array  # (n_theta,), with the centres and widths that were given
+    noise: Array  # (n_outputs,), variance of the errors, scaled
+    prior: Array  # (n_outputs,), standard deviation of the units' weights before the data, alpha
+    effective: Array  # (n_outputs,), numbers that the data determine
 
 
-def _recur(s: RbfSettings, data: Scaled, work: _Work, tick: Tick | None) -> None:
-    """Train sample by sample, from weights of zero; beside steepest descent recursive Gauss-Newton is shown too."""
-    problem = work.problem(data.parts, work.theta)
-    rate, method = s.rate or 0.0, GAUSS_NEWTON
-    if s.training == "descent":
-        method = DESCENT if s.bounded else UNBOUNDED
-    first, second = portions(tick, (1.0, float(method != GAUSS_NEWTON)))
-    theta, curve = train_by_sample(problem, work.theta, method, rate, 1 if method == GAUSS_NEWTON else _PASSES, first)
+def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior: float | None) -> Weights:
+    """Solve for the output weights of units that stand, min |y - F l - Phi w|^2 / sigma^2 + |w|^2 / alpha^2.
+
+    The linear part l has no prior. One QR of [F | Phi | y], then singular values of what F leaves of Phi: every prior
+    costs a line. Left open, sigma and alpha are those of the restricted likelihood, output by output (Patterson and
+    Thompson 1971; MacKay's evidence 1992), so that Laplace's covariance is honest.
+    """
+    n, p, h = y.shape[0], function.p, function.neurons
+    d = 1 + function.line.width
+
+    def columns(k: int) -> Array:
+        part = slice(k, k + _BLOCK)
+        return np.hstack([function.features(theta, x[part]), y[part]])
+
+    R = np.zeros((d + h + p, d + h + p))
+    with np.errstate(over="ignore", invalid="ignore"):
+        small = triangle_of([columns(k) for k in range(0, n, _BLOCK)])
+    if not np.all(np.isfinite(small)):
+        raise np.linalg.LinAlgError("regressors are not finite")
+    R[: small.shape[0]] = small
+    left, rank = _beyond(R[:, :d], R[:, d:])
+    U, s, Vt = np.linalg.svd(left[:, :h], full_matrices=False)
+    g = U.T @ left[:, h:]
+    rest = np.sum((left[:, h:] - U @ g) ** 2, axis=0)
+    w, noise, alpha, effective = np.zeros((h, p)), np.empty(p), np.empty(p), np.empty(p)
+    for o in range(p):
+        ratio, noise[o] = _ratio(s**2, g[:, o] ** 2, float(rest[o]), n - rank, prior)
+        w[:, o] = Vt.T @ (s / (s**2 + ratio) * g[:, o])
+        alpha[o] = np.sqrt(noise[o] / ratio)
+        effective[o] = rank + np.sum(s**2 / (s**2 + ratio))
+    line = np.linalg.lstsq(R[:, :d], R[:, d + h :] - R[:, d : d + h] @ w, rcond=_BLIND)[0]
+    found = function.with_matrix(theta, np.concatenate([line, w]).T)
+    return Weights(theta=found, noise=noise, prior=alpha, effective=effective)
+
+
+def _beyond(known: Array, others: Array) -> tuple[Array, int]:
+    """Return what known columns, some of which may be the same, leave of others, and the rank of the known ones."""
+    U, s, _ = np.linalg.svd(known, full_matrices=False)
+    U = U[:, s > _BLIND * max(float(s[0]), 1e-300)]
+    for _ in range(2):  # twice is enough
+        others = others - U @ (U.T @ others)
+    return others, U.shape[1]
+
+
+def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float | None) -> tuple[float, float]:
+    """Return sigma^2 / alpha^2 and sigma^2."""
+    top, free = max(float(squares.max(initial=0.0)), 1e-300), max(free, 1)
+
+    def noise(ratio: Array) -> Array:
+        left = rest + np.sum(products[:, None] * ratio / (squares[:, None] + ratio), axis=0)
+        found: Array = np.maximum(left / free, _FLOOR)
+        return found
+
+    if squares.size == 0:
+        sigma2 = float(noise(np.ones(1))[0])
+        return sigma2 if prior is None else sigma2 / prior**2, sigma2
+    if prior is not None:
+        ratio = np.array([_FLOOR])
+        for _ in range(30):
+            ratio = noise(ratio) / prior**2
+        return float(ratio[0]), float(noise(ratio)[0])
+    grid = _GRID * top
+    for _ in range(3):
+        minus_log = free * np.log(noise(grid)) + np.sum(np.log1p(squares[:, None] / grid), axis=0)
+        at = int(np.argmin(minus_log))
+        low, high = grid[max(at - 1, 0)], grid[min(at + 1, grid.size - 1)]
+        best = grid[at]
+        grid = np.geomspace(low, high, 21)
+    return float(best), float(noise(np.array([best]))[0])
+
+
+# --- sample by sample -------------------------------------------------------------------------------------------------
+
+
+def _recur(s: RbfSettings, data: Scaled, work: _Work, noise: Array, tick: Tick | None) -> None:
+    """Train the output weights sample by sample, from zero."""
+    of, rate = work.network, s.rate if s.training == "descent" else None
+    pull = of.matrix(work.problem(data.parts, work.theta).precision) * np.sqrt(noise)[:, None]
+    work.theta, curve = train_by_sample(of, work.theta, *_measured(of, data.parts), pull, rate, tick)
     work.curves.append(curve)
-    if method != GAUSS_NEWTON:
-        work.curves.append(train_by_sample(problem, work.theta, GAUSS_NEWTON, 0.0, 1, second)[1])
-    work.theta = theta
-    R = work.problem(data.parts, theta).triangle(theta[problem.live])
+    problem = work.problem(data.parts, work.theta)
+    R = problem.triangle(work.theta[problem.live])
     left = directions(R[:, :-1]).explain(R[:, -1]) if np.all(np.isfinite(R)) else np.inf
     if not left < _NEAR:
         work.status, work.at_optimum = "stalled", False
         work.warnings.append(
-            f"{method} has not converged: a batch step would still lower the sum of squares by {left:.3g} times "
+            f"{curve.method} has not converged: a batch step would still lower the sum of squares by {left:.3g} times "
             "the errors' variance, and so there are no standard deviations. Say training = linear"
         )
+
+
+def train_by_sample(
+    of: RbfFunction, theta: Array, x: Array, y: Array, pull: Array, rate: float | None, tick: Tick | None
+) -> tuple[Array, LearningCurve]:
+    """Train the weights on regressors and outputs, from zero: by steepest descent with a rate, or by Gauss-Newton.
+
+    `pull` (n_outputs, n_features) is the errors' standard deviation over that of the prior.
+    """
+    from ambid.nonlinear.lagged_kernels import descent_pass
+
+    F = np.ascontiguousarray(of.features(theta, x))
+    (N, d), W = F.shape, np.zeros((of.p, F.shape[1]))
+    method, passes = ("recursive Gauss-Newton", 1) if rate is None else ("steepest descent, bounded rate", _PASSES)
+    edges = np.unique(np.linspace(0, N, _CHUNKS + 1).astype(np.int64)).tolist()
+    descent_pass(F[:0], y[:0], 0.0, W)  # loads the compiled loop, which is no part of the training
+    R = [np.hstack([np.diag(own), np.zeros((d, 1))]) for own in pull]
+    began, seconds, errors = perf_counter(), [0.0], [_rms(y)]
+    for k in range(passes):
+        for first, last in pairwise(edges):
+            part = slice(first, last)
+            if tick is not None:
+                tick(method, (k + first / N) / passes)
+            if rate is None:
+                for o in range(of.p):
+                    R[o] = triangle_of([R[o], np.column_stack([F[part], y[part, o]])])
+                    W[o] = np.linalg.solve(R[o][:d, :d], R[o][:d, d])
+            else:
+                descent_pass(F[part], y[part], rate, W)
+            if not np.all(np.isfinite(W)):
+                raise FloatingPointError(f"{method} diverged in pass {k + 1} near sample {first}: say a lower rate")
+            seconds.append(perf_counter() - began)
+            errors.append(_rms(y - F @ W.T))
+    curve = LearningCurve(method=method, seconds=np.array(seconds), training=np.array(errors))
+    return of.with_matrix(theta, W), curve
+
+
+def _rms(e: Array) -> float:
+    return float(np.sqrt(np.mean(e**2)))
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
 
 
 def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work, seed: int) -> NonlinearFit:
@@ -437,9 +641,7 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
     used = {**asdict(s), "ny": of.ny, "nu": of.nu, "neurons": of.neurons, "width": work.width}
     used["prior"] = float(np.exp(np.mean(np.log(work.prior))))
     used["focus"] = "simulation" if work.free else "prediction"
-    problem = rbf_problem(
-        of, data.parts, work.theta, work.prior, work.start, all_numbers=work.all_numbers, free=work.free
-    )
+    problem = work.problem(data.parts, work.theta, free=work.free)
     if not np.isfinite(problem.cost(work.theta)):
         return failed_fit("rbf", records, used, seed, NO_WEIGHTS, work.timing_s)
     found = laplace(problem, work.theta)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.rbf_network import RbfFunction
+from ambid.nonlinear.rbf import RbfFunction
 
 Array = NDArray[np.float64]
 
@@ -19,12 +19,12 @@ def data(u: Array, y: Array, *, open_loop: bool = True) -> IOData:
 
 
 def network(
-    p: int = 1, m: int = 1, *, ny: int = 1, nu: int = 1, nk: int = 1, neurons: int = 3, unit: str = "gaussian",
+    p: int = 1, m: int = 1, *, ny: int = 1, nu: int = 1, nk: int = 1, neurons: int = 3,
     linear: bool = True, metric: Array | None = None,
 ) -> RbfFunction:  # fmt: skip
     nu = nu if m else 0
     M = np.eye(p * ny + m * nu) if metric is None else metric
-    return RbfFunction(p=p, m=m, ny=ny, nu=nu, nk=nk, linear=linear, neurons=neurons, unit_name=unit, metric=M)
+    return RbfFunction(p=p, m=m, ny=ny, nu=nu, nk=nk, linear=linear, neurons=neurons, metric=M)
 
 
 CENTRES = np.array([[-1.0, 0.8], [1.2, 1.0], [0.2, -1.2]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.nonlinear.rbf_network import k_means, neighbour_widths, ols_order, typical_size
+from ambid.nonlinear.rbf import k_means, neighbour_widths, ols_order, typical_size
 from ambid.nonlinear.selection import MatrixCandidates, select_terms
 
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from ambid.nonlinear.lagged_problem import laplace
-from ambid.nonlinear.rbf_network import RbfFunction, rbf_problem, solve_weights
+from ambid.nonlinear.rbf import RbfFunction, rbf_problem, solve_weights
 from tests.nonlinear.rbf.systems import CENTRES, WIDTHS, bumpy, network
 
 
