@@ -274,6 +274,12 @@ def solve_linear(problem: LaggedProblem, n: int, v: Array) -> Array:
     return out
 
 
+def linear_start(function: LaggedFunction, parts: Parts, n: int) -> Array:
+    """Return the first `n` numbers of a function, those of a linear model, by least squares, all others zero."""
+    theta = np.zeros(function.n_theta)
+    return solve_linear(problem_at(function, parts, theta, weight=np.eye(function.n_outputs)), n, theta)
+
+
 def draw_start(
     problem: LaggedProblem, n: int, v: Array, neurons: int, width: int, rng: np.random.Generator, draws: int
 ) -> Array:

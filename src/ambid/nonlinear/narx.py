@@ -36,6 +36,7 @@ from ambid.nonlinear.lagged_problem import (
     guarded,
     lag_sizes,
     laplace,
+    linear_start,
     problem_at,
     refine,
     rms_error,
@@ -148,7 +149,9 @@ def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: 
         raise EstimationError("narx: ny and nu are both 0; nothing is left to predict from. Raise one of them")
     data = scaled_records("narx", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
     function = _function(data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, s.nk, 0)
-    draft = Draft(function=function, theta=linear_start(function, data.parts))  # for an interruption at once
+    draft = Draft(
+        function=function, theta=linear_start(function, data.parts, int(function.edges[1]))
+    )  # for an interruption at once
     spread: list[Array] = []
     failed = guarded(
         lambda: _identify(s, data, draft, spread, seed, tick), draft,
@@ -200,7 +203,7 @@ def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: 
         function = _function(parts, of["ny"], of["nu"], s.nk, of["neurons"])
         most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
         training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
-        problem = narx_problem(function, training, linear_start(function, training), s.prior)
+        problem = narx_problem(function, training, linear_start(function, training, int(function.edges[1])), s.prior)
         start = _random_start(problem, function, np.random.default_rng(seed))
         watch = partial(_error, function, held)
         return min(
@@ -236,7 +239,7 @@ def _train_all(
 ) -> None:
     """Train from several starts, and go on with the best."""
     training, held = split(data.parts, s.held_out, function.lag)
-    draft.function, draft.theta = function, linear_start(function, training)
+    draft.function, draft.theta = function, linear_start(function, training, int(function.edges[1]))
     problem = narx_problem(function, training, draft.theta, s.prior)
     rng, least = np.random.default_rng(seed), np.inf
     watch = partial(_error, function, held) if held else None
@@ -260,16 +263,6 @@ def _train_all(
             "over the last ten: raise iterations if that matters. Standard deviations are those of a linearisation "
             "there"
         )
-
-
-def linear_start(function: NarxFunction, parts: Parts) -> Array:
-    """Return the weights of the best linear model, the hidden layer's zero."""
-    rows = [function.rows(y, u) for y, u in parts]
-    x, y = np.concatenate([r.x for r in rows]), np.concatenate([r.y for r in rows])
-    found = np.linalg.lstsq(np.hstack([x, np.ones((x.shape[0], 1))]), y, rcond=1e-12)[0]
-    theta = np.zeros(function.n_theta)
-    theta[: found.size] = np.concatenate([found[:-1].T.ravel(), found[-1]])
-    return theta
 
 
 def _finish(

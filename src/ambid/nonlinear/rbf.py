@@ -42,6 +42,7 @@ from ambid.nonlinear.lagged_problem import (
     guarded,
     lag_sizes,
     laplace,
+    linear_start,
     problem_at,
     refine,
     rms_error,
@@ -287,11 +288,8 @@ def _measured(function: LaggedFunction, parts: Parts) -> tuple[Array, Array]:
 def _linear(s: RbfSettings, data: Scaled) -> _Work:
     """A model without units: something to hand over when the very next thing is an interruption."""
     function = _function(s, data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, 0)
-    x, y = _measured(function, data.parts)
-    known = np.hstack([x if s.linear else x[:, :0], np.ones((x.shape[0], 1))])
-    found = np.linalg.lstsq(known, y, rcond=1e-12)[0]
-    theta = np.concatenate([found[:-1].T.ravel(), found[-1]])
-    return _Work(function=function, theta=theta, start=theta, prior=np.ones(y.shape[1]))
+    theta = linear_start(function, data.parts, function.n_theta)
+    return _Work(function=function, theta=theta, start=theta, prior=np.ones(function.p))
 
 
 def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick | None) -> None:
@@ -380,7 +378,8 @@ class Placing:
         self.x, self.y = x[::step], y[::step]
         self.seen = self.x @ function.metric.T
         self.size = typical_size(self.seen)
-        self._found: dict[tuple[int, float], Array] = {}
+        self.by_means = cache(lambda k: k_means(self.seen, k, np.random.default_rng([seed, 2])))
+        self.by_ols = cache(self._order)
 
     def start(self, neurons: int, width: float) -> tuple[RbfFunction, Array]:
         """Return units with weights of zero; fewer than asked for where the data have no place for more."""
@@ -395,26 +394,16 @@ class Placing:
         neurons = min(neurons, max((self.x.shape[0] - self.function.n_line) // 2, 0))  # two samples for each
         if not neurons or not self.function.units.n_seen:
             return np.empty((0, self.function.units.n_seen))
-        rng = np.random.default_rng([self.seed, 2])
-        if self.s.centres == "kmeans":
-            key = (neurons, 0.0)
-            if key not in self._found:
-                self._found[key] = k_means(self.seen, neurons, rng)
-            return self._found[key]
-        key = (0, width)
-        if key not in self._found:
-            self._found[key] = self._by_ols(width, rng)
-        return self._found[key][:neurons]
+        return self.by_means(neurons) if self.s.centres == "kmeans" else self.by_ols(width)[:neurons]
 
-    def _by_ols(self, width: float, rng: np.random.Generator) -> Array:
-        n = self.x.shape[0]
+    def _order(self, width: float) -> Array:
+        n, rng = self.x.shape[0], np.random.default_rng([self.seed, 2])
         C = self.seen[np.sort(rng.permutation(n)[: max(_CANDIDATES, 2 * self.most)])]
         squares = np.zeros((n, C.shape[0]))
         for j in range(C.shape[1]):
             squares += (self.seen[:, j, None] - C[:, j]) ** 2
         known = np.hstack([self.x if self.s.linear else self.x[:, :0], np.ones((n, 1))])
-        order, _ = ols_order(np.exp(-0.5 * squares / (width * self.size) ** 2), known, self.y, self.most)
-        return C[order]
+        return C[ols_order(np.exp(-0.5 * squares / (width * self.size) ** 2), known, self.y, self.most)]
 
 
 def typical_size(x: Array) -> float:
@@ -433,13 +422,12 @@ def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
         return np.asarray(kmeans2(x, k, iter=50, minit="++", seed=rng)[0])
 
 
-def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDArray[np.int64], Array]:
+def ols_order(candidates: Array, known: Array, y: Array, most: int) -> list[int]:
     """Choose regressors by orthogonal least squares, beside some that are in the model in any case.
 
     It takes, again and again, that candidate which explains most of what is left of all outputs (Chen, Cowan and Grant
     1991), by Gram-Schmidt on the candidates themselves: units that overlap are nearly dependent, and their Gram matrix
-    has too few digits to tell them apart. Returns their order, and the part of what the known regressors leave of the
-    outputs' energy that each explains.
+    has too few digits to tell them apart. Returns their order.
     """
     free = y.shape[0] - known.shape[1] - 1
     m, d = candidates.shape[1], known.shape[1]
@@ -447,9 +435,7 @@ def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDA
     length = np.sum(R[:, d : d + m] ** 2, axis=0)
     left, _ = _beyond(R[:, :d], R[:, d:])
     P, rest = left[:, :m], left[:, m:]
-    energy = max(float(np.sum(rest**2)), 1e-300)
     order: list[int] = []
-    err: list[float] = []
     alive = np.ones(P.shape[1], dtype=bool)
     while len(order) < min(most, free):
         squared = np.sum(P**2, axis=0)
@@ -463,8 +449,7 @@ def ols_order(candidates: Array, known: Array, y: Array, most: int) -> tuple[NDA
         rest -= np.outer(w, w @ rest)
         alive[pick] = False
         order.append(pick)
-        err.append(float(gain[pick]) / energy)
-    return np.array(order, dtype=np.int64), np.array(err)
+    return order
 
 
 def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
