@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.model import PolynomialModel
 from peers import Array, Model
 
 SETTLED = 500  # samples run before a record that is cut out of a longer run

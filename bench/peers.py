@@ -23,10 +23,8 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.structures import structure as registered
+from ambid.blackbox.fit import structure as registered
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel
 from ambid.errors import EstimationError
 
 HERE = Path(__file__).resolve().parent

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import Offsets, StateSpaceModel
 from peers import Answer, Array, Bench, Way, bench, ways
 from table import Table
 from timing import quantity

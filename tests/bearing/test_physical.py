@@ -14,10 +14,7 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.blackbox import structures
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import EstimationError
 from ambid.physics.discretise import discretise
 from ambid.physics.models import model

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.fit import STRUCTURES, BlackBoxFit, Structure
 from ambid.blackbox.fit_file import fit_from_json, fit_text
 from ambid.blackbox.model import response_covariance
 from ambid.blackbox.prediction import innovations_form
-from ambid.blackbox.structures import STRUCTURES, Structure
 from ambid.errors import EstimationError
 from ambid.validate.fits import judge
 from tests.blackbox import systems

@@ -7,9 +7,7 @@ import pytest
 import scipy.signal
 
 from ambid.blackbox.convert import to_control, to_scipy
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import ModelError
 
 control = pytest.importorskip("control", reason="python-control is an optional dependency (ambid[control])")

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets, one_step, simulation
-from ambid.blackbox.roots import root_derivative, roots_at
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import (
+    Offsets,
+    PolynomialModel,
+    Polynomials,
+    StateSpaceModel,
+    TransferModel,
+    root_derivative,
+    roots_at,
+)
+from ambid.blackbox.prediction import one_step, simulation
 
 DT = 1e-3
 OMEGA = np.array([3.0, 50.0, 400.0, 2500.0])

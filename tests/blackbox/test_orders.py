@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import check_length, check_order_names, compact_order, left_open, order_per_input, single_order
-from ambid.blackbox.structures import STRUCTURES, Structure
+from ambid.blackbox.fit import STRUCTURES, Structure
 from ambid.errors import EstimationError
 from tests.blackbox import systems
 
@@ -54,7 +54,9 @@ def test_every_structure_names_a_missing_order_and_one_that_it_cannot_choose(s: 
         assert "cannot choose it; give a number" in said
 
 
-COUNTED = [(s, name) for s in ALL for name in s.orders if name in _PER_INPUT and (s.name, name) != ("weakform", "nf")]
+COUNTED = [
+    (s, name) for s in ALL for name in s.orders if name in _PER_INPUT and (s.kind, name) != ("transfer function", "nf")
+]
 
 
 @pytest.mark.parametrize(("s", "name"), COUNTED, ids=[f"{s.name} {name}" for s, name in COUNTED])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.response import Offsets, one_step
+from ambid.blackbox.model import Offsets, StateSpaceModel
+from ambid.blackbox.prediction import one_step
 
 NONE = Offsets(u=np.zeros(1), y=np.zeros(1))
 

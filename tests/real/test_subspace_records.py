@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.response import one_step, simulation
+from ambid.blackbox.prediction import one_step, simulation
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid
 from tests.measured import ABSENT, BENCHMARKS
 

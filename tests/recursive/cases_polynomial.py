@@ -6,8 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials
 from ambid.recursive.polynomial import RecursivePolynomial
 from tests.recursive.cases import Case
 

@@ -9,7 +9,7 @@ from matplotlib.patches import Ellipse
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.structures import structure
+from ambid.blackbox.fit import structure
 from ambid.report.fit_figures import fit_overview
 from ambid.validate.fits import judge
 

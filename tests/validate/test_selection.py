@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.structures import structure
+from ambid.blackbox.fit import structure
 from ambid.errors import EstimationError
 from ambid.validate.orders import arx_candidates, select
 from tests.validate.blackbox.fits import arx, io, polynomial, run

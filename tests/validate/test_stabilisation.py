@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.response import run_states
+from ambid.blackbox.prediction import run_states
 from ambid.errors import EstimationError
 from ambid.report.response_figures import stabilisation_figure
 from ambid.validate.stabilisation import assurance, stabilisation

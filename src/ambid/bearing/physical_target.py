@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import response_covariance
-from ambid.blackbox.polynomial_model import PolynomialModel
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import PolynomialModel, TransferModel, response_covariance
 from ambid.errors import EstimationError
 from ambid.estimation.start import Moments
 from ambid.physics.discretise import DiscreteSpace, discretise

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from ambid.blackbox.instrumental import two_stage as two_stage
     from ambid.blackbox.instrumental_continuous import clsrivc as clsrivc
     from ambid.blackbox.instrumental_continuous import srivc as srivc
+    from ambid.blackbox.model import PolynomialModel as PolynomialModel
+    from ambid.blackbox.model import Polynomials as Polynomials
     from ambid.blackbox.model import StateSpaceModel as StateSpaceModel
+    from ambid.blackbox.model import TransferModel as TransferModel
     from ambid.blackbox.polynomial import ararmax as ararmax
     from ambid.blackbox.polynomial import ararx as ararx
     from ambid.blackbox.polynomial import arma as arma
@@ -32,15 +35,12 @@ if TYPE_CHECKING:
     from ambid.blackbox.polynomial import bj as bj
     from ambid.blackbox.polynomial import fir as fir
     from ambid.blackbox.polynomial import oe as oe
-    from ambid.blackbox.polynomial_model import PolynomialModel as PolynomialModel
-    from ambid.blackbox.polynomial_model import Polynomials as Polynomials
     from ambid.blackbox.state_space_search import sspem as sspem
     from ambid.blackbox.subspace import cva as cva
     from ambid.blackbox.subspace import moesp as moesp
     from ambid.blackbox.subspace import n4sid as n4sid
     from ambid.blackbox.subspace import pbsid as pbsid
     from ambid.blackbox.subspace import subspace_models as subspace_models
-    from ambid.blackbox.transfer_model import TransferModel as TransferModel
     from ambid.blackbox.weak_form import weakform as weakform
 
 __getattr__, __dir__, __all__ = exports(__name__)

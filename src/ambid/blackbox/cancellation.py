@@ -16,10 +16,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel
-from ambid.blackbox.roots import roots_at
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import PolynomialModel, StateSpaceModel, TransferModel, roots_at
 from ambid.estimation.parts import Check
 
 Complex = NDArray[np.complex128]
@@ -103,7 +100,7 @@ def _families(fit: BlackBoxFit) -> Iterator[tuple[str, Roots, Roots]]:
         yield from _polynomial_families(model)
     elif isinstance(model, TransferModel):
         theta = model.theta
-        parts = {(o, i, which): place for o, i, which, _, place in model.parts()}
+        parts = {(o, i, which): place for o, which, i, place in model.blocks()}
         for o, i in np.ndindex(model.n_outputs, model.n_inputs):
             den, num = (roots_at(theta, parts[o, i, which]) for which in ("den", "num"))
             yield "num and den", den, num

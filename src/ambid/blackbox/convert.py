@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ambid.blackbox.model import BlackBoxModel, StateSpaceModel
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import BlackBoxModel, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import ModelError
 
 if TYPE_CHECKING:

@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import BlackBoxModel, StateSpaceModel, pole_covariance
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.structures import RESPONSE_STRUCTURES, any_structure
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.fit import RESPONSE_STRUCTURES, BlackBoxFit, any_structure
+from ambid.blackbox.model import (
+    BlackBoxModel,
+    Offsets,
+    PolynomialModel,
+    Polynomials,
+    StateSpaceModel,
+    TransferModel,
+    pole_covariance,
+)
 from ambid.errors import ModelError
 from ambid.estimation.documents import (
     by_output,
@@ -91,10 +95,10 @@ def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) ->
         return "state_space", parts
     if isinstance(model, TransferModel):
         rows: dict[str, list[list[Array]]] = {"num": [], "den": []}
-        for o, i, which, p, place in model.parts():
+        for o, which, i, place in model.blocks():
             if not i:
                 rows[which].append([])
-            rows[which][o].append(theta[place.start : place.start + p.size])
+            rows[which][o].append(theta[place])
         return "transfer_function", rows
     raise ModelError(f"a model of type {type(model).__name__} has no place in a file")
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import UsedOrders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import BlackBoxModel
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import BlackBoxModel, Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.parts import Check
 from ambid.estimation.search import Rows, search

@@ -20,7 +20,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import Orders, check_order_names, compact_order, left_open, order_per_input, single_order
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines, search_lines
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.signals.response import FrequencyResponse

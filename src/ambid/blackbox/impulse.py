@@ -26,9 +26,8 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, compact_order, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instruments import autoregression
-from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.model import Offsets, PolynomialModel
 from ambid.blackbox.polynomial_predictor import Layout, arx_layout
-from ambid.blackbox.response import Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.signals.delay import lagged_triangle

@@ -31,11 +31,8 @@ from ambid.blackbox.instruments import (
     span,
     weak_instruments,
 )
-from ambid.blackbox.model import pole_covariance
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, pole_covariance, reflect, stable
 from ambid.blackbox.polynomial_predictor import Layout, arx_layout
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 

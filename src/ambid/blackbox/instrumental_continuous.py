@@ -42,9 +42,9 @@ from ambid.blackbox.instruments import (
     span,
     weak_instruments,
 )
+from ambid.blackbox.model import Offsets, ScaledTransfer, continuous_model
 from ambid.blackbox.polynomial_predictor import arx_layout
-from ambid.blackbox.response import Numbers, Offsets, Responses, companion, filter_states, free_response, responses
-from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
+from ambid.blackbox.prediction import Numbers, Responses, companion, filter_states, free_response, responses
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.physics.discretise import zero_order_hold

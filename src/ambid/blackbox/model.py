@@ -8,6 +8,7 @@ innovations form (thesis eq. 1.1-1.3), x+ = A x + B u + K e, y = C x + D u + e, 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,14 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 
 Complex = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Offsets:
+    """What is taken off inputs and outputs before a model is used, SI."""
+
+    u: Array  # (n_inputs,)
+    y: Array  # (n_outputs,)
 
 
 class BlackBoxModel(ABC):
@@ -340,3 +349,599 @@ def response_covariance(model: BlackBoxModel, covariance: Array, omega: Array) -
     2).
     """
     return complex_covariance(model.frequency_response_derivative(omega), covariance)
+
+
+_ROUNDING = 1e-13
+
+
+def stable(p: Array) -> bool:
+    """Return whether all roots in z are inside the unit circle, by more than rounding may move them out again.
+
+    `p`: (n + 1,), coefficients of q^0, q^-1, ..., the first is 1.
+    """
+    c = [float(x) for x in p]
+    while len(c) > 1:
+        k = c[-1]
+        if not abs(k) < 1.0 - _ROUNDING:
+            return False
+        rest = 1.0 - k * k
+        c = [(a - k * b) / rest for a, b in zip(c[:-1], c[:0:-1], strict=True)]
+    return True
+
+
+def reflect(p: Array, radius: float = 0.98) -> Array:
+    """Return the polynomial with roots outside the unit circle reflected, for a start alone.
+
+    `p`: (n + 1,); `radius`: roots are drawn in to at most this. Returns (n + 1,).
+    """
+    if p.size < 2 or not np.all(np.isfinite(p)):
+        return np.asarray(np.eye(1, p.size)[0])
+    if stable(p / radius ** np.arange(p.size)):
+        return p
+    roots = np.roots(p)
+    size = np.abs(roots)
+    outside = size > 1.0
+    roots[outside] /= size[outside] ** 2
+    size = np.abs(roots)
+    far = size > radius
+    roots[far] *= radius / size[far]
+    return np.asarray(np.real(np.poly(roots)))
+
+
+def roots_of(p: Array) -> Complex:
+    """Return the roots in z; the formula serves for up to two, which are most.
+
+    `p`: (n + 1,), the first is not 0; none at all have no roots. Returns (n,), complex.
+    """
+    if p.size < 2:
+        return np.empty(0, dtype=np.complex128)
+    if p.size == 2:
+        return np.array([-p[1] / p[0]], dtype=np.complex128)
+    if p.size == 3:
+        half, product = -0.5 * float(p[1] / p[0]), float(p[2] / p[0])
+        d = half * half - product
+        if d < 0:
+            return np.array([complex(half, (-d) ** 0.5), complex(half, -((-d) ** 0.5))])
+        far = half + (d**0.5 if half >= 0 else -(d**0.5))
+        return np.array([far, product / far if far else 0.0], dtype=np.complex128)
+    return np.asarray(np.roots(p), dtype=np.complex128)
+
+
+def root_derivative(coefficients: Array, roots: Complex) -> Complex:
+    """Return the derivative of polynomial roots by its coefficients.
+
+    `coefficients`: (n + 1,), of z^n ... z^0; `roots`: (n_roots,). Returns (n_roots, n + 1), complex, from P(r) = 0:
+    dr/dp_k = -r^(n-k) / P'(r). Infinite at a multiple root.
+    """
+    n = coefficients.size - 1
+    if n < 1:
+        return np.zeros((roots.size, n + 1), dtype=np.complex128)
+    far = np.abs(roots) > 1.0  # there by powers of 1/r, numerator and slope both over r^(n-1), as r^n may overflow
+    x = np.where(far, 1.0 / np.where(far, roots, 1.0), roots)
+    falling = np.polynomial.polynomial.polyvander(x, n)  # 1, x ... x^n
+    inside, outside = falling[:, ::-1], np.column_stack([np.where(far, roots, 1.0), falling[:, :-1]])
+    slope_terms = np.arange(n, 0, -1) * coefficients[:-1]  # of z^(n-1) ... z^0
+    slope = np.where(far, falling[:, :-1] @ slope_terms, falling[:, :-1] @ slope_terms[::-1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(-np.where(far[:, None], outside, inside) / slope[:, None])
+
+
+def used_part(theta: Array, place: slice) -> slice:
+    """Return where a polynomial begins behind leading zeros: a delay has no roots.
+
+    `theta`: (n_theta,); `place`: of the polynomial.
+    """
+    used = np.nonzero(theta[place])[0]
+    return slice(place.start + int(used[0]) if used.size else place.stop, place.stop)
+
+
+def roots_at(theta: Array, *places: slice) -> tuple[Complex, Complex]:
+    """Return the roots of some of a model's polynomials, and their derivatives by all its coefficients.
+
+    `theta`: (n_theta,); `places`: of the polynomials; leading zeros are a delay. Returns `roots`: (n_roots,), complex;
+    `derivatives`: (n_roots, n_theta), complex.
+    """
+    found, rows = [np.empty(0, dtype=np.complex128)], [np.zeros((0, theta.size), dtype=np.complex128)]
+    for place in places:
+        used = used_part(theta, place)
+        found.append(roots_of(theta[used]))
+        rows.append(np.zeros((found[-1].size, theta.size), dtype=np.complex128))
+        if found[-1].size:
+            rows[-1][:, used] = root_derivative(theta[used], found[-1])
+    return np.concatenate(found), np.vstack(rows)
+
+
+class RationalModel(BlackBoxModel):
+    """A model of polynomials, which stand one after the other in `theta`."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def blocks(self) -> Iterator[tuple[int, str, int | None, slice]]:
+        """Yield (output, which, input or None, place in `theta`) of every polynomial."""
+
+    def places(self, which: str) -> list[slice]:
+        """Return the places of all polynomials of one of these kinds."""
+        return [place for _, kind, _, place in self.blocks() if kind in which]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Polynomials:
+    """Polynomials of one output in q^-1, lowest power first.
+
+    Attributes
+    ----------
+    A, C, D : ndarray, shape (n + 1,)
+        Monic.
+    B, F : tuple of ndarray, shape (n + 1,) each
+        One for each input; F monic.
+    """
+
+    A: Array
+    B: tuple[Array, ...]
+    C: Array
+    D: Array
+    F: tuple[Array, ...]
+
+    def __post_init__(self) -> None:
+        for name in "ACD":
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+        for name in "BF":
+            object.__setattr__(self, name, tuple(np.array(p, dtype=np.float64) for p in getattr(self, name)))
+        if len(self.B) != len(self.F):
+            raise ModelError(f"{len(self.B)} polynomials B and {len(self.F)} F; there is one of each for every input")
+        for name, p in (("A", self.A), ("C", self.C), ("D", self.D), *(("F", f) for f in self.F)):
+            if p.ndim != 1 or not p.size or p[0] != 1.0:
+                raise ModelError(f"polynomial {name} = {p}; it must begin with 1")
+        if any(p.ndim != 1 or not p.size for p in self.B):
+            raise ModelError("polynomial B has no coefficients; give at least [0]")
+
+    def parts(self) -> Iterator[tuple[str, int | None, Array]]:
+        """Yield (letter, input or None, coefficients) in the order A, B..., C, D, F...."""
+        yield "A", None, self.A
+        yield from (("B", i, p) for i, p in enumerate(self.B))
+        yield "C", None, self.C
+        yield "D", None, self.D
+        yield from (("F", i, p) for i, p in enumerate(self.F))
+
+    @property
+    def theta(self) -> Array:
+        """All coefficients in the order of `parts`, shape (n_theta,)."""
+        return np.concatenate([c for _, _, c in self.parts()])
+
+    def with_theta(self, theta: Array) -> Polynomials:
+        """Return polynomials of the same degrees with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        Polynomials
+        """
+        parts, n = np.split(theta, np.cumsum([c.size for _, _, c in self.parts()])[:-1]), len(self.B)
+        return Polynomials(
+            A=parts[0], B=tuple(parts[1 : n + 1]), C=parts[n + 1], D=parts[n + 2], F=tuple(parts[n + 3 :])
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PolynomialModel(RationalModel):
+    """One set of polynomials for each output; discrete time.
+
+    Attributes
+    ----------
+    outputs : tuple of Polynomials
+        All for the same inputs.
+    dt : float
+        Sampling interval in s.
+    """
+
+    outputs: tuple[Polynomials, ...]
+    dt: float
+
+    def __post_init__(self) -> None:
+        if not self.outputs or len({len(p.B) for p in self.outputs}) != 1:
+            raise ModelError("a polynomial model needs an output, and the same inputs for all outputs")
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.outputs[0].B)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient names: ``a1``, ``b2``; ``b2.0`` with several inputs, ``y1:a1`` with several outputs."""
+        several = self.n_inputs > 1
+        return tuple(
+            ("" if self.n_outputs == 1 else f"y{o}:")
+            + f"{letter.lower()}{k}"
+            + (f".{i}" if i is not None and several else "")
+            for o, p in enumerate(self.outputs)
+            for letter, i, c in p.parts()
+            for k in range(c.size)
+        )
+
+    @property
+    def theta(self) -> Array:
+        """All coefficients, leading ones and zeros included, in the order of `names`, shape (n_theta,)."""
+        return np.concatenate([p.theta for p in self.outputs])
+
+    def blocks(self) -> Iterator[tuple[int, str, int | None, slice]]:
+        """Yield (output, letter, input or None, place in `theta`) of every polynomial."""
+        first = 0
+        for o, p in enumerate(self.outputs):
+            for letter, i, c in p.parts():
+                yield o, letter, i, slice(first, first + c.size)
+                first += c.size
+
+    def with_theta(self, theta: Array) -> PolynomialModel:
+        """Return the same structure with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        PolynomialModel
+        """
+        ends = np.cumsum([p.theta.size for p in self.outputs])
+        split = zip(self.outputs, np.split(theta, ends[:-1]), strict=True)
+        return PolynomialModel(outputs=tuple(p.with_theta(part) for p, part in split), dt=self.dt)
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G = B/(A F).
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
+        z = 1.0 / self.points(omega)
+        g = [[_at(b, z) / (_at(p.A, z) * _at(f, z)) for b, f in zip(p.B, p.F, strict=True)] for p in self.outputs]
+        return np.moveaxis(np.array(g, dtype=np.complex128).reshape(self.n_outputs, self.n_inputs, z.size), 2, 0)
+
+    def noise_response(self, omega: Array) -> Complex:
+        """Return H = C/(A D), diagonal.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
+        z = 1.0 / self.points(omega)
+        h = np.zeros((z.size, self.n_outputs, self.n_outputs), dtype=np.complex128)
+        for o, p in enumerate(self.outputs):
+            h[:, o, o] = _at(p.C, z) / (_at(p.A, z) * _at(p.D, z))
+        return h
+
+    def frequency_response_derivative(self, omega: Array) -> Complex:
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
+        z, g = 1.0 / self.points(omega), self.frequency_response(omega)
+        out = np.zeros((*g.shape, self.theta.size), dtype=np.complex128)
+        for o, letter, i, place in self.blocks():
+            p = self.outputs[o]
+            powers = z[:, None] ** np.arange(place.stop - place.start)
+            if letter == "A":
+                out[:, o, :, place] = -g[:, o, :, None] * (powers / _at(p.A, z)[:, None])[:, None, :]
+            elif letter == "B" and i is not None:
+                out[:, o, i, place] = powers / (_at(p.A, z) * _at(p.F[i], z))[:, None]
+            elif letter == "F" and i is not None:
+                out[:, o, i, place] = -g[:, o, i, None] * powers / _at(p.F[i], z)[:, None]
+        return out
+
+    def _poles(self) -> tuple[Complex, Complex]:
+        return roots_at(self.theta, *self.places("AF" if self.n_inputs else "AD"))
+
+    def _zeros(self) -> tuple[Complex, Complex]:
+        return roots_at(self.theta, *self.places("B" if self.n_inputs else "C"))
+
+    def state_space(self) -> StateSpaceModel:
+        """Return the innovations form: the outputs side by side, each in observer form."""
+        parts = [_observer_form(p) for p in self.outputs]
+        from scipy.linalg import block_diag
+
+        A, C, K = (block_diag(*[part[k] for part in parts]) for k in (0, 2, 4))
+        B, D = (np.vstack([part[k] for part in parts]) for k in (1, 3))
+        return StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=self.dt)
+
+    def plant(self) -> StateSpaceModel:
+        """Return G alone, without the states of the noise.
+
+        Returns
+        -------
+        StateSpaceModel
+            With K = 0.
+        """
+        silent = PolynomialModel(
+            outputs=tuple(Polynomials(A=p.A, B=p.B, C=[1.0], D=[1.0], F=p.F) for p in self.outputs),  # type: ignore[arg-type]
+            dt=self.dt,
+        ).state_space()
+        return silent.plant()
+
+
+def _at(p: Array, z: Complex) -> Complex:
+    return np.asarray(np.polynomial.polynomial.polyval(z, p), dtype=np.complex128)
+
+
+def _observer_form(p: Polynomials) -> tuple[Array, Array, Array, Array, Array]:
+    """Return A, B, C, D, K of one output.
+
+    A chain of order n carries -a_k y, b_k u of the inputs without F and, without D, c_k e. Every B/F, and C/D, is a
+    chain of its own whose output w adds to y: y = first state + sum of w + b0 u + e.
+    """
+    n_u, fir = len(p.B), [f.size == 1 for f in p.F]
+    main = max(p.A.size, p.C.size if p.D.size == 1 else 1, *(b.size for b, x in zip(p.B, fir, strict=True) if x), 1) - 1
+    sizes = [0 if x else max(b.size, f.size) - 1 for b, f, x in zip(p.B, p.F, fir, strict=True)]
+    noise = 0 if p.D.size == 1 else max(p.C.size, p.D.size) - 1
+    n = main + sum(sizes) + noise
+    A, B, K, C, D = np.zeros((n, n)), np.zeros((n, n_u)), np.zeros((n, 1)), np.zeros((1, n)), np.zeros((1, n_u))
+    first = main
+    for i, (b, f, size) in enumerate(zip(p.B, p.F, sizes, strict=True)):
+        D[0, i] = b[0]
+        if fir[i]:
+            B[: b.size - 1, i] += b[1:]
+            continue
+        _chain(A, slice(first, first + size), f)
+        B[first : first + size, i] = _padded(b, size) - _padded(f, size) * b[0]
+        C[0, first] = 1.0
+        first += size
+    if noise:
+        _chain(A, slice(first, n), p.D)
+        K[first:, 0] = _padded(p.C, noise) - _padded(p.D, noise)
+        C[0, first] = 1.0
+    elif main:
+        K[:main, 0] += _padded(p.C, main)
+    if main:
+        C[0, 0] = 1.0
+        A[: main - 1, 1:main] += np.eye(main - 1)
+        a = _padded(p.A, main)
+        A[:main] -= np.outer(a, C[0])
+        B[:main] -= np.outer(a, D[0])
+        K[:main, 0] -= a
+    return A, B, C, D, K
+
+
+def _chain(A: Array, place: slice, p: Array) -> None:
+    size = place.stop - place.start
+    block = np.eye(size, k=1)
+    block[:, 0] -= _padded(p, size)
+    A[place, place] = block
+
+
+def _padded(p: Array, size: int) -> Array:
+    """Coefficients 1 to `size`, zeros where there are none."""
+    out = np.zeros(size)
+    out[: p.size - 1] = p[1:]
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TransferModel(RationalModel):
+    """G[o][i] = num[o][i] / den[o][i] * exp(-s delay[i]), output noise white (H = I).
+
+    Attributes
+    ----------
+    num, den : tuple of tuple of ndarray, shape (degree + 1,) each
+        By output, then input; highest power first, den monic.
+    dt : float or None
+        Sampling interval in s; None for continuous time.
+    delay : tuple of float, s
+        One for each input (whole samples times dt for a discrete model).
+    delay_estimated : bool
+        Whether the delays are real numbers that were estimated: `theta` then ends with them, so that what is open about
+        them goes into every spread.
+    """
+
+    num: tuple[tuple[Array, ...], ...]
+    den: tuple[tuple[Array, ...], ...]
+    dt: float | None
+    delay: tuple[float, ...] = ()
+    delay_estimated: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("num", "den"):
+            rows = tuple(
+                tuple(np.atleast_1d(np.array(p, dtype=np.float64)) for p in row) for row in getattr(self, name)
+            )
+            object.__setattr__(self, name, rows)
+        if not self.delay:
+            object.__setattr__(self, "delay", (0.0,) * len(self.num[0]))
+        shapes = {len(row) for row in (*self.num, *self.den)}
+        if shapes != {len(self.delay)} or len(self.num) != len(self.den):
+            raise ModelError("num, den and delay of a transfer function do not have the same inputs and outputs")
+        for n, d in ((n, d) for rn, rd in zip(self.num, self.den, strict=True) for n, d in zip(rn, rd, strict=True)):
+            if d[0] != 1.0 or n.size > d.size:
+                raise ModelError(f"a transfer function {n}/{d}; its denominator must be monic and of no lower degree")
+
+    @property
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return len(self.delay)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return len(self.num)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coefficient names ``num[o,i]s2`` and ``den[o,i]s2`` with the power behind, ``delay[i]``, as in `theta`."""
+        variable = "s" if self.dt is None else "z"
+        coefficients = tuple(
+            f"{which}[{o},{i}]{variable}{place.stop - 1 - k}"
+            for o, which, i, place in self.blocks()
+            for k in range(place.start, place.stop)
+        )
+        return coefficients + tuple(f"delay[{i}]" for i in range(self.n_inputs) if self.delay_estimated)
+
+    @property
+    def theta(self) -> Array:
+        """All coefficients, leading ones included, and estimated delays in s, as in `names`, shape (n_theta,)."""
+        pairs = [p for o, i in np.ndindex(self.n_outputs, self.n_inputs) for p in (self.num[o][i], self.den[o][i])]
+        return np.concatenate([*pairs, self.delay if self.delay_estimated else ()])
+
+    def frequency_response(self, omega: Array) -> Complex:
+        """Return G.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
+        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
+        g = np.empty((omega.size, self.n_outputs, self.n_inputs), dtype=np.complex128)
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
+        return g
+
+    def noise_response(self, omega: Array) -> Complex:
+        """Return the identity.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
+        return np.broadcast_to(np.eye(self.n_outputs, dtype=np.complex128), (omega.size,) + (self.n_outputs,) * 2)
+
+    def frequency_response_derivative(self, omega: Array) -> Complex:
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
+        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
+        out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
+        for o, which, i, place in self.blocks():
+            powers = s[:, None] ** np.arange(place.stop - place.start - 1, -1, -1)
+            den = np.polyval(self.den[o][i], s)
+            factor = lag[:, i] / den if which == "num" else -lag[:, i] * np.polyval(self.num[o][i], s) / den**2
+            out[:, o, i, place] = powers * factor[:, None]
+        if self.delay_estimated:
+            g, first = self.frequency_response(omega), self.theta.size - self.n_inputs
+            for i in range(self.n_inputs):
+                out[:, :, i, first + i] = -1j * omega[:, None] * g[:, :, i]
+        return out
+
+    def _poles(self) -> tuple[Complex, Complex]:
+        return roots_at(self.theta, *self.places("den"))
+
+    def _zeros(self) -> tuple[Complex, Complex]:
+        return roots_at(self.theta, *self.places("num"))
+
+    def state_space(self) -> StateSpaceModel:
+        """Return an innovations form with K = 0; delays of a discrete model become states.
+
+        Returns
+        -------
+        StateSpaceModel
+
+        Raises
+        ------
+        ModelError
+            If a continuous model has a delay, which no finite state holds.
+        """
+        from scipy.linalg import block_diag
+        from scipy.signal import tf2ss
+
+        if self.dt is None and any(self.delay):
+            raise ModelError("a continuous model with a delay has no state space. Set the delay apart, or discretise")
+        blocks, n_u, n_y = [], self.n_inputs, self.n_outputs
+        D = np.zeros((n_y, n_u))
+        for o, i in np.ndindex(n_y, n_u):
+            later = 0 if self.dt is None else round(self.delay[i] / self.dt)
+            num, den = self.num[o][i], np.concatenate([self.den[o][i], np.zeros(later)])
+            if den.size == 1:
+                D[o, i] = num[0]
+                continue
+            used = int(np.nonzero(num)[0][0]) if np.any(num) else num.size - 1
+            a, b, c, d = tf2ss(num[used:], den)
+            D[o, i] = d[0, 0]
+            wide_b, wide_c = np.zeros((a.shape[0], n_u)), np.zeros((n_y, a.shape[0]))
+            wide_b[:, i], wide_c[o] = b[:, 0], c[0]
+            blocks.append((a, wide_b, wide_c))
+        A = block_diag(*[b[0] for b in blocks]) if blocks else np.zeros((0, 0))
+        B = np.vstack([np.zeros((0, n_u)), *[b[1] for b in blocks]])
+        C = np.hstack([np.zeros((n_y, 0)), *[b[2] for b in blocks]])
+        return StateSpaceModel(A=A, B=B, C=C, D=D, K=np.zeros((A.shape[0], n_y)), dt=self.dt)
+
+    def blocks(self) -> Iterator[tuple[int, str, int, slice]]:
+        """Yield (output, "num" or "den", input, place in `theta`) of every polynomial."""
+        first = 0
+        for o, i in np.ndindex(self.n_outputs, self.n_inputs):
+            for which, p in (("num", self.num[o][i]), ("den", self.den[o][i])):
+                yield o, which, i, slice(first, first + p.size)
+                first += p.size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaledTransfer:
+    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
+
+    theta: Array  # (n_theta,)
+    covariance: Array  # (n_theta, n_theta)
+    n: int  # degree of the denominator
+    nb: tuple[int, ...]  # numerator coefficients by input
+    w0: float  # rad/s
+    gain: Array  # (n_inputs,), SI unit of a numerator coefficient
+
+    def in_s(self) -> tuple[list[Array], list[Array], Array]:
+        """Return numerators and denominators by input in s and SI, and their derivative by `theta`."""
+        n, unit, num, rows = self.n, np.eye(self.theta.size), list[Array](), list[Array]()
+        worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
+        by_den = np.vstack([np.zeros(self.theta.size), (unit[:n] * worth[:n, None])[::-1]])
+        den = np.append(1.0, by_den[1:] @ self.theta)
+        for gain, own in zip(self.gain, np.split(unit[n:], np.cumsum(self.nb)[:-1]), strict=True):
+            by_num = (own * (worth[: own.shape[0]] * gain)[:, None])[::-1]
+            num.append(by_num @ self.theta)
+            rows += [by_num, by_den]
+        return num, [den] * len(num), np.vstack(rows)
+
+
+def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]) -> tuple[TransferModel, Array]:
+    """Return the continuous model of all outputs in SI, and the covariance of all its coefficients."""
+    from scipy.linalg import block_diag
+
+    found = [one.in_s() for one in outputs]
+    model = TransferModel(
+        num=tuple(tuple(num) for num, _, _ in found),
+        den=tuple(tuple(den) for _, den, _ in found),
+        dt=None,
+        delay=delay,
+    )
+    slopes = zip(outputs, found, strict=True)
+    return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])

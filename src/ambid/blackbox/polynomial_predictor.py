@@ -28,8 +28,8 @@ from ambid.blackbox.data import (
     order_per_input,
     single_order,
 )
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.structures import structure
+from ambid.blackbox.fit import structure
+from ambid.blackbox.model import PolynomialModel, Polynomials
 from ambid.errors import EstimationError, nearest
 
 Key = tuple[str, int | None]

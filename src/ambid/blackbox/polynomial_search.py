@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from ambid.arrays import Array
+from ambid.blackbox.model import reflect, stable
 from ambid.blackbox.polynomial_predictor import Layout, Predictor, arx_layout, filter_signal, liveliest_part, predictor
-from ambid.blackbox.roots import reflect, stable
 from ambid.errors import EstimationError
 from ambid.estimation.linear import Directions, directions
 

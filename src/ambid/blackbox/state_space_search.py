@@ -21,7 +21,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.response import Sensitivities
+from ambid.blackbox.prediction import Sensitivities
 from ambid.blackbox.subspace import (
     Asked,
     FirstModel,

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_order_names, left_open, order_per_input, single_order
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.model import StateSpaceModel
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import Offsets, StateSpaceModel
 from ambid.blackbox.subspace_projection import (
     Channels,
     Factors,

@@ -30,8 +30,7 @@ from ambid.blackbox.data import (
     single_order,
 )
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.transfer_model import ScaledTransfer, continuous_model
+from ambid.blackbox.model import Offsets, ScaledTransfer, continuous_model
 from ambid.errors import EstimationError
 from ambid.estimation.linear import directions, one_thread, triangle_of
 from ambid.estimation.search import search

@@ -33,7 +33,7 @@ def info(record: opt.RecordFile, rig: opt.RigFile = None, rate: opt.Rate = None,
 
 def models() -> None:
     """List models with their parameters and units, black-box structures, excitations, scenarios and preset benches."""
-    from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES
+    from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
     from ambid.physics.bearing_numbers import BEARING_NUMBERS
     from ambid.physics.models import model, model_names

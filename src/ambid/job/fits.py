@@ -11,7 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, get_args
 
-from ambid.blackbox.structures import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
+from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
@@ -58,7 +58,7 @@ def fit(
     records : Record, str or Path, or sequence of these
         Several: for nonlinear structures, of one bench, with the same channels and rate.
     structure_name : str
-        As in `ambid.blackbox.structures` or `ambid.nonlinear.structures`.
+        As in `ambid.blackbox.fit` or `ambid.nonlinear.structures`.
     orders : Mapping[str, int, "auto" or tuple of int], optional
         Of a linear structure; a tuple has one number for each input. None: all are chosen by `criterion`.
     criterion : str, optional

@@ -14,7 +14,7 @@ from ambid.bearing.frequency import FrequencyEstimate
 from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent

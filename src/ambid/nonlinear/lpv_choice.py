@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.blackbox.roots import reflect, roots_of
+from ambid.blackbox.model import reflect, roots_of
 from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, portions

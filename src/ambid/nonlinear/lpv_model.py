@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.blackbox.roots import root_derivative, roots_of, stable
+from ambid.blackbox.model import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
 from ambid.estimation.documents import fields_json, read_as
 from ambid.nonlinear.cloud import Cloud

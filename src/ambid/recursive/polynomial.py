@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.fit import structure as structure_named
+from ambid.blackbox.model import Offsets, PolynomialModel
 from ambid.blackbox.polynomial_predictor import compact_orders, read_orders
-from ambid.blackbox.response import Offsets
-from ambid.blackbox.structures import structure as structure_named
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import as_blocks, kernels
 from ambid.recursive.polynomial_state import (
@@ -502,8 +501,8 @@ class _Window:
 
 
 def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
+    from ambid.blackbox.polynomial import polynomial_fit
     from ambid.blackbox.polynomial_predictor import coefficient_units, predictor, scale_data
-    from ambid.blackbox.polynomial_result import polynomial_fit
     from ambid.blackbox.polynomial_search import search
 
     scaled = scale_data(who.structure, data)

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.polynomial_model import PolynomialModel
+from ambid.blackbox.fit import BlackBoxFit, any_structure
+from ambid.blackbox.model import PolynomialModel
 from ambid.blackbox.polynomial_predictor import Layout
-from ambid.blackbox.structures import any_structure
 from ambid.errors import EstimationError
 from ambid.recursive.square_root import factors_of, root_of, root_of_factors
 

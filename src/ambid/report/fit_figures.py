@@ -14,10 +14,8 @@ from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import pole_covariance, zero_covariance
-from ambid.blackbox.prediction import innovations_form, plant_form
-from ambid.blackbox.response import one_step, simulation
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.model import TransferModel, pole_covariance, zero_covariance
+from ambid.blackbox.prediction import innovations_form, one_step, plant_form, simulation
 from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (

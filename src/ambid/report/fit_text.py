@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import pole_covariance
-from ambid.blackbox.structures import any_structure
-from ambid.blackbox.transfer_model import TransferModel
+from ambid.blackbox.fit import BlackBoxFit, any_structure
+from ambid.blackbox.model import TransferModel, pole_covariance
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.report.estimate_text import frequency_lines, names_words
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
@@ -445,7 +443,7 @@ def _once(fit: BlackBoxFit) -> BlackBoxFit:
     if not isinstance(fit.model, TransferModel) or not _common(fit.model) or fit.covariance is None:
         return fit
     covariance = fit.covariance.copy()
-    for o, i, which, _, place in fit.model.parts():
+    for o, which, i, place in fit.model.blocks():
         if which == "den" and (o or i):
             covariance[place, :] = covariance[:, place] = 0.0
     return replace(fit, covariance=covariance)
@@ -456,7 +454,7 @@ def _first_entry(fit: BlackBoxFit) -> BlackBoxFit:
     model = fit.model
     if not isinstance(model, TransferModel) or not _common(model):
         return fit
-    places = [np.arange(p.start, p.stop) for o, i, _, _, p in model.parts() if not (o or i)]
+    places = [np.arange(p.start, p.stop) for o, _, i, p in model.blocks() if not (o or i)]
     own = np.concatenate(places)
     first = TransferModel(num=((model.num[0][0],),), den=((model.den[0][0],),), dt=model.dt, delay=model.delay[:1])
     return replace(fit, model=first, covariance=None if fit.covariance is None else fit.covariance[np.ix_(own, own)])

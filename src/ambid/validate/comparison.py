@@ -10,8 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.blackbox.data import IOData, Orders
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.structures import structure
+from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.errors import EstimationError
 from ambid.validate.fits import judge
 from ambid.validate.orders import HELD_OUT, hold_out, select

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.cancellation import orders_supported
 from ambid.blackbox.data import IOData
-from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.blackbox.prediction import Errors, Gradient, errors, errors_elsewhere, gradient
-from ambid.blackbox.structures import structure
 from ambid.errors import EstimationError
 from ambid.estimation.criteria import criteria, skipped
 from ambid.estimation.linear import triangle_of

@@ -18,9 +18,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, UsedOrders, compact_order
-from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.fit import BlackBoxFit, Structure, structure
 from ambid.blackbox.prediction import errors, errors_elsewhere
-from ambid.blackbox.structures import Structure, structure
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.criteria import criteria, skipped
 from ambid.signals.delay import lagged_triangle
@@ -80,7 +79,7 @@ def select(
 ) -> Selection:
     """Choose the orders of a structure.
 
-    `structure_name`: as in `ambid.blackbox.structures`; `ranges`: least and largest value of an order; `tick`: called
+    `structure_name`: as in `ambid.blackbox.fit`; `ranges`: least and largest value of an order; `tick`: called
     with the orders before each fit; may raise to interrupt.
     """
     of = structure(structure_name)
@@ -296,8 +295,9 @@ Coordinate = tuple[str, int | None]
 
 
 def _coordinates(of: Structure, n_inputs: int) -> tuple[Coordinate, ...]:
-    """One coordinate for each order; for nb, nf and nk one for each input."""
-    return tuple((key, i) for key in of.orders for i in (range(n_inputs) if key in ("nb", "nf", "nk") else (None,)))
+    """One coordinate for each order; for nb, nk and, where inputs have denominators of their own, nf one an input."""
+    each = ("nb", "nk") if of.kind == "transfer function" else ("nb", "nf", "nk")
+    return tuple((key, i) for key in of.orders for i in (range(n_inputs) if key in each else (None,)))
 
 
 def _orders(keys: tuple[Coordinate, ...], point: Point) -> UsedOrders:

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
 from ambid.blackbox.cancellation import cancellations
-from ambid.blackbox.roots import reflect, stable
+from ambid.blackbox.model import reflect, stable
 from ambid.errors import EstimationError
 from tests.blackbox.polynomial.systems import SYSTEMS, A, B, System, record, unstable_loop
 

@@ -9,10 +9,9 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
-from ambid.blackbox import polynomial as engine
 from ambid.blackbox.data import IOData
+from ambid.blackbox.polynomial import missed_minimum
 from ambid.blackbox.polynomial_predictor import Layout, predictor, scale_data
-from ambid.blackbox.polynomial_result import missed_minimum
 from ambid.blackbox.polynomial_search import search, separable_starts, starts
 from ambid.physics.models import model
 from tests.bearing.benches import BEARING, run
@@ -49,7 +48,7 @@ def test_a_minimum_that_was_missed_is_told() -> None:
     scaled = scale_data("armax", data)
     p = predictor(of)
     wrong = search(p, scaled.y[0], scaled.u, next(starts(of, scaled.y[0], scaled.u)))
-    right = engine.fit_output("armax", of, scaled, 0, {}, None)
+    right = polynomial.fit_output("armax", of, scaled, 0, {}, None)
     assert wrong.cost > 1.05 * right.cost
     (said,) = missed_minimum([of], [wrong], scaled)
     assert "may have missed a better minimum" in said
@@ -62,7 +61,7 @@ def test_no_false_alarm_where_the_search_was_long() -> None:
         system = SYSTEMS["armax"]
         scaled = scale_data("armax", system.data(seed, 400))
         of = layout("armax", na=2, nb=2, nc=2)
-        fit = engine.fit_output("armax", of, scaled, 0, {}, None)
+        fit = polynomial.fit_output("armax", of, scaled, 0, {}, None)
         found += missed_minimum([of], [replace(fit, iterations=99)], scaled)
     assert not found
 
@@ -103,6 +102,6 @@ def test_the_search_ends_as_low_as_from_the_truth(name: str) -> None:
         truth[of.places[plant, None if plant == "A" else 0]] = A
         truth[of.places["B", 0]] = B * scaled.u_scale[0] / scaled.y_scale[0]
         there = search(predictor(of), scaled.y[0], scaled.u, truth)
-        fit = engine.fit_output(name, of, scaled, 0, {}, None)
+        fit = polynomial.fit_output(name, of, scaled, 0, {}, None)
         worse += fit.cost > there.cost * (1 + 1.0 / fit.n_rows)  # by more than one unit of the log likelihood, twice
     assert worse <= 1

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from ambid.blackbox import polynomial
-from ambid.blackbox.response import one_step
+from ambid.blackbox.prediction import one_step
 from ambid.errors import EstimationError
 from tests.blackbox.polynomial.systems import SYSTEMS, record, two_outputs, unstable_loop
 

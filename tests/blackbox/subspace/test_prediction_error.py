@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.model import StateSpaceModel, pole_covariance, response_covariance
-from ambid.blackbox.response import Sensitivities, one_step
+from ambid.blackbox.prediction import Sensitivities, one_step
 from ambid.blackbox.state_space_search import balance, linear, sspem, tangent
 from ambid.blackbox.subspace import pbsid
 from ambid.errors import EstimationError

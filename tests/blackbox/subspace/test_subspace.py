@@ -10,8 +10,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import structure
 from ambid.blackbox.model import pole_covariance, response_covariance
-from ambid.blackbox.structures import structure
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
 from ambid.errors import EstimationError
 from ambid.physics.discretise import discretise

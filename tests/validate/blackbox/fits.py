@@ -6,8 +6,7 @@ import numpy as np
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.polynomial_model import PolynomialModel, Polynomials
-from ambid.blackbox.response import Offsets
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials
 
 DT = 0.01
 

@@ -8,12 +8,10 @@ from scipy.signal import cont2discrete, lfilter
 
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instrumental import two_stage
-from ambid.blackbox.model import StateSpaceModel
+from ambid.blackbox.model import Offsets, StateSpaceModel, TransferModel
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.prediction import errors, gradient, innovations_form, polynomial_gradient
-from ambid.blackbox.response import Offsets
 from ambid.blackbox.subspace import n4sid, pbsid
-from ambid.blackbox.transfer_model import TransferModel
 from ambid.validate.fits import judge
 from tests.validate.blackbox.fits import DT, arx, io, polynomial, run
 
