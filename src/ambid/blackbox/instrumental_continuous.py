@@ -15,6 +15,7 @@ p^k/F(p) is state k of the companion form of F, exact for inputs held over a sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +43,7 @@ from ambid.blackbox.instruments import (
     span,
     weak_instruments,
 )
-from ambid.blackbox.model import Offsets, ScaledTransfer, continuous_model
+from ambid.blackbox.model import Offsets, TransferModel
 from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.blackbox.prediction import Numbers, Responses, companion, filter_states, free_response, responses
 from ambid.errors import EstimationError
@@ -273,20 +274,58 @@ def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
         return _srivc_fit(data, used, nk, found, means)
 
 
-def transfer_orders(who: str, data: IOData, orders: Orders) -> TransferOrders:
-    """Check nb, nf and nk."""
+def transfer_orders(who: str, data: IOData, orders: Orders, more: int = 1) -> TransferOrders:
+    """Check nb, nf and nk; `more`: numerator coefficients that there may be beyond nf."""
     check_order_names(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
     n_u = data.n_inputs
     if not n_u:
         raise EstimationError(f"{who}: no input is named; it estimates the way from inputs to outputs. Give --input")
     nb, n = order_per_input(who, orders, "nb", 1, n_u), single_order(who, orders, "nf", 1)
-    if max(nb) > n + 1:
+    if max(nb) > n + more:
         raise EstimationError(
-            f"{who}: {max(nb)} numerator coefficients over a denominator of degree {n}; a plant that can be sampled "
-            f"has at most {n + 1}. Lower nb, or raise nf"
+            f"{who}: {max(nb)} numerator coefficients over a denominator of degree {n}; at most {n + more}. "
+            "Lower nb, or raise nf"
         )
     nk = None if left_open(orders, "nk") else order_per_input(who, orders, "nk", 0, n_u)
     return TransferOrders(nb=nb, n=n, nk=nk)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaledTransfer:
+    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
+
+    theta: Array  # (n_theta,)
+    covariance: Array  # (n_theta, n_theta)
+    orders: TransferOrders
+    w0: float  # rad/s
+    gain: Array  # (n_inputs,), SI unit of a numerator coefficient
+
+    def in_s(self) -> tuple[list[Array], list[Array], Array]:
+        """Return numerators and denominators by input in s and SI, and their derivative by `theta`."""
+        n, unit, num, rows = self.orders.n, np.eye(self.theta.size), list[Array](), list[Array]()
+        worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
+        by_den = np.vstack([np.zeros(self.theta.size), (unit[:n] * worth[:n, None])[::-1]])
+        den = np.append(1.0, by_den[1:] @ self.theta)
+        for gain, own in zip(self.gain, np.split(unit[n:], np.cumsum(self.orders.nb)[:-1]), strict=True):
+            by_num = (own * (worth[: own.shape[0]] * gain)[:, None])[::-1]
+            num.append(by_num @ self.theta)
+            rows += [by_num, by_den]
+        return num, [den] * len(num), np.vstack(rows)
+
+
+def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]) -> tuple[TransferModel, Array]:
+    """Return the continuous model of all outputs in SI, and the covariance of all its coefficients."""
+    from scipy.linalg import block_diag
+
+    found = [one.in_s() for one in outputs]
+    model = TransferModel(
+        num=tuple(tuple(num) for num, _, _ in found),
+        den=tuple(tuple(den) for _, den, _ in found),
+        dt=None,
+        delay=delay,
+    )
+    slopes = zip(outputs, found, strict=True)
+    return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])
 
 
 def _all_outputs(data: IOData, orders: TransferOrders, nk: tuple[int, ...], first: int) -> list[tuple[Found, float]]:
@@ -318,8 +357,7 @@ def _srivc_fit(
             ScaledTransfer(
                 theta=f.theta,
                 covariance=error.size / max(error.size - orders.size - 1, 1) * inner,
-                n=orders.n,
-                nb=orders.nb,
+                orders=orders,
                 w0=w0,
                 gain=size / u_size,
             )
@@ -507,7 +545,7 @@ def _clsrivc_fit(
     for o, (c, w) in enumerate(zip(nearest, w0, strict=True)):
         half = np.linalg.pinv(c.root, rcond=1e-14)
         scaled.append(
-            ScaledTransfer(theta=c.theta, covariance=half @ half.T, n=n, nb=orders.nb, w0=w, gain=sds[1][o] / sds[0])
+            ScaledTransfer(theta=c.theta, covariance=half @ half.T, orders=orders, w0=w, gain=sds[1][o] / sds[0])
         )
         if c.freedom and chi2.sf(c.misfit, c.freedom) < _UNLIKELY:
             warnings.append(

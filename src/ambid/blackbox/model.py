@@ -8,7 +8,7 @@ innovations form (thesis eq. 1.1-1.3), x+ = A x + B u + K e, y = C x + D u + e, 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -906,42 +906,3 @@ class TransferModel(RationalModel):
             for which, p in (("num", self.num[o][i]), ("den", self.den[o][i])):
                 yield o, which, i, slice(first, first + p.size)
                 first += p.size
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ScaledTransfer:
-    """Transfer functions of one output in p = s/w0: f_0 ... f_(n-1), then b_0 ... of each input."""
-
-    theta: Array  # (n_theta,)
-    covariance: Array  # (n_theta, n_theta)
-    n: int  # degree of the denominator
-    nb: tuple[int, ...]  # numerator coefficients by input
-    w0: float  # rad/s
-    gain: Array  # (n_inputs,), SI unit of a numerator coefficient
-
-    def in_s(self) -> tuple[list[Array], list[Array], Array]:
-        """Return numerators and denominators by input in s and SI, and their derivative by `theta`."""
-        n, unit, num, rows = self.n, np.eye(self.theta.size), list[Array](), list[Array]()
-        worth = self.w0 ** np.arange(n, -1, -1.0)  # of p^0 ... p^n
-        by_den = np.vstack([np.zeros(self.theta.size), (unit[:n] * worth[:n, None])[::-1]])
-        den = np.append(1.0, by_den[1:] @ self.theta)
-        for gain, own in zip(self.gain, np.split(unit[n:], np.cumsum(self.nb)[:-1]), strict=True):
-            by_num = (own * (worth[: own.shape[0]] * gain)[:, None])[::-1]
-            num.append(by_num @ self.theta)
-            rows += [by_num, by_den]
-        return num, [den] * len(num), np.vstack(rows)
-
-
-def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]) -> tuple[TransferModel, Array]:
-    """Return the continuous model of all outputs in SI, and the covariance of all its coefficients."""
-    from scipy.linalg import block_diag
-
-    found = [one.in_s() for one in outputs]
-    model = TransferModel(
-        num=tuple(tuple(num) for num, _, _ in found),
-        den=tuple(tuple(den) for _, den, _ in found),
-        dt=None,
-        delay=delay,
-    )
-    slopes = zip(outputs, found, strict=True)
-    return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])

@@ -24,13 +24,11 @@ from ambid.blackbox.data import (
     IOData,
     Orders,
     check_length,
-    check_order_names,
     compact_order,
-    order_per_input,
-    single_order,
 )
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.model import Offsets, ScaledTransfer, continuous_model
+from ambid.blackbox.instrumental_continuous import ScaledTransfer, continuous_model, transfer_orders
+from ambid.blackbox.model import Offsets
 from ambid.errors import EstimationError
 from ambid.estimation.linear import directions, one_thread, triangle_of
 from ambid.estimation.search import search
@@ -67,16 +65,9 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     EstimationError
         If an order breaks a rule, the record is too short or does not excite the plant.
     """
-    check_order_names("weakform", orders, ("nb", "nf", "nk"), ("nb", "nf"))
-    n = single_order("weakform", orders, "nf", 1)
-    nb = order_per_input("weakform", orders, "nb", 1, data.n_inputs)
-    nk = order_per_input("weakform", {"nk": 0, **orders}, "nk", 0, data.n_inputs)
-    if max(nb, default=1) > n:
-        raise EstimationError(
-            f"weakform: {max(nb)} numerator coefficients over a denominator of degree {n}; at most {n}, as an output "
-            "that jumps with its input has no samples to be held against. Lower nb, or raise nf"
-        )
-    check_length("weakform", data, data.n_samples - max(nk, default=0) - 4 * _SHORTEST, n + sum(nb) + 1)
+    used = transfer_orders("weakform", data, {"nk": 0, **orders}, more=0)
+    n, nb, nk = used.n, used.nb, used.nk or ()
+    check_length("weakform", data, data.n_samples - max(nk) - 4 * _SHORTEST, n + sum(nb) + 1)
     halves = supports(data.n_samples - max(nk), half_width_s, data.dt)
     u_mean, y_mean = data.u.mean(axis=0), data.y.mean(axis=0)
     u_sd, y_sd = data.u.std(axis=0), data.y.std(axis=0)
@@ -89,7 +80,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
     solutions = [f[0] for f in found]
     size = n + sum(nb)
     scaled = [
-        ScaledTransfer(theta=s.theta[:size], covariance=s.covariance[:size, :size], n=n, nb=nb, w0=1.0, gain=sd / u_sd)
+        ScaledTransfer(theta=s.theta[:size], covariance=s.covariance[:size, :size], orders=used, w0=1.0, gain=sd / u_sd)
         for s, sd in zip(solutions, y_sd, strict=True)
     ]
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))
