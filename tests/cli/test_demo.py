@@ -4,9 +4,10 @@ import gzip
 
 import numpy as np
 
-from ambid.cli.demo import PRESET, demo_csv, demo_file, demo_simulation
+from ambid.cli.demo import PRESET, demo_file
 from ambid.physics.presets import preset
 from ambid.rig import load_rig, read_bench
+from tools.demo_record import demo_csv, demo_simulation
 
 
 def numbers(text):
@@ -47,12 +48,3 @@ def test_the_demo_prints_estimate_and_truth(ambid):
         (line,) = [x for x in found.out.splitlines() if x.startswith(f"{name} ") and "±" in x]
         error = float(line.split(" %")[0].split()[-1])
         assert abs(error) < 2.0
-
-
-def test_the_demo_can_be_copied_and_run_by_hand(tmp_path, ambid):
-    assert ambid("demo", "--copy", tmp_path).code == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["demo.csv.gz", "demo.toml"]
-    assert ambid("info", tmp_path / "demo.csv.gz", "--rig", tmp_path / "demo.toml").code == 0
-    again = ambid("demo", "--copy", tmp_path)
-    assert again.code == 2
-    assert "exists already" in again.err
