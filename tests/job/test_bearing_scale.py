@@ -8,6 +8,7 @@ import pytest
 from ambid.job.identification import identify_nonlinear
 from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
+from ambid.rig import RigMagnet, default_rig
 from ambid.simulate import simulate
 
 
@@ -24,7 +25,7 @@ def test_a_wrong_gain_of_the_position_is_not_seen_while_the_mass_is_free_and_tha
         channels=tuple(replace(c, values=1.05 * c.values) if c.name == "position" else c for c in record.channels),
     )
     bias = Parameter(name="i0", unit="A", role="fixed", value=1.0)
-    found = identify_nonlinear([wide], magnet="pair", parameters=[bias])
+    found = identify_nonlinear([wide], replace(default_rig(), magnet=RigMagnet(kind="pair", parameters=(bias,))))
     m = found.parameter("m")
     assert found.checks["residuals_white"].passed
     assert found.checks["residuals_uncorrelated"].passed

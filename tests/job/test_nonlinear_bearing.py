@@ -10,7 +10,6 @@ from ambid.job.bearing_records import Reading, take_record
 from ambid.job.identification import identify_nonlinear
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.loop import Limits
-from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.rig import load_rig
 from ambid.simulate import simulate
@@ -122,8 +121,6 @@ def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
 
 
 def test_what_is_asked_wrongly_is_refused(balls, rig):
-    with pytest.raises(EstimationError, match="has no number"):
-        identify_nonlinear(balls, rig, parameters=[Parameter(name="gap", unit="m")])
     with pytest.raises(EstimationError, match="every one holds the rotor"):
         identify_nonlinear([], rig, held=balls, magnet="single")
 

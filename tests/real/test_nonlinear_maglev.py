@@ -4,14 +4,16 @@ The balance uses no fit: where the ball stands, f = dL/dz i^2/2 = m g and k_i/m 
 the mean current of all samples near that position.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ambid.cli import run
 from ambid.job.identification import identify_nonlinear
 from ambid.job.results import read_estimate
-from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
+from ambid.rig import load_rig
 from tests.measured import ABSENT, MAGLEV
 
 pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason=ABSENT)
@@ -51,11 +53,10 @@ def rig(tmp_path_factory):
     return path
 
 
-def over_all(rig, **wishes):
+def over_all(rig):
     return identify_nonlinear(
-        [MAGLEV / f"levitate_{n}.csv" for n in LEVITATION], rig,
-        held=[MAGLEV / f"coil_steps_{n}.csv" for n in COIL], **wishes,
-    )  # fmt: skip
+        [MAGLEV / f"levitate_{n}.csv" for n in LEVITATION], rig, held=[MAGLEV / f"coil_steps_{n}.csv" for n in COIL]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +132,9 @@ def test_the_command_draws_and_judges(files, capsys):
 
 
 def test_a_free_mass_is_right_or_flagged(rig):
-    estimate = over_all(rig, magnet=MagnetLaw(gap="hyperbolic"), parameters=[Parameter(name="m", unit="kg")])
+    known = load_rig(rig)
+    law = replace(known.magnet, kind="single", gap="hyperbolic", saturation=False, rise=False)
+    free = tuple(Parameter(name="m", unit="kg") if p.name == "m" else p for p in known.parameters)
+    estimate = over_all(replace(known, magnet=law, parameters=free))
     m = estimate.parameter("m")
     assert m.ci95[0] < MASS < m.ci95[1] or not m.identifiable

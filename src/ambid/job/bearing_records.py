@@ -12,15 +12,13 @@ from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 
-from ambid.bearing.magnet_problem import UNITS, BearingRecord, touching
-from ambid.errors import EstimationError, nearest
+from ambid.bearing.magnet_problem import BearingRecord, touching
+from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick
 from ambid.job.data import Reading, Source, known_rig, load, origin
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.parameters import Parameter
 from ambid.rig import Rig, RigMagnet
-
-Magnet = MagnetLaw | Literal["auto", "single", "pair"]
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
@@ -44,8 +42,7 @@ class TakenRecord:
 class MagnetWords(TypedDict, total=False):
     """What a caller says of a nonlinear bearing beside its rig."""
 
-    magnet: Magnet | None  # kind or whole law; None: as the rig says
-    parameters: Sequence[Parameter]  # each instead of the rig's
+    magnet: Literal["auto", "single", "pair"] | None  # None: as the rig says
     eddy: bool  # beside what the rig says
     drift: bool
     off_below: float | None  # in V; None: as the rig says
@@ -57,38 +54,17 @@ class BearingWords(MagnetWords, Reading, total=False):
 
 def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> Rig:
     """Return a rig whose `magnet` is known as it says, but for what is given here."""
-    bench, magnet, off_below = known_rig(rig), words.get("magnet"), words.get("off_below")
-    parameters = words.get("parameters", ())
+    bench, off_below = known_rig(rig), words.get("off_below")
     if bench.model != "one-axis":
         raise EstimationError(
             f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
         )
-    for p in parameters:
-        if p.name not in UNITS:
-            raise EstimationError(
-                f"a nonlinear bearing has no number {p.name!r}; it has {', '.join(UNITS)}."
-                f"{nearest(p.name, list(UNITS))}"
-            )
-    before, given = bench.magnet or RigMagnet(), {p.name: p for p in parameters}
-    kept = [p for p in before.parameters if p.name not in given]
-    new = [p for p in parameters if p.name not in _LINEAR]
+    known = bench.magnet or RigMagnet()
     known = replace(
-        before, eddy=before.eddy or words.get("eddy", False), drift=before.drift or words.get("drift", False),
-        off_below=before.off_below if off_below is None else off_below, parameters=(),
+        known, kind=words.get("magnet") or known.kind, eddy=known.eddy or words.get("eddy", False),
+        drift=known.drift or words.get("drift", False), off_below=known.off_below if off_below is None else off_below,
     )  # fmt: skip
-    if isinstance(magnet, MagnetLaw):
-        kind: Literal["single", "pair"] = "pair" if magnet.pair else "single"
-        known = replace(
-            known, kind=kind, gap=magnet.gap, asymmetric=magnet.asymmetric if magnet.pair else None,
-            saturation=magnet.saturation, rise=magnet.rise,
-        )  # fmt: skip
-    elif magnet is not None:
-        known = replace(known, kind=magnet)
-    return replace(
-        bench,
-        magnet=replace(known, parameters=(*kept, *new)),
-        parameters=tuple(given.get(p.name, p) for p in bench.parameters),
-    )
+    return replace(bench, magnet=known)
 
 
 def numbers_of(rig: Rig) -> dict[str, Parameter]:

@@ -180,7 +180,7 @@ def identify_nonlinear(
         As `identify`.
     **words
         ``from_s``, ``to_s``, ``rate_hz`` and ``gaps`` as `identify`, the part of every record in which the rotor moves;
-        ``magnet``, ``parameters``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
+        ``magnet``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
         `ambid.job.bearing_records.MagnetWords`.
 
     Returns
