@@ -5,7 +5,7 @@ Anything else that escapes is a defect of the program.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 
 class AmbidError(Exception):
@@ -50,3 +50,13 @@ def nearest(word: str, known: Sequence[str]) -> str:
     """
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
     return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def refuse_given(given: Mapping[str, object], refusal: str) -> None:
+    """Refuse the first option that was given although it has no use; its name replaces ``{}`` in the refusal.
+
+    `given`: by name; None, False and what is empty were not given.
+    """
+    for name, value in given.items():
+        if not (value is None or value is False or (isinstance(value, (Sequence, Mapping)) and not value)):
+            raise EstimationError(refusal.replace("{}", name))

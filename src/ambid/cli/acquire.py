@@ -20,7 +20,7 @@ from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
 from ambid.cli.terminal import painter, watching
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, refuse_given
 
 if TYPE_CHECKING:
     from ambid.acquire.amplitude import Trial
@@ -128,9 +128,7 @@ def command(
 def _check_excitation(port: str, mode: Mode, name: str | None, given: Mapping[str, object]) -> None:
     """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
     if name is None:
-        for of, value in given.items():
-            if value is not None:
-                raise AmbidError(f"{of} is of an excitation, and none is named. Give --excitation, or leave it out")
+        refuse_given(given, "{} is of an excitation, and none is named. Give --excitation, or leave it out")
     elif port.startswith("replay:"):
         raise AmbidError("--excitation cannot be played to a record that is replayed. Leave it out")
     elif mode == "sample":

@@ -15,7 +15,7 @@ from ambid.cli.interrupts import Stop, interruptible, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import FIGURE_ENDINGS, Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, refuse_given
 
 if TYPE_CHECKING:
     from ambid.blackbox.fit import BlackBoxFit
@@ -108,8 +108,8 @@ def command(
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)
     said: dict[str, Any] = {"settings": None if settings is None else opt.settings_of(settings)}
     if nonlinear:
-        opt.refuse_given(
-            {"--stabilisation": stabilisation is not None, "--sensitivity": sensitivity},
+        refuse_given(
+            {"--stabilisation": stabilisation, "--sensitivity": sensitivity},
             f"{{}} is for linear structures; {structure} has no use for it. Leave it out",
         )
         if settings is not None and orders != "auto":

@@ -15,7 +15,7 @@ from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, refuse_given
 
 
 def command(
@@ -113,8 +113,8 @@ def command(
 
 def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
     """Refuse what only the nonlinear magnet has."""
-    opt.refuse_given(
-        {f"--{name.replace('_', '-')}": not (x is None or x is False or x == ()) for name, x in given.items()},
+    refuse_given(
+        {f"--{name.replace('_', '-')}": x for name, x in given.items()},
         "{} is for the nonlinear magnet. Give --nonlinear too, or leave {} out",
     )
     if len(records) > 1:

@@ -132,13 +132,6 @@ def refuse_twice(records: Sequence[Path]) -> None:
         seen.add(path.resolve())
 
 
-def refuse_given(given: Mapping[str, bool], refusal: str) -> None:
-    """Refuse the first option that was given although it has no use; it replaces ``{}`` in the refusal."""
-    for name, was in given.items():
-        if was:
-            raise AmbidError(refusal.replace("{}", name))
-
-
 def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str, str]:
     """Read NAME=VALUE, each name once; ``{}`` in `said` stands for a part that is not of that form."""
     found: dict[str, str] = {}

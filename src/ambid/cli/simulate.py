@@ -12,7 +12,7 @@ import typer
 from ambid.cli.options import argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, refuse_given
 
 if TYPE_CHECKING:
     from ambid.arrays import Array
@@ -79,15 +79,16 @@ def command(
     preset = preset_of(rig)
     closed, source = None if loop is None else loop == "closed", None if preset else Path(rig)
     if scenario is not None:
-        _refuse("--scenario", {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear or None,
-                               "--position": position, "--periods": None if periods == 1 else periods})  # fmt: skip
+        of_excitation = {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear,
+                         "--position": position, "--periods": periods != 1}  # fmt: skip
+        refuse_given(of_excitation, "--scenario has no {}. Leave {} out")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
                  "closed": closed, "log_excitation": log_excitation}  # fmt: skip
         _run_scenario(scenario, preset, rig, record, seed, words)
         return
-    _refuse("a simulation without --scenario", {"--at": at, "--size": size})
+    refuse_given({"--at": at, "--size": size}, "a simulation without --scenario has no {}. Leave {} out")
     if not nonlinear:
-        _refuse("a simulation without --nonlinear", {"--position": position})
+        refuse_given({"--position": position}, "a simulation without --nonlinear has no {}. Leave {} out")
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(source) as outputs, progress("simulate"):
         outputs.claim(record, "-o", _ENDINGS)
@@ -114,12 +115,6 @@ def command(
     warn(done)
     typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {kind} of {peak:.4g} V, seed {seed}")
     typer.echo("truth: " + truth_words(done))
-
-
-def _refuse(of: str, given: Mapping[str, object]) -> None:
-    for name, value in given.items():
-        if value is not None:
-            raise AmbidError(f"{of} has no {name}. Leave {name} out")
 
 
 def _bench(rig: str, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:

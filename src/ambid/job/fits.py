@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack, get_args
 
 from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
 from ambid.job.data import Channels, Clock, Columns, Source, check_same_bench, known_rig
@@ -101,9 +101,9 @@ def fit(
     sources = [records] if isinstance(records, (Record, str, Path)) else list(records)
     nonlinear = structure_name in NONLINEAR_STRUCTURES
     if nonlinear:
-        linear_only = {"--orders": orders, "--fix": fixed, "--reference": channels.references, "--at-rest": at_rest}
-        linear_only["--criterion"] = criterion != "bic"
-        _refuse(linear_only, f"{{}} is for linear structures; {structure_name} has no use for it. Leave it out")
+        linear_only = {"--orders": orders, "--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
+                       "--criterion": criterion != "bic"}  # fmt: skip
+        refuse_given(linear_only, f"{{}} is for linear structures; {structure_name} has no use for it. Leave it out")
         _check_settings(structure_name, sources, settings or {}, seed or 0)
     else:
         _check_linear(structure_name, sources, {"--settings": settings, "--seed": seed is not None})
@@ -305,14 +305,7 @@ def _check_linear(name: str, records: Sequence[object], given: Mapping[str, obje
     if len(records) > 1:
         several = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(f"structure {name} takes one record; {several} take several. Leave {records[1]} out")
-    _refuse(given, f"{{}} is for nonlinear structures; {name} has --orders. Leave it out")
-
-
-def _refuse(given: Mapping[str, object], refusal: str) -> None:
-    """Refuse the first option that was given although it has no use; it replaces ``{}`` in the refusal."""
-    for name, value in given.items():
-        if value:
-            raise EstimationError(refusal.format(name))
+    refuse_given(given, f"{{}} is for nonlinear structures; {name} has --orders. Leave it out")
 
 
 def _check_settings(name: str, records: Sequence[object], settings: Settings, seed: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, io_data
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, Source
 from ambid.job.following import EstimatorWords, Following, Memory
@@ -80,11 +80,13 @@ def track_estimator(
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
     inputs, outputs = settings.get("inputs", ()), settings.get("outputs", ())
     references, orders = settings.get("references", ()), settings.get("orders")
+    refusal = f"--method {method} takes no {{}}. Leave it out"
     if method in JOINT:
-        _refuse(method, {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders})
+        columns = {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders}
+        refuse_given(columns, refusal)
         made = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
-        _refuse(method, {"--rig": rig, "--start": start, "--start-seconds": start_s})
+        refuse_given({"--rig": rig, "--start": start, "--start-seconds": start_s}, refusal)
         whole = record if isinstance(record, Record) else read_record(record, rate_hz=part.get("rate_hz"))
         span = part.get("from_s"), part.get("to_s")
         used = whole if span == WHOLE else cut(whole, *span)
@@ -94,13 +96,6 @@ def track_estimator(
         made = _coefficients(method, data, orders, how.memory, settings.get("step"), used.start_s)
     label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
     return _follow(made, label, how)
-
-
-def _refuse(method: str, given: Mapping[str, object]) -> None:
-    """Refuse options that the method would ignore."""
-    wrong = [name for name, value in given.items() if value is not None and value != ()]
-    if wrong:
-        raise EstimationError(f"--method {method} takes no {' and no '.join(wrong)}. Leave it out")
 
 
 def _coefficients(
