@@ -92,7 +92,7 @@ def test_numbers_are_spread_over_inputs_and_shown_as_one_where_they_agree() -> N
 
 
 def test_known_orders_may_be_left_out() -> None:
-    check_order_names("pbsid", {}, ("n", "nk"))
+    check_order_names("pbsid", {}, ("n",))
     with pytest.raises(EstimationError, match=r"Did you mean 'nf'\? Leave it out"):
         check_order_names("oe", {"nff": 1}, ("nb", "nf", "nk"), ("nb",))
 

@@ -317,8 +317,7 @@ def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
     ----------
     data : IOData
     orders : Mapping
-        ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
-        or one for each, at least 1 (default); larger ones become states of their own.
+        ``n``: number of states, ``"auto"`` or missing to choose it. A delay of the input counts as states.
     tick : callable, optional
         Called between steps.
 

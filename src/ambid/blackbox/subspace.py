@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, Orders, check_order_names, left_open, order_per_input, single_order
+from ambid.blackbox.data import IOData, Orders, check_order_names, left_open, single_order
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.model import Offsets, StateSpaceModel
 from ambid.blackbox.subspace_projection import (
@@ -74,7 +73,6 @@ class Plan:
     method: Method
     n: int | None  # order; None to choose it
     n_max: int  # largest order that the horizons and the record allow, or that was asked for
-    nk: tuple[int, ...]  # delay of every input in samples, at least 1
     past: int  # samples
     future: int
     feedthrough: bool
@@ -91,8 +89,9 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
     `n_max`: largest order to try.
     """
     horizon, feedthrough = asked.horizon, asked.feedthrough
-    n, nk = _read_orders(method, data, orders)
-    given = channels(data, tuple(k - 1 for k in nk))
+    check_order_names(method, orders, ("n",))
+    n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or say 'auto'")
+    given = channels(data)
     largest = n or n_max or _AUTO_MAX
     longest = _longest(method, data, given.n_samples, largest, horizon)
     length = longest + 1 if method == "pbsid" else 2 * longest
@@ -112,7 +111,6 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
         method=method,
         n=n,
         n_max=largest,
-        nk=nk,
         past=chosen,
         future=chosen,
         feedthrough=_feedthrough(data, factors, total, chosen) if feedthrough is None else feedthrough,
@@ -122,14 +120,6 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
         autoregression=max(20, wanted_lags + wanted_lags // 2),
         past_limited=horizon is None and wanted_lags >= length - 1,
     )
-
-
-def _read_orders(method: str, data: IOData, orders: Orders) -> tuple[int | None, tuple[int, ...]]:
-    """Return n (None for automatic) and nk for each input."""
-    check_order_names(method, orders, ("n", "nk"))
-    n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or say 'auto'")
-    least, remedy = 1, "For an input that acts at once say feedthrough"
-    return n, order_per_input(method, {"nk": least, **orders}, "nk", least, data.n_inputs, remedy=remedy)
 
 
 def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int | None) -> int:
@@ -192,17 +182,14 @@ def build_subspace_fit(
     `covariance`: (n_theta, n_theta), of the scaled coefficients; `criterion`: by which the order was chosen; `more`:
     as `build_fit` takes it.
     """
-    core, scale = to_units(scaled, plan.channels, data.dt)
-    model, places = embed_delays(core, plan.nk)
+    model, scale = to_units(scaled, plan.channels, data.dt)
     if covariance is not None:
-        wide = np.zeros((model.theta.size, model.theta.size))
-        wide[np.ix_(places, places)] = covariance * np.outer(scale, scale)
-        covariance = 0.5 * (wide + wide.T)
-    delays = {"nk": plan.nk} if any(k > 1 for k in plan.nk) else {}
+        covariance = covariance * np.outer(scale, scale)
+        covariance = 0.5 * (covariance + covariance.T)
     return build_fit(
         name,
         data,
-        orders={"n": core.order, **delays},
+        orders={"n": model.order},
         model=model,
         covariance=covariance,
         noise_covariance=scaled.innovation * np.outer(plan.channels.scale_y, plan.channels.scale_y),
@@ -223,33 +210,6 @@ def to_units(scaled: Realisation, given: Channels, dt: float) -> tuple[StateSpac
     factors = (np.ones((n, n)), np.ones((n, 1)) / u, y[:, None] * np.ones(n), y[:, None] / u, np.ones((n, 1)) / y)
     scale = np.concatenate([f.ravel() for f in factors])
     return replace(scaled.model.with_theta(scaled.model.theta * scale), dt=dt), scale
-
-
-def embed_delays(core: StateSpaceModel, nk: tuple[int, ...]) -> tuple[StateSpaceModel, NDArray[np.intp]]:
-    """Put known input delays back as states that hand the input on.
-
-    `core`: for inputs that come nk - 1 samples early. Returns `model`: for the inputs as recorded; `places`: (n_theta
-    of core,), where each coefficient of the core is among those of the model.
-    """
-    numbers = np.arange(2.0, core.theta.size + 2)
-    home = {x: k for k, x in enumerate(_embed(core.with_theta(numbers), nk).theta.tolist())}
-    return _embed(core, nk), np.array([home[x] for x in numbers.tolist()], dtype=np.intp)
-
-
-def _embed(core: StateSpaceModel, nk: tuple[int, ...]) -> StateSpaceModel:
-    n, extra = core.order, sum(k - 1 for k in nk)
-    A, C = (np.pad(x, ((0, more), (0, extra))) for x, more in ((core.A, extra), (core.C, 0)))
-    B, K, D = np.pad(core.B, ((0, extra), (0, 0))), np.pad(core.K, ((0, extra), (0, 0))), core.D.copy()
-    first = n
-    for j, k in enumerate(nk):
-        if k == 1:
-            continue
-        A[:n, first], C[:, first], B[:, j], D[:, j] = core.B[:, j], core.D[:, j], 0.0, 0.0
-        for i in range(first, first + k - 2):
-            A[i, i + 1] = 1.0
-        first += k - 1
-        B[first - 1, j] = 1.0
-    return StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=core.dt)
 
 
 def offsets(scaled: Realisation, plan: Plan) -> Offsets:
@@ -454,8 +414,8 @@ def _condition(plan: Plan) -> float:
 class OrderModel:
     """The model of one order among several from one factorisation."""
 
-    order: int  # number of states, those of known delays not counted
-    model: StateSpaceModel  # in SI, known delays included
+    order: int  # number of states
+    model: StateSpaceModel  # in SI
     innovation: Array  # (n_outputs, n_outputs), SI, covariance of the innovations
     criterion: float  # bayes' criterion by which orders are compared
     singular_value: float  # the `order`-th one
@@ -466,7 +426,6 @@ def subspace_models(
     method: Method,
     n_max: int,
     *,
-    nk: int | tuple[int, ...] = 1,
     tick: Tick = None,
 ) -> tuple[OrderModel, ...]:
     """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram wants them.
@@ -477,8 +436,6 @@ def subspace_models(
     method : {"n4sid", "moesp", "cva", "pbsid"}
     n_max : int
         Largest order.
-    nk : int or tuple of int, optional
-        Known delay of the inputs in samples.
     tick : callable, optional
         Called between steps.
 
@@ -496,7 +453,7 @@ def subspace_models(
     if n_max < 1:
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
     with one_thread():
-        plan = plan_estimate(method, data, {"nk": nk}, Asked(tick=tick), n_max)
+        plan = plan_estimate(method, data, {}, Asked(tick=tick), n_max)
         _, found = decomposition(plan)
         criterion = order_criterion(plan)
         out = []
@@ -507,7 +464,7 @@ def subspace_models(
             out.append(
                 OrderModel(
                     order=n,
-                    model=embed_delays(model, plan.nk)[0],
+                    model=model,
                     innovation=scaled.innovation * np.outer(scale, scale),
                     criterion=float(criterion[n]),
                     singular_value=float(found.values[n - 1]),
@@ -524,8 +481,7 @@ Parameters
 ----------
 data : IOData
 orders : Mapping
-    ``n``: number of states, ``"auto"`` or missing to choose it. ``nk``: known delay of the inputs in samples, one
-    or one for each, at least 1 (default); larger ones become states of their own.
+    ``n``: number of states, ``"auto"`` or missing to choose it. A delay of the input counts as states.
 horizon : int, optional
     Samples of future and of past; chosen by an autoregression if missing.
 feedthrough : bool, optional

@@ -35,7 +35,7 @@ from ambid.signals.delay import lagged_triangle
 class Channels:
     """Inputs and outputs with what they are centred and divided by before anything is factored."""
 
-    u: Array  # (n_samples, n_inputs), SI, already shifted by known delays
+    u: Array  # (n_samples, n_inputs), SI
     y: Array  # (n_samples, n_outputs), SI
     mean_u: Array  # (n_inputs,), SI, mean and standard deviation
     scale_u: Array
@@ -78,18 +78,9 @@ class Factors:
         return np.stack([triangular_factor(g) for g in chosen])
 
 
-def channels(data: IOData, delay: Sequence[int]) -> Channels:
-    """Shift the inputs by known delays and look at the size of every channel.
-
-    `delay`: samples by which each input is shifted, shape (n_inputs,).
-    """
-    lost = max(delay, default=0)
-    n = data.n_samples - lost
-    if n < 1:
-        raise EstimationError(f"a delay of {lost} samples leaves nothing of {data.n_samples}. Lower nk")
-    shifted = [data.u[lost - d : lost - d + n, j] for j, d in enumerate(delay)]
-    u = np.stack(shifted, axis=1) if lost else data.u
-    y = data.y[lost:]
+def channels(data: IOData) -> Channels:
+    """Look at the size of every channel."""
+    u, y = data.u, data.y
     for values, names, what in ((u, data.inputs, "input"), (y, data.outputs, "output")):
         for name, column in zip(names, values.T, strict=True):
             if not np.ptp(column) > 1e-12 * np.max(np.abs(column)):
