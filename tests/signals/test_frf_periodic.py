@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.errors import EstimationError
-from ambid.signals import find_experiments, find_period, frf_periodic, multisine
+from ambid.signals import find_period, frf_periodic, multisine
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, one_period, response, steady
 
 N = 512
@@ -45,13 +45,6 @@ def test_no_period_is_invented():
     for x in (rng.standard_normal(3000), lfilter([1.0], [1.0, -0.98], rng.standard_normal(3000)), np.arange(500.0)):
         with pytest.raises(EstimationError, match="no period"):
             find_period(x)
-
-
-def test_experiments_lie_between_rests():
-    rng = np.random.default_rng(4)
-    x = 2.5 + np.concatenate([np.zeros(80), rng.standard_normal(600), np.zeros(90), rng.standard_normal(500)])
-    found = find_experiments(x)
-    assert [(s.start, s.stop) for s in found] == [pytest.approx((80, 680), abs=4), pytest.approx((770, 1270), abs=4)]
 
 
 def test_hum_among_odd_lines_is_left_out_and_named():

@@ -23,15 +23,14 @@ PLANTS = {"coil": ([0, 0.1], [1, -0.9]), "resonant": ([0, 0.1, 0.05], [1, -1.6, 
 
 @pytest.mark.parametrize("db", [40.0, 20.0, 10.0])
 @pytest.mark.parametrize("plant", PLANTS)
-def test_each_method_finds_the_ratio_within_1_db(make, plant, db):
+def test_the_ratio_is_found_within_1_db(make, plant, db):
     period = N // 10
     u = multisine(N, RATE, amplitude=1.0, band=(5.0, 2000.0), periods=10, seed=1)
     clean = np.tile(lfilter(*PLANTS[plant], u)[-period:], 10)
     r = make(RATE, u=u, y=noisy(clean, db) + 3.0)
-    for settings in ({"period_s": period / RATE}, {"floor": True}, {"inputs": "u", "order": 40}):
-        found = snr(r, "y", **settings)
-        assert found.db == pytest.approx(db, abs=1.0)
-        assert found.noise_sd == pytest.approx(np.std(clean) * 10 ** (-db / 20), rel=0.12)
+    found = snr(r, "y", inputs="u", order=40)
+    assert found.db == pytest.approx(db, abs=1.0)
+    assert found.noise_sd == pytest.approx(np.std(clean) * 10 ** (-db / 20), rel=0.12)
 
 
 @pytest.mark.parametrize("db", [40.0, 20.0, 10.0])
@@ -55,16 +54,13 @@ def test_limiting_cases(make):
     r = make(RATE, dead=np.ones(N), noise=rng.standard_normal(N), clean=np.tile(rng.standard_normal(100), 200))
     assert snr(r, "dead").db == -np.inf
     assert snr(r, "noise").db < -20.0
-    assert snr(r, "clean", period_s=0.01).db > 200.0
+    assert snr(r, "clean", order=100).db > 200.0
     assert "SNR" in str(snr(r, "noise"))
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"period_s": 0.01, "floor": True}, "more than one"),
-        ({"period_s": 0.01234567}, "whole number"),
-        ({"period_s": 1.5}, "two periods"),
         ({"inputs": "y"}, "own inputs"),
         ({"inputs": "nothing"}, "no channel"),
         ({"order": 20000}, "too few"),
@@ -73,11 +69,6 @@ def test_limiting_cases(make):
 def test_what_cannot_be_done_is_refused(make, settings, message):
     with pytest.raises(AmbidError, match=message):
         snr(make(RATE, y=np.random.default_rng(1).standard_normal(N)), "y", **settings)
-
-
-def test_measured_position_noise_agrees_between_methods(maglev):
-    r = maglev("levitate_updown_c")
-    assert snr(r, "position", floor=True).noise_sd == pytest.approx(18e-6, rel=0.5)
 
 
 def test_power_spectrum_integrates_to_the_variance():

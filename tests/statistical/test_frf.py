@@ -42,11 +42,6 @@ def h1(rng):
     return frf_random(u, lfilter(B, A, u) + 0.5 * rng.standard_normal(4096), 1.0, segment=256)
 
 
-def h1_overlap(rng):
-    u = rng.standard_normal(4096)
-    return frf_random(u, lfilter(B, A, u) + 0.5 * rng.standard_normal(4096), 1.0, segment=256, overlap=0.75)
-
-
 def h2(rng):
     u = rng.standard_normal(4096)
     return frf_random(u + 0.5 * rng.standard_normal(4096), lfilter(B, A, u), 1.0, segment=256, kind="h2")
@@ -89,7 +84,6 @@ def runs(estimate):
         (periodic_realisations, (B, A)),
         (periodic_with_reference, (Loop.b, Loop.a)),
         (h1, (B, A)),
-        (h1_overlap, (B, A)),
         (h2, (B, A)),
         (hv, (B, A)),
         (welch_with_reference, (Loop.b, Loop.a)),

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from ambid.signals.noise_ratio import Snr as Snr
     from ambid.signals.noise_ratio import snr as snr
     from ambid.signals.periodic_response import Distortions as Distortions
-    from ambid.signals.periodic_response import find_experiments as find_experiments
     from ambid.signals.periodic_response import find_period as find_period
     from ambid.signals.periodic_response import frf_periodic as frf_periodic
     from ambid.signals.random_response import frf_random as frf_random

@@ -1,4 +1,4 @@
-"""Frequency response from arbitrary excitation by the local polynomial (or rational) method.
+"""Frequency response from arbitrary excitation by the local polynomial method.
 
 In a window of lines around each line, Z = G(q) X + T(q) + V with polynomials G and T of the distance q, where T is
 the leakage: a smooth spectrum too (Pintelon and Schoukens 2012, sec. 7.2; Schoukens et al. 2009). Least squares by QR;
@@ -17,18 +17,17 @@ from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.signals.response import FEEDBACK, FrequencyResponse, Hold, checked, labels, ratio, weak_inputs
 
+_DEGREE = 2  # of the polynomials
 _CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
 _WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Plan:
-    """Polynomial degree, half width h of the windows of 2h + 1 lines, unknowns of each, and whether poles are too."""
+    """Half width h of the windows of 2h + 1 lines, and unknowns of each."""
 
-    degree: int
     half: int
     unknowns: int
-    rational: bool
 
     @property
     def free(self) -> int:
@@ -52,9 +51,7 @@ def frf_local(
     rate_hz: float,
     *,
     r: Array | None = None,
-    degree: int = 2,
     free: int | None = None,
-    rational: bool = False,
     band: tuple[float, float] | None = None,
     open_loop: bool = False,
     hold: Hold = "zoh",
@@ -77,14 +74,9 @@ def frf_local(
         Sampling rate in Hz.
     r : ndarray, shape (n_samples, n_r), optional
         References: outer excitation of the loop, independent of the noise, at least as many as inputs.
-    degree : int
-        Degree of the polynomials, 1 or more.
     free : int, optional
         Least lines of a window beyond its unknowns: more gives a better variance and a wider window. By default 8, or
         4 more than there are signals.
-    rational : bool
-        Give each output a local denominator of the same degree (McKelvey and Guérin 2012): less bias at light damping,
-        but noise biases it where the signal is not 20 dB above it, and the variance, some 20 % low, shows neither.
     band : (float, float), optional
         Band in Hz in which the estimate is wanted.
     open_loop : bool
@@ -110,7 +102,7 @@ def frf_local(
     n, n_y, n_u = u.shape[0], y.shape[1], u.shape[1]
     x, z = (u, y) if r is None else (r, np.concatenate([y, u], axis=1))
     X, Z = (np.fft.rfft(s, axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for s in (x, z))
-    plan = _plan(X, Z, degree, free, rational)
+    plan = _plan(X, Z, free)
     frequency = np.arange(1, X.shape[0] + 1) * (rate_hz / n)
     wanted = _in_band(frequency, band)
     fitted = _fitted(X, Z, wanted, plan)
@@ -126,8 +118,7 @@ def frf_local(
         frequency_hz=frequency[wanted],
         G=G,
         covariance=covariance,
-        method=f"local {'rational' if rational else 'polynomial'}, degree {degree}"
-        + ("" if r is None else ", joint input-output with the reference"),
+        method=f"local polynomial, degree {_DEGREE}" + ("" if r is None else ", joint input-output with the reference"),
         inputs=labels(inputs, "u", n_u),
         outputs=labels(outputs, "y", n_y),
         units=MappingProxyType(dict(units or {})),
@@ -138,7 +129,7 @@ def frf_local(
         warnings=warnings,
         details=MappingProxyType(
             {
-                "degree": degree,
+                "degree": _DEGREE,
                 "window_lines": 2 * plan.half + 1,
                 "window_hz": (2 * plan.half + 1) * rate_hz / n,
                 "condition": float(np.max(fitted.condition)),
@@ -147,20 +138,18 @@ def frf_local(
     )
 
 
-def _plan(X: Complex, Z: Complex, degree: int, free: int | None, rational: bool) -> _Plan:
+def _plan(X: Complex, Z: Complex, free: int | None) -> _Plan:
     free = max(8, Z.shape[1] + 4) if free is None else free
-    if degree < 1 or free < Z.shape[1]:
+    if free < Z.shape[1]:
         raise EstimationError(
-            f"local polynomials of degree {degree} with {free} lines beyond the unknowns and {Z.shape[1]} signals; the "
-            "degree must be at least 1, and the lines at least as many as the signals. Give more"
+            f"local polynomials with {free} lines beyond the unknowns and {Z.shape[1]} signals; there must be at least "
+            "as many lines as signals. Give more"
         )
-    unknowns = (degree + 1) * (X.shape[1] + 1) + degree * rational
+    unknowns = (_DEGREE + 1) * (X.shape[1] + 1)
     half = (unknowns + free) // 2
     if X.shape[0] < 2 * half + 1:
-        raise EstimationError(
-            f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record or a lower degree"
-        )
-    return _Plan(degree=degree, half=half, unknowns=unknowns, rational=rational)
+        raise EstimationError(f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record")
+    return _Plan(half=half, unknowns=unknowns)
 
 
 def _in_band(frequency: Array, band: tuple[float, float] | None) -> np.ndarray:
@@ -188,12 +177,12 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
         # At the ends of the band the window is not centred on its line.
         window = np.clip(lines - plan.half, 0, X.shape[0] - width)[:, None] + np.arange(width)
         found[part], L, noise, condition[part] = _windows(X[window], Z[window], (window - lines[:, None]), plan)
-        product = np.einsum("fiaw,fjbw->fiajb", L, L.conj(), optimize=True)
-        C = noise[:, :, None, :, None] * product
+        product = np.einsum("faw,fbw->fab", L, L.conj())
+        C = noise[:, :, None, :, None] * product[:, None, :, None, :]
         covariance[part] = C.reshape(lines.size, n_z * n_x, n_z * n_x)
-        spread[part] = product[:, 0, :, 0]
+        spread[part] = product
         for a in range(n_x):
-            weighted = L[:, 0, a] / np.real(spread[part][:, a, a])[:, None]
+            weighted = L[:, a] / np.real(spread[part][:, a, a])[:, None]
             np.add.at(shared[:, a], window.ravel(), weighted.ravel())
     own = np.sum(1.0 / np.real(np.diagonal(spread, axis1=1, axis2=2)), axis=0)
     return _Fitted(
@@ -209,25 +198,14 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
 def _windows(X: Complex, Z: Complex, q: np.ndarray, plan: _Plan) -> tuple[Complex, Complex, Complex, Array]:
     """Fit all windows of a chunk: X (c, w, n_x), Z (c, w, n_z), q (c, w) distances in lines.
 
-    Returns the responses (c, n_z, n_x), the rows L (c, n_z, n_x, w) that make them from Z, the noise (c, n_z, n_z)
+    Returns the responses (c, n_z, n_x), the rows L (c, n_x, w) that make them from Z, the noise (c, n_z, n_z)
     and the condition of the columns (c,).
     """
-    powers = (q / plan.half)[:, :, None] ** np.arange(plan.degree + 1)
+    powers = (q / plan.half)[:, :, None] ** np.arange(_DEGREE + 1)
     of_x = (X[:, :, None, :] * powers[:, :, :, None]).reshape(*X.shape[:2], -1)
     columns = np.concatenate([of_x, powers], axis=2)
-    n_x, n_z = X.shape[2], Z.shape[2]
-    if plan.rational:
-        parts = [
-            _solved(np.concatenate([columns, powers[:, :, 1:] * Z[:, :, i : i + 1]], axis=2), Z[:, :, i : i + 1], n_x)
-            for i in range(n_z)
-        ]
-        L = np.stack([p[0] for p in parts], axis=1)
-        left = np.concatenate([p[1] for p in parts], axis=2)
-        condition = np.max([p[2] for p in parts], axis=0)
-    else:
-        one, left, condition = _solved(columns, Z, n_x)
-        L = np.broadcast_to(one[:, None], (one.shape[0], n_z, *one.shape[1:]))
-    found = np.einsum("fiaw,fwi->fia", L, Z)
+    L, left, condition = _solved(columns, Z, X.shape[2])
+    found = np.einsum("faw,fwi->fia", L, Z)
     noise = np.einsum("fwi,fwj->fij", left, left.conj()) / plan.free
     return found, L, noise, condition
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals.conditioning import runs
 from ambid.signals.response import (
     FEEDBACK,
     FrequencyResponse,
@@ -70,47 +69,6 @@ def find_period(x: Array) -> int:
     deepest = float(d[low].min())
     # A multiple of the period is as deep but for noise: the first that is not clearly shallower is the period.
     return int(low[np.argmax(d[low] <= 2.0 * deepest + 1e-3)])
-
-
-def find_experiments(x: Array, *, quiet: int = 50, margin: int = 0) -> tuple[slice, ...]:
-    """Find the experiments of a record: stretches of excitation between rests, at least as long as a rest.
-
-    A rest is a stretch in which no channel leaves a band of 2 % of its largest deviation.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples,) or (n_samples, n_channels), any unit
-        Excitation.
-    quiet : int
-        Least samples of a rest.
-    margin : int
-        Samples left out at the end of each experiment, where the excitation fades through its filter and is no longer
-        periodic.
-
-    Returns
-    -------
-    tuple of slice
-        Samples of each experiment, in order.
-
-    Raises
-    ------
-    EstimationError
-        If the signal rests all the time.
-    """
-    x = x[:, None] if x.ndim == 1 else x
-    level = np.median(x, axis=0)
-    for _ in range(2):  # the median of an excitation is not its rest: refine on the quiet samples
-        size = np.max(np.abs(x - level), axis=0)
-        calm = np.all(np.abs(x - level) <= 0.02 * size, axis=1)
-        starts, lengths = runs(calm)
-        rests = [(s, s + n) for s, n in zip(starts, lengths, strict=True) if n >= quiet]
-        if rests:
-            level = np.median(np.concatenate([x[a:b] for a, b in rests]), axis=0)
-    if not np.all(size > 0) or sum(b - a for a, b in rests) == x.shape[0]:
-        raise EstimationError("the excitation rests all the time; there is no experiment in it. Pass the driven signal")
-    edges = [0, *(edge for rest in rests for edge in rest), x.shape[0]]
-    both = zip(edges[::2], edges[1::2], strict=True)
-    return tuple(slice(int(a), int(b) - margin) for a, b in both if b - a >= quiet + margin)
 
 
 def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:

@@ -41,8 +41,6 @@ def frf_random(
     r: Array | None = None,
     kind: Kind = "h1",
     segment: int | None = None,
-    overlap: float = 0.5,
-    window: str = "hann",
     noise_ratio: float | None = None,
     open_loop: bool = False,
     hold: Hold = "zoh",
@@ -69,10 +67,6 @@ def frf_random(
         Where the noise is, without a reference: outputs, inputs (as many outputs as inputs), or both.
     segment : int, optional
         Samples of a segment; by default an eighth of the record. It should hold several time constants.
-    overlap : float
-        Share of a segment in common with the next.
-    window : str
-        Window, as in `cross_spectra`.
     noise_ratio : float, optional
         For "hv": variance of the input noise over that of the output noise. By default the noise is taken to be the
         same share of both signals at every line.
@@ -100,7 +94,7 @@ def frf_random(
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     _options_agree(kind, noise_ratio, r is not None)
     z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
-    spectra = cross_spectra(z, rate_hz, segment=segment, overlap=overlap, window=window)
+    spectra = cross_spectra(z, rate_hz, segment=segment)
     n_y, n_u, n_x = y.shape[1], u.shape[1], (u if r is None else r).shape[1]
     if spectra.n_effective <= n_x + 1 or spectra.frequency_hz.size < 2 * _EDGE + 2:
         raise EstimationError(
@@ -114,7 +108,7 @@ def frf_random(
             warnings += ("Hv takes the noise for the same share of input and output at every line. Give noise_ratio",)
     length = round(rate_hz / spectra.frequency_hz[1])
     if length % 2 == 0 and length >= _LEAKAGE_FROM:
-        half = cross_spectra(z, rate_hz, segment=length // 2, overlap=overlap, window=window)
+        half = cross_spectra(z, rate_hz, segment=length // 2)
         warnings += _leakage(found, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
     G, covariance, coherence, method = found
     return FrequencyResponse(

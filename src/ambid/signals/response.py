@@ -126,22 +126,6 @@ class FrequencyResponse:
         """|G|, shape (n_f, n_y, n_u)."""
         return np.asarray(np.abs(self.G))
 
-    @property
-    def magnitude_sd(self) -> Array:
-        """Standard deviation of |G|, shape (n_f, n_y, n_u): sd/√2, for errors well under |G|."""
-        return np.asarray(self.sd / np.sqrt(2.0))
-
-    @property
-    def phase_rad(self) -> Array:
-        """Phase of G in rad, unwrapped along frequency, shape (n_f, n_y, n_u)."""
-        return np.asarray(np.unwrap(np.angle(self.G), axis=0))
-
-    @property
-    def phase_sd_rad(self) -> Array:
-        """Standard deviation of the phase in rad, shape (n_f, n_y, n_u): sd/(√2 |G|), for errors well under |G|."""
-        with np.errstate(divide="ignore"):
-            return np.asarray(self.sd / np.sqrt(2.0) / np.abs(self.G))
-
     def confidence_radius(self, level: float = 0.95) -> Array:
         """Return the radius of the circle around each entry of G that holds the truth with the given probability.
 

@@ -124,10 +124,8 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
     )
 
 
-def cross_spectra(
-    z: Array, rate_hz: float, *, segment: int | None = None, overlap: float = 0.5, window: str = "hann"
-) -> CrossSpectra:
-    """Estimate the spectral density matrix of several signals by Welch's method (mean of each segment removed).
+def cross_spectra(z: Array, rate_hz: float, *, segment: int | None = None) -> CrossSpectra:
+    """Estimate the spectral density matrix of several signals by Welch's method (Hann, half overlap).
 
     Parameters
     ----------
@@ -137,10 +135,6 @@ def cross_spectra(
         Sampling rate in Hz.
     segment : int, optional
         Samples of a segment, as in `power_spectrum`.
-    overlap : float
-        Share of a segment that it has in common with the next, 0 to 0.9.
-    window : str
-        Name of a window that `scipy.signal.get_window` knows.
 
     Returns
     -------
@@ -150,14 +144,14 @@ def cross_spectra(
     Raises
     ------
     RecordError
-        If the segment does not fit the record, or the overlap is out of range.
+        If the segment does not fit the record.
     """
-    if not 0.0 <= overlap <= 0.9:
-        raise RecordError(f"segments that overlap by {overlap:g}; 0 to 0.9 of a segment is possible. Give e.g. 0.5")
+    from scipy.signal import get_window
+
     length = _segment(z.shape[0], segment)
-    step = max(1, length - int(overlap * length))
+    step = length - length // 2
     count = (z.shape[0] - length) // step + 1
-    w = _window(window, length)
+    w = np.asarray(get_window("hann", length), dtype=np.float64)
     segments = np.lib.stride_tricks.sliding_window_view(z, length, axis=0)[::step]
     density = np.zeros((length // 2 + 1, z.shape[1], z.shape[1]), dtype=np.complex128)
     for first in range(0, count, _CHUNK):
@@ -183,12 +177,6 @@ def _segment(n_samples: int, segment: int | None) -> int:
     if not 8 <= segment <= n_samples:
         raise RecordError(f"a segment of {segment} samples; it must have 8 to {n_samples} (the record). Give another")
     return segment
-
-
-def _window(name: str, length: int) -> Array:
-    from scipy.signal import get_window
-
-    return np.asarray(get_window(name, length), dtype=np.float64)
 
 
 def _effective(w: Array, step: int, count: int) -> float:
