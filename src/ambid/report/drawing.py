@@ -423,7 +423,7 @@ def poles_panel(
     axes.set_title(title, fontsize=10)
     grid(axes)
     beside.axis("off")
-    beside.text(0.0, 0.97, text, fontsize=9, va="top", family="monospace", transform=beside.transAxes)
+    beside.text(0.0, 0.97, text, fontsize=8, va="top", family="monospace", transform=beside.transAxes)
 
 
 def note(axes: Axes, text: str) -> None:

@@ -31,7 +31,7 @@ from ambid.report.drawing import (
 )
 from ambid.report.estimate_text import names_words
 from ambid.report.numbers import prefixed
-from ambid.report.text import pure
+from ambid.report.text import pole_table
 from ambid.validate import nonlinear_bearing
 from ambid.validate.second_record import Replay
 
@@ -201,22 +201,8 @@ def _bode(figure: Figure | SubFigure, estimate: Estimate) -> None:
 
 def _poles(figure: Figure | SubFigure, estimate: Estimate) -> None:
     found = poles(estimate)
-    text = ["pole [rad/s]", "", *(line for pole in found if pole.value.imag >= 0 for line in _pole_words(pole))]
+    text = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
     poles_panel(figure, found, "\n".join(text), "poles of the identified plant, 95 % regions")
-
-
-def _pole_words(pole: Pole) -> list[str]:
-    spread = np.zeros(2) if pole.covariance is None else np.sqrt(np.maximum(np.diag(pole.covariance), 0.0))
-    p = pole.value
-    real = pure(p.real, float(spread[0]))
-    if p.imag == 0:
-        if not p.real:
-            return [real, "    integrator", ""]
-        scale, unit = prefixed(1 / abs(p.real), "s")
-        state = "unstable" if p.real > 0 else "stable"
-        return [real, f"    {state}, time constant {1 / abs(p.real) / scale:.3g} {unit}", ""]
-    oscillation = f"    {abs(p) / (2 * np.pi):.4g} Hz, damping {-p.real / abs(p):.3g}"
-    return [real, f"  ± j({pure(p.imag, float(spread[1]))})", oscillation, ""]
 
 
 # --- a nonlinear bearing --------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ predictions with bands, correlations, learning curves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -39,7 +39,7 @@ from ambid.report.drawing import (
     stems,
     worst_stretch,
 )
-from ambid.report.fit_text import is_weight, pole_lines
+from ambid.report.fit_text import is_weight, pole_lines, term_ratios
 from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
 from ambid.validate.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
@@ -318,15 +318,9 @@ def term_names(fit: NonlinearFit) -> set[str]:
 
     `fit`: with a model. Returns empty for a structure without terms.
     """
-    terms = fit.details.get("terms")
-    if not isinstance(terms, Mapping) or fit.model is None:
+    if fit.model is None:
         return set()
-    several = len(fit.outputs) > 1
-    chosen = {
-        (f"y{o + 1}: " if several else "") + str(t["term"])
-        for o, output in enumerate(fit.outputs)
-        for t in terms.get(output, ())
-    }
+    several, chosen = len(fit.outputs) > 1, term_ratios(fit)
     below = {f"{x.split(': ')[0]}: " if several else "" for x in chosen}
     return {x for x in fit.model.names if x in chosen or any(x.startswith(f"{b}1/(") for b in below)}
 

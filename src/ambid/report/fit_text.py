@@ -29,7 +29,7 @@ from ambid.report.text import (
     joined,
     other_warnings,
     plain,
-    pure,
+    pole_table,
     status_words,
     timing_lines,
     title_line,
@@ -40,7 +40,6 @@ from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from ambid.bearing.measured import Measured
-    from ambid.blackbox.model import BlackBoxModel
     from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 
 _COEFFICIENTS = 24  # that a terminal shows; the file has all
@@ -127,10 +126,10 @@ def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
 # --- coefficients and poles of a linear model -----------------------------------------------------------------------
 
 
-def coefficient_lines(fit: BlackBoxFit) -> list[str]:
-    """Write the coefficients that are not fixed by the structure, each with its standard deviation."""
+def coefficient_lines(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[str]:
+    """Write the coefficients that are not fixed by the structure, each with its standard deviation, `without` some."""
     theta, sd = fit.model.theta, fit.sd
-    free = np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0]
+    free = np.setdiff1d(np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0], without)
     rows = [
         (fit.model.names[k], coefficient_text(float(theta[k]), 0.0 if sd is None else float(sd[k])))
         for k in free[:_COEFFICIENTS]
@@ -148,28 +147,13 @@ def coefficient_lines(fit: BlackBoxFit) -> list[str]:
 
 
 def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
-    """Write the poles with frequency, damping and standard deviation, one of each pair."""
-    poles, discrete = fit.model.poles(), fit.model.dt is not None
-    shown = [k for k in range(poles.size) if poles[k].imag >= 0][: _COEFFICIENTS // 2]
-    if not shown:
-        return []
+    """Write the first poles of a fit."""
+    poles = fit.model.poles()
     spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
-    rows = [(f"poles [{'z' if discrete else 'rad/s'}]", "frequency", "damping", "")]
-    for k in shown:
-        p = complex(poles[k])
-        sd = np.zeros(2) if spread is None else np.sqrt(np.maximum(np.diag(spread[k]), 0.0))
-        text = pure(p.real, float(sd[0]))
-        if p.imag:
-            text += f" ± j({pure(p.imag, float(sd[1]))})"
-        if p == 0:
-            rows.append((text, "", "", "delay"))
-            continue
-        s = np.log(p) / fit.dt if discrete else p
-        unstable = abs(p) > 1 if discrete else p.real > 0
-        frequency = sized(abs(s) / (2 * np.pi), "Hz") if abs(s) else "0 Hz"
-        damping = f"{-s.real / abs(s):.3g}" if abs(s) else ""
-        rows.append((text, frequency, damping, paint("unstable", "bad") if unstable else ""))
-    return columns(rows)
+    known = [None] * poles.size if spread is None else list(spread)
+    shown = [k for k in range(poles.size) if poles[k].imag >= 0][: _COEFFICIENTS // 2]
+    dt = None if fit.model.dt is None else fit.dt
+    return pole_table([(complex(poles[k]), known[k]) for k in shown], dt, paint=paint)
 
 
 # --- numbers of a nonlinear model -----------------------------------------------------------------------------------
@@ -209,19 +193,25 @@ def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
     return lines
 
 
+def term_ratios(fit: NonlinearFit) -> dict[str, object]:
+    """Return the error reduction ratio of each chosen term by the name of its parameter, None where it has none."""
+    terms, several = fit.details.get("terms"), len(fit.outputs) > 1
+    if not isinstance(terms, Mapping):
+        return {}
+    return {
+        (f"y{o + 1}: " if several else "") + str(t["term"]): t.get("err")
+        for o, output in enumerate(fit.outputs)
+        for t in terms.get(output, ())
+    }
+
+
 def term_lines(fit: NonlinearFit) -> list[str]:
     """Write the first terms in the order of choice, with error reduction ratios in percent where there are any.
 
     `fit` has ``terms`` in its details. Weights of a network beside them are counted.
     """
     assert fit.model is not None
-    several, terms = len(fit.outputs) > 1, fit.details["terms"]
-    assert isinstance(terms, Mapping)
-    ratio = {
-        (f"y{o + 1}: " if several else "") + str(t["term"]): t.get("err")
-        for o, output in enumerate(fit.outputs)
-        for t in terms[output]
-    }
+    ratio = term_ratios(fit)
     named = [k for k, name in enumerate(fit.model.names) if not is_weight(name)]
     weights, rest = fit.model.theta.size - len(named), max(len(named) - _TERMS, 0)
     rows: list[tuple[str, ...]] = [("term", _column(fit)), *(_row(fit, k) for k in named[:_TERMS])]
@@ -424,40 +414,25 @@ def _response_fit_lines(fit: BlackBoxFit, width: int, paint: Paint) -> list[str]
     about = f"{fit.structure}: {summary}; {settings_text(fit.orders)}{status_words(fit.status)}"
     lines = textwrap.wrap(about, width)
     lines[0] = lines[0].replace(fit.structure, paint(fit.structure, "strong"), 1)
+    first, repeated = _first_entry(fit)
     if fit.structure == "frf-ml":  # states are in coordinates of the method's own: their numbers say nothing
-        fit = _once(fit)
-        lines += coefficient_lines(fit)
-    lines += [*pole_lines(_first_entry(fit), paint=paint), *_late_lines(fit), *_laguerre_lines(fit, width)]
+        lines += coefficient_lines(fit, without=repeated)
+    lines += [*pole_lines(first, paint=paint), *_late_lines(fit), *_laguerre_lines(fit, width)]
     return [*lines, *check_lines(fit.checks, width=width, paint=paint)]
 
 
-def _common(model: BlackBoxModel) -> bool:
-    if not isinstance(model, TransferModel):
-        return False
-    dens = [d for row in model.den for d in row]
-    return len(dens) > 1 and all(np.array_equal(d, dens[0]) for d in dens)
-
-
-def _once(fit: BlackBoxFit) -> BlackBoxFit:
-    """Leave a denominator that all entries share to the first, so that its coefficients are shown once."""
-    if not isinstance(fit.model, TransferModel) or not _common(fit.model) or fit.covariance is None:
-        return fit
-    covariance = fit.covariance.copy()
-    for o, which, i, place in fit.model.blocks():
-        if which == "den" and (o or i):
-            covariance[place, :] = covariance[:, place] = 0.0
-    return replace(fit, covariance=covariance)
-
-
-def _first_entry(fit: BlackBoxFit) -> BlackBoxFit:
-    """Where all entries share a denominator, the fit of the first: it has all the poles."""
+def _first_entry(fit: BlackBoxFit) -> tuple[BlackBoxFit, list[int]]:
+    """The fit of the first entry where all share a denominator, which has all the poles, and places of its copies."""
     model = fit.model
-    if not isinstance(model, TransferModel) or not _common(model):
-        return fit
-    places = [np.arange(p.start, p.stop) for o, _, i, p in model.blocks() if not (o or i)]
-    own = np.concatenate(places)
+    dens = [d for row in model.den for d in row] if isinstance(model, TransferModel) else []
+    if not isinstance(model, TransferModel) or len(dens) < 2 or not all(np.array_equal(d, dens[0]) for d in dens):
+        return fit, []
+    places = [(o or i, which, range(p.start, p.stop)) for o, which, i, p in model.blocks()]
+    own = [k for other, _, place in places if not other for k in place]
+    copies = [k for other, which, place in places if other and which == "den" for k in place]
     first = TransferModel(num=((model.num[0][0],),), den=((model.den[0][0],),), dt=model.dt, delay=model.delay[:1])
-    return replace(fit, model=first, covariance=None if fit.covariance is None else fit.covariance[np.ix_(own, own)])
+    covariance = None if fit.covariance is None else fit.covariance[np.ix_(own, own)]
+    return replace(fit, model=first, covariance=covariance), copies
 
 
 def _late_lines(fit: BlackBoxFit) -> list[str]:

@@ -8,6 +8,9 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, cast
 
+import numpy as np
+
+from ambid.arrays import Array
 from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
 from ambid.report.numbers import Quantity, quantity, sized
 
@@ -143,6 +146,35 @@ def coefficient_text(value: float, sd: float | None) -> str:
         return pure(value, sd)
     scale = 10.0**exponent
     return f"({pure(value / scale, sd / scale)})e{exponent}"
+
+
+def pole_table(
+    poles: Sequence[tuple[complex, Array | None]],
+    dt: float | None = None,
+    *,
+    times: bool = False,
+    paint: Paint = plain,
+) -> list[str]:
+    """Write poles, each with its covariance or None, with frequency, damping and standard deviation.
+
+    `dt` is the sampling interval in s of discrete ones, `times` adds time constants; of each pair one is given.
+    """
+    rows = [(f"poles [{'z' if dt else 'rad/s'}]", "frequency", "damping", "")]
+    for p, covariance in poles:
+        sd = np.zeros(2) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        text = pure(p.real, float(sd[0])) + (f" ± j({pure(p.imag, float(sd[1]))})" if p.imag else "")
+        if p == 0:
+            rows.append((text, "", "", "delay" if dt else "integrator"))
+            continue
+        s = complex(np.log(p) / dt) if dt else p
+        unstable = abs(p) > 1 if dt else p.real > 0
+        frequency = sized(abs(s) / (2 * np.pi), "Hz") if abs(s) else "0 Hz"
+        damping = f"{-s.real / abs(s):.3g}" if abs(s) else ""
+        words = "unstable" if unstable else ""
+        if times and s.real and not s.imag:
+            words += f"{', ' if words else ''}time constant {sized(1 / abs(s.real), 's')}"
+        rows.append((text, frequency, damping, paint(words, "bad") if unstable else words))
+    return columns(rows) if poles else []
 
 
 def fit_rows(fits: Mapping[str, OutputFit], units: Mapping[str, str], no_simulation: str) -> list[tuple[str, ...]]:

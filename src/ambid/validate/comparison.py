@@ -12,6 +12,7 @@ import numpy as np
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.errors import EstimationError
+from ambid.estimation.documents import fields_json
 from ambid.validate.fits import judge
 from ambid.validate.orders import HELD_OUT, hold_out, select
 
@@ -54,28 +55,17 @@ class Comparison:
         Returns ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds
         and refusal; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
         """
-        return {
-            "judged_on": self.judged_on,
-            "fitted_samples": self.fitted_samples,
-            "judged_samples": self.judged_samples,
-            "inputs": list(self.inputs),
-            "outputs": list(self.outputs),
-            "summary": self.summary,
-            "entries": [
-                {
-                    "structure": x.structure,
-                    "orders": dict(x.orders),
-                    "n_estimated": None if x.fit is None else x.fit.n_estimated,
-                    "criteria": {} if x.fit is None else dict(x.fit.criteria),
-                    "one_step": x.one_step,
-                    "simulation": x.simulation,
-                    "failed_checks": list(x.failed),
-                    "seconds": x.seconds,
-                    "refusal": x.refusal or None,
-                }
-                for x in self.entries
-            ],
-        }
+        entries = [
+            {
+                **fields_json(x, without=("fit",)),
+                "n_estimated": None if x.fit is None else x.fit.n_estimated,
+                "criteria": {} if x.fit is None else dict(x.fit.criteria),
+                "failed_checks": list(x.failed),
+                "refusal": x.refusal or None,
+            }
+            for x in self.entries
+        ]
+        return {**fields_json(self, without=("entries", "record")), "entries": entries}
 
 
 def compare(
@@ -124,37 +114,31 @@ def compare(
 
 
 def _entry(name: str, orders: Orders | None, fitted: IOData, other: IOData, criterion: str) -> Entry:
-    start = time.perf_counter()
+    start, fit, refusal = time.perf_counter(), None, ""
     try:
         if orders is None:
             orders = select(name, fitted, criterion=criterion).orders
-        fit = structure(name).estimator(fitted, orders)
+        found = structure(name).estimator(fitted, orders)
         seconds = time.perf_counter() - start
-        fit = judge(fit, fitted, second=other)
-    except EstimationError as refusal:
-        return Entry(
-            structure=name,
-            orders={} if orders is None else dict(orders),
-            fit=None,
-            one_step=None,
-            simulation=None,
-            seconds=time.perf_counter() - start,
-            refusal=str(refusal),
-        )
+        fit = judge(found, fitted, second=other)
+    except EstimationError as error:
+        seconds, refusal = time.perf_counter() - start, str(error)
     return Entry(
         structure=name,
-        orders=fit.orders,
+        orders=dict(orders or {}) if fit is None else fit.orders,
         fit=fit,
         one_step=_mean(fit, "one_step"),
         simulation=_mean(fit, "simulation"),
         seconds=seconds,
+        refusal=refusal,
     )
 
 
-def _mean(fit: BlackBoxFit, kind: str) -> float | None:
+def _mean(fit: BlackBoxFit | None, kind: str) -> float | None:
     """Mean over the outputs of a fit on the second record; None where an output has none."""
     values = list[float]()
-    for of in (fit.validation or {}).values():
+    judged = None if fit is None else fit.validation
+    for of in (judged or {}).values():
         part = of.get(kind) if isinstance(of, dict) else None
         if part is None or not np.isfinite(part["fit"]):
             return None
