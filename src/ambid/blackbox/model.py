@@ -322,7 +322,8 @@ def complex_covariance(derivative: Complex, covariance: Array) -> Array:
     part.
     """
     parts = np.stack([derivative.real, derivative.imag], axis=-2)
-    return np.asarray(parts @ covariance @ np.swapaxes(parts, -1, -2))
+    with np.errstate(over="ignore", invalid="ignore"):  # not finite at multiple roots
+        return np.asarray(parts @ covariance @ np.swapaxes(parts, -1, -2))
 
 
 def pole_covariance(model: BlackBoxModel, covariance: Array) -> Array:

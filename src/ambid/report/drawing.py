@@ -265,6 +265,17 @@ class Pole:
     covariance: Array | None  # (2, 2)
 
 
+def roots(values: Complex, covariance: Array | None, most: float) -> list[Pole]:
+    """Return roots with their spread where it is less than `most`: that of a multiple root is infinite."""
+    if covariance is None:
+        return [Pole(value=complex(x), covariance=None) for x in values]
+    usable = [bool(np.all(np.isfinite(c)) and np.max(np.abs(c)) < most**2) for c in covariance]
+    return [
+        Pole(value=complex(x), covariance=c if use else None)
+        for x, c, use in zip(values, covariance, usable, strict=True)
+    ]
+
+
 def frequency_grid(poles: Complex | Array, lowest_hz: float, nyquist_hz: float, n_frequencies: int = 600) -> Array:
     """Return frequencies in Hz, even in the logarithm, with more points at lightly damped poles (rad/s)."""
     extra = [

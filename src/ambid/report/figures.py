@@ -13,6 +13,7 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_problem import BearingRecord
 from ambid.bearing.magnet_result import Curve, Curves, NonlinearBearingEstimate
 from ambid.bearing.measured import ModelResponse, with_spread
+from ambid.blackbox.model import StateSpaceModel, pole_covariance
 from ambid.estimation.estimate import Estimate
 from ambid.physics.models import model
 from ambid.report.drawing import (
@@ -25,6 +26,7 @@ from ambid.report.drawing import (
     poles_panel,
     records_panel,
     residuals_panel,
+    roots,
     signals_panel,
     single,
     stacked,
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
     from ambid.report.drawing import Draw
 
 _LOWEST_HZ = 0.1
-_DEFECTIVE = 1e-6  # |wᴴ v| of unit vectors under which a pole counts as multiple: its derivative does not exist
+_WIDEST = 1e9  # rad/s, standard deviation from which a pole counts as multiple: its derivative does not exist
 _LEVELS = 3  # currents or positions for which a curve is drawn
 _POINTS = 121
 _BEYOND = 0.1  # part of the usual range by which curves go beyond it
@@ -146,50 +148,35 @@ def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
 # --- a linear plant -------------------------------------------------------------------------------------------------
 
 
+def _as_black_box(estimate: Estimate) -> tuple[StateSpaceModel, Array]:
+    """The plant as a black-box model, and the slopes of its coefficients by the estimated parameters."""
+    plant = model(estimate.model)
+    space = plant.matrices(estimate.values)
+    n_y, n_u, n = space.C.shape[0], space.B.shape[1], space.A.shape[0]
+    rest = {"D": np.zeros((n_y, n_u)), "K": np.zeros((n, n_y))}
+    moved = [plant.derivative(estimate.values, name) for name in estimate.covariance_names]
+    slopes = [np.concatenate([x.ravel() for x in (d.A, d.B, d.C, *rest.values())]) for d in moved]
+    return StateSpaceModel(A=space.A, B=space.B, C=space.C, dt=None, **rest), np.array(slopes).T
+
+
 def responses(estimate: Estimate, *, n_frequencies: int = 600) -> ModelResponse:
     """Compute the frequency response of every pair with its spread, from 0.1 Hz to half the sampling rate.
 
-    With Φ = (jω - A)⁻¹, G = C Φ B and dG = C Φ (dA Φ B + dB) + dC Φ B. The delay of the input is not in it.
+    The delay of the input is not in it.
     """
-    plant = model(estimate.model)
-    space = plant.matrices(estimate.values)
+    plant, slopes = _as_black_box(estimate)
     nyquist = 0.5 * float(str(estimate.record["rate_hz"]))
     frequency = frequency_grid(estimate.continuous.poles, min(_LOWEST_HZ, 0.01 * nyquist), nyquist, n_frequencies)
-    s = 2j * np.pi * frequency[:, None, None]
-    resolvent = np.linalg.inv(s * np.eye(space.A.shape[0]) - space.A)
-    states = resolvent @ space.B
-    G = space.C @ states
-    slopes = np.zeros((*G.shape, len(estimate.covariance_names)), dtype=np.complex128)
-    for k, name in enumerate(estimate.covariance_names):
-        d = plant.derivative(estimate.values, name)
-        slopes[..., k] = space.C @ resolvent @ (d.A @ states + d.B) + d.C @ states
-    return with_spread(estimate.model, frequency, G, slopes, estimate.covariance)
+    omega = 2 * np.pi * frequency
+    by_parameter = plant.frequency_response_derivative(omega) @ slopes
+    return with_spread(estimate.model, frequency, plant.frequency_response(omega), by_parameter, estimate.covariance)
 
 
-def poles(estimate: Estimate) -> tuple[Pole, ...]:
-    """Compute the poles of the plant with their spread, sorted by real part.
-
-    A simple pole moves by dλ = wᴴ dA v / (wᴴ v), v and w its right and left eigenvectors.
-    """
-    from scipy.linalg import matrix_balance
-
-    plant = model(estimate.model)
-    space = plant.matrices(estimate.values)
-    slopes = [plant.derivative(estimate.values, name) for name in estimate.covariance_names]
-    _, (scale, _) = matrix_balance(space.A, permute=False, separate=True)  # rows and columns of like size
-    A = space.A * scale / scale[:, None]
-    values, right = np.linalg.eig(A)
-    # rows of the inverse are the left eigenvectors, scaled so that wᴴ v = 1; a multiple pole has none
-    left = np.linalg.inv(right) if np.linalg.cond(right) < 1 / _DEFECTIVE else None
-    found = []
-    for k in np.argsort(values.real):
-        covariance = None
-        if left is not None:
-            slope = np.array([left[k] @ (d.A * scale / scale[:, None]) @ right[:, k] for d in slopes])
-            J = np.array([slope.real, slope.imag]).reshape(2, len(slopes))
-            covariance = J @ estimate.covariance @ J.T
-        found.append(Pole(value=complex(values[k]), covariance=covariance))
-    return tuple(found)
+def poles(estimate: Estimate) -> list[Pole]:
+    """Compute the poles of the plant with their spread, sorted by real part."""
+    plant, slopes = _as_black_box(estimate)
+    spread = pole_covariance(plant, slopes @ estimate.covariance @ slopes.T)
+    return sorted(roots(plant.poles(), spread, _WIDEST), key=lambda pole: pole.value.real)
 
 
 def _bode(figure: Figure | SubFigure, estimate: Estimate) -> None:

@@ -25,8 +25,6 @@ from ambid.report.drawing import (
     MOST_PAIRS,
     NORMAL_95,
     PREDICTED,
-    Complex,
-    Pole,
     Traces,
     bode_panel,
     frequency_grid,
@@ -34,6 +32,7 @@ from ambid.report.drawing import (
     poles_panel,
     records_panel,
     residuals_panel,
+    roots,
     signals_panel,
     stacked,
     stems,
@@ -193,23 +192,12 @@ def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
     delayed = ", delay apart" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
     poles_panel(
         figure,
-        _roots(poles, of_poles, 1e3),
+        roots(poles, of_poles, 1e3),
         "\n".join(pole_lines(fit)),
         f"poles (x) and zeros (o), 95 % regions{hidden}{delayed}",
-        zeros=_roots(zeros[near], of_zeros, reach),
+        zeros=roots(zeros[near], of_zeros, reach),
         discrete=fit.model.dt is not None,
     )
-
-
-def _roots(values: Complex, covariance: Array | None, most: float) -> list[Pole]:
-    """Roots with their spread, where it is not much wider than the figure: that of a multiple root is infinite."""
-    if covariance is None:
-        return [Pole(value=complex(x), covariance=None) for x in values]
-    usable = [bool(np.all(np.isfinite(c)) and np.max(np.abs(c)) < most**2) for c in covariance]
-    return [
-        Pole(value=complex(x), covariance=c if use else None)
-        for x, c, use in zip(values, covariance, usable, strict=True)
-    ]
 
 
 # --- a nonlinear model ----------------------------------------------------------------------------------------------
