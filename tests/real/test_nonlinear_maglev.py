@@ -5,6 +5,7 @@ the mean current of all samples near that position.
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -75,11 +76,16 @@ def estimate(files):
     return read_estimate(files / "ball.json")
 
 
+@cache
+def moving():
+    """Position and current of all moving records."""
+    names = [MAGLEV / f"levitate_{n}.csv" for n in LEVITATION]
+    return np.concatenate([np.loadtxt(n, delimiter=",", skiprows=2001, usecols=(2, 3)) for n in names])
+
+
 def standing(z):
     """Mean current of all moving records within 0.3 mm of a position."""
-    every = np.concatenate(
-        [np.genfromtxt(MAGLEV / f"levitate_{n}.csv", delimiter=",", skip_header=1)[2000:, 2:4] for n in LEVITATION]
-    )
+    every = moving()
     return float(every[np.abs(every[:, 0] - z) < 0.3e-3, 1].mean())
 
 

@@ -27,16 +27,20 @@ def record(seed, n, *, truth=TRUTH, noise=NOISE, gain=0.0, rate=RATE, hold=40, s
     r = np.repeat(rng.choice([-1.0, 1.0], n // hold + 1), hold)[:n]
     r[until or n :] = 0.0
     e = rng.standard_normal((n, 2)) * noise
-    v, y, x, E = np.empty(n), np.empty((n, 3)), np.zeros(3), np.eye(4)
-    for k in range(n):
-        if k == 0 or (slope and k % 500 == 0):
-            M = np.zeros((4, 4))
-            M[:3] = [[-a * (1 + slope * k / n), 0, 0, ka], [0, -b, kb, 0], [kc, kc, -c, 0]]
-            E = expm(M / rate)
-            F, G = E[:3, :3], E[:3, 3]
-        y[k] = x
-        v[k] = r[k] - gain * (x[2] + e[k, 1])
-        x = F @ x + G * v[k]
+    y, x, drive, step = np.empty((n, 3)), np.zeros(3), r - gain * e[:, 1], 500 if slope else n
+    for k in range(0, n, step):
+        M = np.zeros((4, 4))
+        M[:3] = [[-a * (1 + slope * k / n), 0, 0, ka], [0, -b, kb, 0], [kc, kc, -c, 0]]
+        E = expm(M / rate)
+        values, vectors = np.linalg.eig(E[:3, :3] - gain * np.outer(E[:3, 3], [0.0, 0.0, 1.0]))
+        into = np.linalg.solve(vectors, np.column_stack([E[:3, 3], x]).astype(complex))
+        modes = [
+            lfilter([0.0, 1.0], [1.0, -p], g * drive[k : k + step], zi=[z])
+            for p, (g, z) in zip(values, into, strict=True)
+        ]
+        y[k : k + step] = (np.column_stack([m for m, _ in modes]) @ vectors.T).real
+        x = (vectors @ [left[0] for _, left in modes]).real
+    v = drive - gain * y[:, 2]
     return v + 2.0, y[:, 0] + y[:, 1] + e[:, 0] + 0.2, y[:, 2] + e[:, 1] + 0.01, r
 
 
