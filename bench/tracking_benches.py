@@ -20,7 +20,7 @@ from ambid.recursive.lines import Event
 from ambid.signals import multisine
 from ambid.simulate.bench import VaryingLoop
 from ambid.simulate.plant import LinearPlant
-from ambid.simulate.scenario_run import scenario_blocks
+from ambid.simulate.scenarios import scenario_blocks
 from ambid.simulate.variation import Variation
 from ambid.track.evidence import Samples
 from ambid.track.numbers import TrackedNumbers, tracked_numbers

@@ -158,7 +158,7 @@ def test_a_damaged_file_ends_at_the_same_estimate_and_says_what_was_left_out(tmp
 
 
 def test_lost_samples_all_over(tmp_path):
-    from ambid.simulate.lost_samples import losses
+    from ambid.simulate.scenarios import losses
 
     record = simulated(seconds=3.0, seed=2)
     lines = rows(record)

@@ -23,8 +23,7 @@ from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import IDEAL, PowerStage
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
-from ambid.simulate.bench import Simulation, simulate
-from ambid.simulate.levels import largest_amplitude
+from ambid.simulate.bench import Simulation, largest_amplitude, simulate
 from ambid.simulate.plant import LinearPlant
 from ambid.units import parse_unit
 

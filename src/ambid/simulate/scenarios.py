@@ -9,22 +9,142 @@ k_i/g. Who does not know the mass cannot tell the two apart.
 
 from __future__ import annotations
 
+import gzip
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import ModelError, nearest
+from ambid.errors import ModelError, RecordError, nearest
+from ambid.physics.presets import Preset
+from ambid.record import write_record
+from ambid.record.record import Channel, Record, Step
 from ambid.signals import multisine
-from ambid.simulate.rig_bench import Bench
+from ambid.simulate.bench import TRUE, Simulation, Stretch, VaryingLoop, join
+from ambid.simulate.rig_bench import Bench, as_columns
 from ambid.simulate.variation import Schedule, Unbalance, Variation
 
-if TYPE_CHECKING:
-    pass
+_MEAN_BURST = 8  # samples
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """One burst of lost samples.
+
+    Attributes
+    ----------
+    first, stop : int
+        Samples ``first`` to ``stop - 1`` are lost.
+    kind : {"cells", "rows", "skipped"}
+        One channel's cells are empty; all cells but the time are; or the rows are missing, so that time jumps.
+    column : int
+        Which channel, for ``"cells"``; any number, to be taken modulo the number of channels.
+    """
+
+    first: int
+    stop: int
+    kind: str
+    column: int
+
+
+_KINDS = ("cells", "rows", "skipped")
+
+
+def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[Loss, ...]:
+    """Return which samples are lost: bursts of some samples each, of all kinds in turn, apart from each other.
+
+    Parameters
+    ----------
+    n_samples : int
+        Length of the record.
+    share : float
+        Of the samples from `first` on that is lost, above 0 and at most 0.5.
+    seed : int
+        Equal seeds give equal losses.
+    first : int
+        No sample before this one is lost; nor are the record's first and last eight.
+
+    Returns
+    -------
+    tuple of Loss
+        In order; at least one of each kind where there is room.
+
+    Raises
+    ------
+    RecordError
+        If the share is out of range, or the record too short.
+    """
+    begin, end = max(first, 8), n_samples - 8
+    if not 0.0 < share <= 0.5:
+        raise RecordError(f"the share of lost samples is {share}; it is above 0 and at most 0.5. Correct it")
+    if end - begin < 64:
+        raise RecordError(
+            f"{max(0, end - begin)} samples can be lost from sample {first} on; losses need 64. Record for longer"
+        )
+    rng = np.random.default_rng([seed, 0x1055])
+    count = max(3, round(share * (end - begin) / _MEAN_BURST))
+    cell = (end - begin) / count
+    lengths = np.minimum(rng.geometric(1.0 / _MEAN_BURST, count), int(cell) - 2)
+    starts = begin + np.floor(np.arange(count) * cell + rng.random(count) * (cell - lengths - 2)).astype(np.int64)
+    columns = rng.integers(0, 1000, count)
+    return tuple(
+        Loss(first=int(a), stop=int(a + n), kind=_KINDS[j % 3], column=int(columns[j]))
+        for j, (a, n) in enumerate(zip(starts, lengths, strict=True))
+    )
+
+
+def damage(
+    record: Record, path: str | Path, *, share: float, seed: int, first: int = 0, comments: Sequence[str] = ()
+) -> tuple[Loss, ...]:
+    """Write a record as a CSV file in which samples are lost.
+
+    Parameters
+    ----------
+    record : Record
+        The whole record; it stays as it is. Channels whose names begin with ``true_`` lose no cells.
+    path : str or Path
+        ``.csv`` or ``.csv.gz``.
+    share, seed, first
+        As in `losses`.
+    comments : sequence of str
+        Comment lines on top.
+
+    Returns
+    -------
+    tuple of Loss
+        What is lost.
+
+    Raises
+    ------
+    RecordError
+        If the file is no CSV file, cannot be written, or the record is too short.
+    """
+    path = Path(path)
+    if not path.name.lower().endswith((".csv", ".csv.gz")):
+        raise RecordError(f"{path}: lost samples can be written as CSV only. Write .csv or .csv.gz")
+    lost = losses(record.n_samples, share, seed, first=first)
+    write_record(record, path, comments=comments)
+    packed = path.suffix.lower() == ".gz"
+    data = path.read_bytes()
+    lines = (gzip.decompress(data) if packed else data).decode().split("\n")
+    top = next(k for k, line in enumerate(lines) if not line.startswith("#")) + 1
+    measured = [j + 1 for j, c in enumerate(record.channels) if not c.name.startswith("true_")]
+    for loss in lost:
+        empty = [measured[loss.column % len(measured)]] if loss.kind == "cells" else measured
+        for k in range(loss.first + top, loss.stop + top):
+            cells = lines[k].split(",")
+            for j in empty:
+                cells[j] = ""
+            lines[k] = "" if loss.kind == "skipped" else ",".join(cells)
+    text = "\n".join(line for line in lines if line) + "\n"
+    path.write_bytes(gzip.compress(text.encode(), compresslevel=6, mtime=0) if packed else text.encode())
+    return lost
 
 
 _PERIOD = 20_000  # samples in which the excitation repeats
@@ -299,3 +419,281 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
     }
 )  # fmt: skip
 """All scenarios by name."""
+
+
+if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
+    from ambid.rig.rig import Rig
+
+
+_CHUNK = 16384  # samples that are simulated at once
+_LARGEST = 10**8  # samples of one record: it has to fit into memory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScenarioBlock:
+    """Consecutive samples of a scenario.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first sample.
+    time_s : ndarray, shape (n_samples,)
+        Sampling instants in s.
+    signals : Mapping[str, ndarray of shape (n_samples,)]
+        As logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns. Lost
+        samples of the scenario ``dropped`` are NaN.
+    truth : Mapping[str, ndarray of shape (n_samples,)]
+        What varies, SI, by name: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``.
+    """
+
+    first: int
+    time_s: Array
+    signals: Mapping[str, Array]
+    truth: Mapping[str, Array]
+
+
+class Course(TypedDict, total=False):
+    """How a scenario runs; what is left out is the scenario's, or the bench's, own."""
+
+    duration_s: float | None  # length in s
+    rate_hz: float | None  # sampling rate in Hz
+    seed: int  # of excitation and noise; 0 if left out
+    # peak of the persistent excitation in the unit of the input; default what 0.4 of the limits allows before anything
+    # changes
+    amplitude: float | None
+    at_s: float | None  # when it begins, in s
+    size: float | None  # how much, as `Scenario.size_is` says
+    closed: bool | None  # closed or open loop; default closed, unless a rig says ``open_loop``
+
+
+def simulate_scenario(
+    name: str | Scenario, bench: Preset | Rig, *, log_excitation: bool = False, **course: Unpack[Course]
+) -> Simulation:
+    """Simulate a scenario on the linear model of a bench.
+
+    Parameters
+    ----------
+    name : str or Scenario
+        One of `scenario_names`.
+    bench : Preset or Rig
+        With a loop that holds it, also after the change.
+    log_excitation : bool
+        Add a column ``excitation``.
+    **course
+        ``duration_s``, ``rate_hz``, ``seed``, ``amplitude``, ``at_s``, ``size`` and ``closed``, see `Course`.
+
+    Returns
+    -------
+    Simulation
+        Its record (a rig's has the rig's columns, uncalibrated) has a column ``true_<name>`` for all that varies,
+        e.g. ``true_k_i``, ``true_gain_position``, ``true_force``, ``true_unbalance`` and ``true_unbalance_phase``, and
+        ``speed`` and ``angle`` where the rotor turns; `Simulation.truth` are the parameters at the beginning. That of
+        ``dropped`` is whole: `ambid.simulate.damage` writes the damaged file.
+
+    Raises
+    ------
+    ModelError
+        If a number is out of range, there is no such scenario, or the bench does not survive it.
+    RigError
+        If a rig lacks what a simulation needs.
+    """
+    run = _Run(name, bench, **course)
+    if run.n_samples > _LARGEST:
+        raise ModelError(
+            f"{run.duration_s:g} s at {run.bench.rate_hz:g} Hz is {run.n_samples:g} samples; one record takes"
+            f" {_LARGEST:g}. Make it shorter"
+        )
+    stretches, excitations = [], []
+    for first in range(0, run.n_samples, _CHUNK):
+        u = run.excitation(first, min(_CHUNK, run.n_samples - first))
+        stretches.append(run.running.advance(u))
+        excitations.append(u)
+    done = join(run.running, stretches, run.seed)
+    record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(run.settings())))
+    if log_excitation:
+        unit = run.bench.linear.model.units[run.bench.linear.model.inputs[0]]
+        logged = Channel(name="excitation", unit=unit, values=np.concatenate(excitations))
+        record = replace(record, channels=(*record.channels, logged))
+    if run.bench.rig is not None:
+        record = as_columns(record, run.bench.rig, np.full(record.n_samples, run.bench.point.position))
+    return replace(done, record=record)
+
+
+def scenario_blocks(
+    name: str | Scenario, bench: Preset | Rig, *, block: int = 1000, **course: Unpack[Course]
+) -> Iterator[ScenarioBlock]:
+    """Simulate a scenario block by block; the numbers are those of `simulate_scenario`, whatever the block's size.
+
+    Memory is that of some blocks: an hour at 20 kHz costs no more than a second.
+
+    Parameters
+    ----------
+    name, bench
+        As in `simulate_scenario`.
+    block : int
+        Samples of a block; the last one may be shorter.
+    **course
+        As in `simulate_scenario`.
+
+    Yields
+    ------
+    ScenarioBlock
+        In order. Its arrays are views that nobody else writes to.
+
+    Raises
+    ------
+    ModelError
+        As `simulate_scenario`, at once; the bench may also fail on the way.
+    """
+    if block < 1:
+        raise ModelError(f"a block of {block} samples; it has at least one. Give another size")
+    return _blocks(_Run(name, bench, **course), block)
+
+
+def truth_columns(record: Record) -> Mapping[str, Channel]:
+    """Return the true values that a simulated record holds.
+
+    Parameters
+    ----------
+    record : Record
+        As simulated or read from a file, before a rig has selected its columns.
+
+    Returns
+    -------
+    Mapping[str, Channel]
+        The channels whose names begin with ``true_``, by what follows: ``k_i`` for ``true_k_i``. Empty for a record
+        without truth.
+    """
+    found = {c.name.removeprefix(TRUE): c for c in record.channels if c.name.startswith(TRUE)}
+    return MappingProxyType(found)
+
+
+class _Run:
+    """A scenario with all its numbers settled, ready to go."""
+
+    def __init__(
+        self,
+        name: str | Scenario,
+        bench: Preset | Rig,
+        *,
+        duration_s: float | None = None,
+        rate_hz: float | None = None,
+        seed: int = 0,
+        amplitude: float | None = None,
+        at_s: float | None = None,
+        size: float | None = None,
+        closed: bool | None = None,
+    ) -> None:
+        self.scenario = scenario(name) if isinstance(name, str) else name
+        always = closed is None and isinstance(bench, Preset)
+        self.bench = b = Bench.of(bench, rate_hz, True if always else closed)
+        self.seed, self.duration_s = seed, self.scenario.duration_s if duration_s is None else duration_s
+        if not (math.isfinite(b.rate_hz) and b.rate_hz > 0.0):
+            raise ModelError(f"rate_hz is {b.rate_hz}; it must be positive. Correct it")
+        count = self.duration_s * b.rate_hz
+        if not (math.isfinite(count) and count >= 1.0):
+            raise ModelError(
+                f"{self.duration_s:g} s at {b.rate_hz:g} Hz is {count:g} samples; it must be at least one. Correct one"
+            )
+        self.n_samples = round(count)
+        if at_s is not None and not self.scenario.size_is:
+            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Leave the time out")
+        self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s
+        if not 0.0 <= self.at_s < self.duration_s:
+            raise ModelError(
+                f"scenario {self.scenario.name!r} begins at {self.at_s:g} s; the record runs from 0 to"
+                f" {self.duration_s:g} s. Give a time in it"
+            )
+        if amplitude is not None and not (math.isfinite(amplitude) and amplitude >= 0.0):
+            raise ModelError(f"amplitude is {amplitude}; it must be zero or positive. Correct it")
+        if amplitude and not self.scenario.excited:
+            raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Leave the amplitude out")
+        self.size = self.scenario.size_for(b, size)
+        self.amplitude, self._period, self._extra = 0.0, np.zeros(1), np.zeros(1)
+        self._prepare_excitation(amplitude)
+        self.running = VaryingLoop(
+            b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
+            loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
+        )  # fmt: skip
+
+    def _prepare_excitation(self, amplitude: float | None) -> None:
+        b = self.bench
+        if self.scenario.excited:
+            shape = one_period(b, self.seed)
+            self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
+            self._period = self.amplitude * shape
+        if self.scenario.driven:
+            room = input_room(b)
+            if not math.isfinite(room):
+                raise ModelError(
+                    f"bench {b.name!r} does not limit its {b.linear.model.inputs[0]}; nothing can saturate. Set"
+                    " loop.limits, or choose another scenario"
+                )
+            self._extra = self.size * room * one_period(b, self.seed + 1, fast=True)
+
+    @property
+    def first_sample(self) -> int:
+        """The sample at which it begins."""
+        return round(self.at_s * self.bench.rate_hz)
+
+    def excitation(self, first: int, n: int) -> Array:
+        """Return the excitation of n samples."""
+        k = first + np.arange(n)
+        u = self._period[k % self._period.size]
+        if self.scenario.driven:
+            u += np.where(k >= self.first_sample, self._extra[k % self._extra.size], 0.0)
+        return u
+
+    def settings(self) -> dict[str, object]:
+        """Return what the history says."""
+        found: dict[str, object] = {"name": self.scenario.name, "seed": self.seed, "amplitude": self.amplitude}
+        if self.scenario.size_is:
+            found |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
+        return found
+
+
+def _blocks(run: _Run, block: int) -> Iterator[ScenarioBlock]:
+    lost = _lost(run)
+    chunk = block * math.ceil(_CHUNK / block)
+    for first in range(0, run.n_samples, chunk):
+        u = run.excitation(first, min(chunk, run.n_samples - first))
+        stretch = run.running.advance(u)
+        signals = _signals(run, stretch, u)
+        if lost.size:
+            _lose(signals, lost, first)
+        time = (first + np.arange(u.size)) / run.bench.rate_hz
+        for k in range(0, u.size, block):
+            part = slice(k, min(k + block, u.size))
+            yield ScenarioBlock(
+                first=first + k,
+                time_s=time[part],
+                signals=MappingProxyType({name: x[part] for name, x in signals.items()}),
+                truth=MappingProxyType({name: x[part] for name, x in stretch.truth.items()}),
+            )
+
+
+def _signals(run: _Run, stretch: Stretch, excitation: Array) -> dict[str, Array]:
+    of = run.bench.linear.model
+    found = {of.inputs[0]: stretch.command}
+    found.update({o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)})
+    found["excitation"] = excitation
+    if stretch.speed is not None and stretch.angle is not None:
+        found |= {"speed": stretch.speed, "angle": stretch.angle}
+    return found
+
+
+def _lost(run: _Run) -> NDArray[np.int64]:
+    """Return first, stop and column (-1: all) of what is lost, shape (n_losses, 3)."""
+    if not run.scenario.dropped:
+        return np.zeros((0, 3), dtype=np.int64)
+    found = losses(run.n_samples, run.size, run.seed, first=run.first_sample)
+    return np.array([(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in found], dtype=np.int64)
+
+
+def _lose(signals: dict[str, Array], lost: NDArray[np.int64], first: int) -> None:
+    columns = list(signals.values())
+    stop = first + columns[0].size
+    for a, b, column in lost[(lost[:, 1] > first) & (lost[:, 0] < stop)].tolist():
+        part = slice(max(a - first, 0), min(b, stop) - first)
+        for values in columns if column < 0 else [columns[column % len(columns)]]:
+            values[part] = np.nan
