@@ -1,10 +1,12 @@
 """Excitations are played as the protocol defines them, lie in the band asked for, and are refused with the nearest."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from ambid.acquire.device import Program
-from ambid.acquire.program import MASKS, amplitude_counts, elements_of, expected, period_ticks, played, program
+from ambid.acquire.program import MASKS, amplitude_counts, elements_of, expected, period_ticks, program
 from ambid.errors import DeviceError
 from ambid.signals.excitations import crest_factor
 from tests.acquire.rigs import bench
@@ -15,6 +17,34 @@ RATE = 2000.0
 def made(name, **options):
     settings = {"amplitude_v": 2.0, "rate_hz": RATE, "seconds": 20.0, "seed": 1, **options}
     return program(name, **settings)
+
+
+@dataclass
+class Content:
+    """What is in one period of an excitation as it is really played."""
+
+    rms_v: float
+    peak_v: float
+    frequency_hz: np.ndarray  # of the lines up to half the rate, without 0
+    line_v: np.ndarray  # peak of each
+
+    def share(self, band):
+        """Return the share of the power that lies in a band, ends included."""
+        inside = (self.frequency_hz >= band[0] * (1 - 1e-9)) & (self.frequency_hz <= band[1] * (1 + 1e-9))
+        power = self.line_v**2
+        return power[inside].sum() / power.sum()
+
+
+def played(p, rate_hz, *, counts=None, volts_per_count=1.0):
+    """Return what is in one period; with `counts` as amplitude, rounded to counts."""
+    period = period_ticks(p)
+    x = expected(p, period, counts=counts) * (1.0 if counts is None else volts_per_count)
+    lines = np.fft.rfft(x) / period
+    size = 2.0 * np.abs(lines[1:])
+    if period % 2 == 0:
+        size[-1] /= 2.0
+    frequency_hz = np.arange(1, lines.size) * rate_hz / period
+    return Content(float(np.sqrt(np.mean(x**2))), float(np.abs(x).max()), frequency_hz, size)
 
 
 @pytest.mark.parametrize("bits", sorted(MASKS))
@@ -80,8 +110,6 @@ def test_a_low_line_holds_the_elements():
     assert (p.hold, p.length) == (4, 1000)
     assert played(p, RATE).frequency_hz[0] == pytest.approx(0.5)
     assert played(p, RATE).share((0.5, 200.0)) > 0.8  # the rest is in the images of the holding
-    small = made("multisine", band=(4.0, 300.0), table_length=512)
-    assert (small.hold, small.length) == (1, 512)
 
 
 def test_a_short_record_gets_a_short_table():

@@ -7,7 +7,6 @@ keep to that.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,13 +44,12 @@ def program(
     rate_hz: float,
     seconds: float,
     seed: int = 0,
-    table_length: int = TABLE_LENGTH,
 ) -> Program:
     """Make an excitation for a controller.
 
     `name`: ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation` knows them;
     `amplitude_v`: peak at the coil, V; `rate_hz`: ticks in one second; `seed`: phases of a multisine, where the
-    register of a PRBS starts; `table_length`: elements of the controller's table. Returns played until it is ended.
+    register of a PRBS starts. Returns played until it is ended.
     """
     _check(name, amplitude_v, band, rate_hz, seconds)
     ticks = round(seconds * rate_hz)
@@ -59,7 +57,7 @@ def program(
         return _steps(amplitude_v, band, ticks)
     if name == "prbs":
         return _prbs(amplitude_v, band, rate_hz, ticks, seed)
-    return _multisine(name, amplitude_v, band, rate_hz, ticks, seed, table_length)
+    return _multisine(name, amplitude_v, band, rate_hz, ticks, seed)
 
 
 def _check(name: str, amplitude_v: float, band: tuple[float, float] | None, rate_hz: float, seconds: float) -> None:
@@ -119,21 +117,20 @@ def _multisine(
     rate_hz: float,
     ticks: int,
     seed: int,
-    table_length: int,
 ) -> Program:
     """The longest table of which four periods fit into the record, held only as far as its lowest line needs it."""
     from ambid.signals.excitations import multisine
 
     low, high = band if band is not None else (0.0, rate_hz / 5.0)
-    hold = max(1, math.ceil(rate_hz / (table_length * low) - 1e-9)) if low > 0.0 else 1
+    hold = max(1, math.ceil(rate_hz / (TABLE_LENGTH * low) - 1e-9)) if low > 0.0 else 1
     top = rate_hz / 2.0 if hold == 1 else _HIGHEST * rate_hz / hold
     if high > top * (1 + 1e-9):
         raise DeviceError(
-            f"a {name} from {low:g} to {high:g} Hz does not fit into a table of {table_length} elements: from"
+            f"a {name} from {low:g} to {high:g} Hz does not fit into a table of {TABLE_LENGTH} elements: from"
             f" {low:g} Hz it goes to {top:.4g} Hz, and to {high:g} Hz it begins at"
-            f" {_lowest(high, rate_hz, table_length):.4g} Hz. Narrow the band, or choose 'prbs'"
+            f" {_lowest(high, rate_hz):.4g} Hz. Narrow the band, or choose 'prbs'"
         )
-    length = min(table_length, ticks // (_PERIODS * hold))
+    length = min(TABLE_LENGTH, ticks // (_PERIODS * hold))
     if length < _SHORTEST_TABLE or (low > 0.0 and hold * length * low < rate_hz * (1 - 1e-9)):
         needed = _PERIODS * max(1.0 / low if low else 0.0, _SHORTEST_TABLE / rate_hz)
         raise DeviceError(
@@ -153,10 +150,10 @@ def _multisine(
     return Program(kind="table", amplitude=amplitude_v, hold=hold, length=length, table=table)
 
 
-def _lowest(high: float, rate_hz: float, table_length: int) -> float:
+def _lowest(high: float, rate_hz: float) -> float:
     """Lowest line of a table whose elements are fast enough for a highest one, Hz."""
     hold = max(1, int(_HIGHEST * rate_hz / high + 1e-9))
-    return rate_hz / (hold * table_length)
+    return rate_hz / (hold * TABLE_LENGTH)
 
 
 def counts_of(program: Program, rig: Rig, settings: ControllerSettings) -> dict[str, int]:
@@ -253,26 +250,6 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
     return counts
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Played:
-    """What is in an excitation as it is really played."""
-
-    period: int  # of the whole excitation, ticks
-    rms_v: float  # V
-    peak_v: float
-    frequency_hz: Array  # (n_lines,), Hz, lines up to half the rate; without 0
-    line_v: Array  # (n_lines,), V, peak of each line
-
-    def share(self, band: tuple[float, float]) -> float:
-        """Return the share of the power that lies in a band.
-
-        `band`: hz, ends included. Returns 0 to 1.
-        """
-        inside = (self.frequency_hz >= band[0] * (1 - 1e-9)) & (self.frequency_hz <= band[1] * (1 + 1e-9))
-        power = self.line_v**2
-        return float(power[inside].sum() / power.sum())
-
-
 def period_ticks(program: Program) -> int:
     """Return the period of an excitation.
 
@@ -280,26 +257,3 @@ def period_ticks(program: Program) -> int:
     """
     n = {"none": 0, "step": 2, "prbs": 2**program.length - 1, "table": program.length}[program.kind]
     return int(n) * program.hold
-
-
-def played(program: Program, rate_hz: float, *, counts: int | None = None, volts_per_count: float = 1.0) -> Played:
-    """Return what is in one period of an excitation.
-
-    `program`: the excitation; `rate_hz`: ticks in one second; `counts`: amplitude in counts: with its rounding to
-    counts; `volts_per_count`: only with `counts`: V per count of pulse width. Returns rms, peak and lines.
-    """
-    period = period_ticks(program)
-    if period == 0:
-        raise DeviceError("an excitation of kind 'none' plays nothing. Give one of " + "steps, prbs, multisine")
-    x = expected(program, period, counts=counts) * (1.0 if counts is None else volts_per_count)
-    lines = np.fft.rfft(x) / period
-    size = 2.0 * np.abs(lines[1:])
-    if period % 2 == 0:
-        size[-1] /= 2.0
-    return Played(
-        period=period,
-        rms_v=float(np.sqrt(np.mean(x**2))),
-        peak_v=float(np.abs(x).max()),
-        frequency_hz=np.arange(1, lines.size) * rate_hz / period,
-        line_v=size,
-    )

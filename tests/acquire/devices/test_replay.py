@@ -104,5 +104,3 @@ def test_a_port_s_name_chooses_the_device(record):
     assert isinstance(open_device("/dev/ttyACM0", PROTOTYPE), SerialDevice)
     with pytest.raises(DeviceError, match="bench"):
         open_device("/dev/ttyACM0", PROTOTYPE, bench=PROTOTYPE)
-    with pytest.raises(DeviceError, match="script"):
-        open_device("simulated", PROTOTYPE, script=Path("x"))

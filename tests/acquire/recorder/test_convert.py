@@ -115,16 +115,6 @@ def test_a_clock_that_tells_nothing_starts_where_the_number_says(tmp_path):
     assert made.survey.start_s == 100 / RATE
 
 
-def test_progress_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(convert, "_ROWS", 50)
-    told = []
-    with Recorder(tmp_path / "run.h5", header()) as recorder:
-        for k in range(10):
-            recorder.append(block(k))
-        recorder.close(told.append)
-    assert told == [0.25, 0.5, 0.75, 1.0]
-
-
 def test_a_gap_at_the_end_of_a_journal_that_was_cut_off_is_not_made_up(tmp_path):
     with Recorder(tmp_path / "run.h5", header()) as recorder:
         for k in range(4):

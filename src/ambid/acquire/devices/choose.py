@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from ambid.acquire.device import Device
 from ambid.acquire.devices.played import Pace
 from ambid.errors import DeviceError
@@ -21,16 +19,12 @@ def open_device(
     bench: Preset | Rig | None = None,
     pace: Pace = "fastest",
     seed: int = 0,
-    script: Path | None = None,
 ) -> Device:
     """Return the device that a port's name stands for, not yet opened: it is a context.
 
     `port`: ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port; `rig`: of the bench; `pace`:
-    of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated; `script`: what
-    happens to an emulated bench meanwhile. Returns not yet opened.
+    of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
     """
-    if script is not None and port != "emulated":
-        raise DeviceError(f"a script is for port emulated; {port!r} has none. Leave it out")
     if bench is not None and port not in ("emulated", "simulated"):
         raise DeviceError(
             f"a bench is chosen for ports emulated and simulated; behind {port!r} stands its own. Leave it out"
@@ -40,7 +34,7 @@ def open_device(
     if port == "emulated":
         from ambid.acquire.devices.emulated import EmulatedDevice
 
-        return EmulatedDevice(rig, bench=bench, pace=pace, seed=seed, script=script)
+        return EmulatedDevice(rig, bench=bench, pace=pace, seed=seed)
     if port == "simulated":
         from ambid.acquire.devices.simulated import SimulatedDevice
 

@@ -17,7 +17,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -35,8 +34,6 @@ INSTALL = "apt-get install gcc-avr avr-libc libsimavr-dev"
 """What a Debian machine needs besides a C compiler and make."""
 
 _PREFIX = "ambid-emulated-"
-_LOCK = "in_use"
-_YOUNG_S = 60.0  # a folder as young may be about to be locked
 _ANSWER_S = 2.0  # a busy machine may hold the emulator up
 _UNREAD_S = 0.25  # of the controller's time
 _LOOK_S = 0.001
@@ -60,51 +57,6 @@ def find_firmware() -> Path:
     Returns what ``AMBID_FIRMWARE`` names, else ``firmware/build/amb_daq.elf`` of the checkout.
     """
     return _find("AMBID_FIRMWARE", "amb_daq.elf", "firmware", ("amb_daq",))
-
-
-class TemporaryFolder:
-    """A folder of this program alone."""
-
-    def __init__(self) -> None:
-        """Make it, and remove what dead programs have left."""
-        _remove_dead()
-        self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
-        self._lock = os.open(self.path / _LOCK, os.O_CREAT | os.O_RDWR | getattr(os, "O_CLOEXEC", 0), 0o600)
-        _locked(self._lock)
-
-    def remove(self) -> None:
-        """Remove it with all that it holds; again is harmless."""
-        if self._lock >= 0:
-            shutil.rmtree(self.path, ignore_errors=True)
-            os.close(self._lock)
-            self._lock = -1
-
-
-def _locked(fd: int) -> bool:
-    """Lock a file; whether nobody else holds it."""
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system: there is no emulated bench either
-        return False
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
-
-
-def _remove_dead() -> None:
-    """Remove the folders of this user that nobody holds."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with suppress(OSError):  # of another user, or just being removed
-            if folder.is_symlink() or time.time() - folder.stat().st_mtime < _YOUNG_S:
-                continue
-            fd = os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                if _locked(fd):
-                    shutil.rmtree(folder, ignore_errors=True)
-            finally:
-                os.close(fd)
 
 
 class Emulator:
@@ -133,7 +85,7 @@ class Emulator:
         self._plant, self._firmware, self._program, self._script = plant, firmware, program, script
         self._options = ["--pace", pace, "--lockstep", repr(float(lockstep_ms)), "--seed", str(seed)]
         self._folder = folder
-        self._temporary: TemporaryFolder | None = None
+        self._temporary = folder is None
         self._trajectory = trajectory
         self._process: subprocess.Popen[bytes] | None = None
         self.port = ""
@@ -208,9 +160,9 @@ class Emulator:
             _end(process)
             if process.stdout is not None:
                 process.stdout.close()
-        if self._temporary is not None and not keep:
-            self._temporary.remove()
-            self._folder = self._temporary = None
+        if self._temporary and self._folder is not None and not keep:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
 
     def ended(self, timeout_s: float) -> str | None:
         """Return how the process ended by itself.
@@ -247,8 +199,7 @@ class Emulator:
 
     def _place(self) -> Path:
         if self._folder is None:
-            self._temporary = TemporaryFolder()
-            self._folder = self._temporary.path
+            self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
         return self._folder
 
     def _said_path(self) -> Path:

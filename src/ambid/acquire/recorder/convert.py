@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -74,12 +74,11 @@ def recorded_from(
     *,
     force: bool = False,
     extra: Mapping[str, object] = MappingProxyType({}),
-    progress: Callable[[float], object] | None = None,
 ) -> Recorded | None:
     """Make the record of a journal, read it back, and put it in its place.
 
     `path`: ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``; `force`: whether a file that is there may be replaced; `extra`:
-    what else its history is to say; `progress`: takes the part that is done, 0 to 1. Returns none if there is no sample
+    what else its history is to say. Returns none if there is no sample
     in the journal.
     """
     found = survey(reader)
@@ -91,7 +90,7 @@ def recorded_from(
     # Named after the journal, which is locked: what a killed conversion leaves is written over by the next one.
     beside = path.with_name(f".{reader.path.name}-{path.name}")
     try:
-        rows = _rows(reader, found, progress)
+        rows = _rows(reader, found)
         check = write_chunks(record, found.rows, rows, beside, _texts(reader.header, found))
         _sync_file(beside)
         check()
@@ -118,7 +117,7 @@ def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
     try:
         _check_gaps(found, reader.path)
         record = _record(reader.header, found, {})
-        check_chunks(record, found.rows, _rows(reader, found, None), path, _texts(reader.header, found))
+        check_chunks(record, found.rows, _rows(reader, found), path, _texts(reader.header, found))
     except (RecordError, DeviceError):
         return None
     return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
@@ -208,10 +207,10 @@ def _check_gaps(found: Survey, path: Path) -> None:
         )
 
 
-def _rows(reader: JournalReader, found: Survey, progress: Callable[[float], object] | None) -> Iterator[Array]:
+def _rows(reader: JournalReader, found: Survey) -> Iterator[Array]:
     """Rows in the order of their numbers, NaN where there are none, in pieces of the same length."""
     held = np.empty((_ROWS, len(reader.header.columns)))
-    n, done = 0, 0
+    n = 0
     for values in _in_order(reader, found):
         at = 0
         while at < len(values):
@@ -220,9 +219,7 @@ def _rows(reader: JournalReader, found: Survey, progress: Callable[[float], obje
             n, at = n + taken, at + taken
             if n == _ROWS:
                 yield held
-                n, done = 0, done + _ROWS
-                if progress is not None:
-                    progress(done / found.rows)
+                n = 0
     if n:
         yield held[:n]
 

@@ -464,14 +464,13 @@ class Recorder:
         """
         return self._writer.flush(self._queue.blocks, timeout_s)
 
-    def close(self, progress: Callable[[float], object] | None = None) -> Recorded | None:
+    def close(self) -> Recorded | None:
         """End the recording: journal to record, read back, and only then the journal removed.
 
         Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record. So does
         a disk that had failed, from which reading back proves little, and a journal that holds more than the record.
 
-        `progress`: takes the part that is done, 0 to 1. Returns none if nothing was recorded; there is then neither
-        record nor journal.
+        Returns none if nothing was recorded; there is then neither record nor journal.
         """
         if self._closed or not self._writer.started:
             return self.result
@@ -480,7 +479,7 @@ class Recorder:
         try:
             reader = JournalReader(file.read, file.size, self.journal)
             extra = {"not_stored": self._writer.lost_samples} if self._writer.lost_samples else {}
-            self.result = recorded_from(reader, self.path, force=self._force, extra=extra, progress=progress)
+            self.result = recorded_from(reader, self.path, force=self._force, extra=extra)
             if self.result is None or not (self.result.keep_journal or self.failed):
                 file.remove()
         except DeviceError as failure:
