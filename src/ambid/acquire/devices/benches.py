@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from ambid.acquire.scales import ADC_TOP, Scale, scale_of
 from ambid.acquire.settings import has_position
 from ambid.errors import DeviceError, nearest
-from ambid.physics.loop import Limits, Noise
 from ambid.physics.magnet import CoEnergy, DifferentialPair
 from ambid.physics.models import model
-from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
+from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.rig.load import load_rig
 from ambid.rig.rig import Rig
-from ambid.simulate.plant import LinearPlant
-from ambid.simulate.rig_bench import parts_of_rig
+from ambid.simulate.rig_bench import Bench
 
 _VOLT_PER_COUNT = 5.0 / (ADC_TOP + 1)
 _NO_POSITION = {"position_gain": 0.0, "position_offset": 2.5}
@@ -27,42 +25,13 @@ _HELD = {"m": 1.0, "k_x": 0.0, "k_i": 0.0}  # a coil alone, in the words of one 
 _THIRD = {"third_position_gain": 0.0, "third_current_gain": 0.0, "third_offset": 2.5}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bench:
-    """What a simulation of it needs."""
-
-    name: str
-    plant: LinearPlant | NonlinearPlant
-    point: OperatingPoint  # where the linear one holds, SI
-    limits: Limits  # its stops count
-    noise: Noise
-
-
 def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
-    """Return the bench that stands behind a rig.
-
-    `rig`: of the device.
-    """
+    """Return the bench that stands behind a rig, nonlinear where a preset is; its loop and rate have no meaning."""
     truth = _named(rig) if bench is None else bench
-    if isinstance(truth, Preset):
-        of = model(truth.model)
-        if of.inputs != ("voltage",):
-            raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
-        return Bench(
-            name=truth.name,
-            plant=truth.plant or LinearPlant(model=of, parameters=truth.parameters),
-            point=truth.operating_point,
-            limits=truth.limits,
-            noise=truth.noise,
-        )
-    plant, _, point = parts_of_rig(truth, None)
-    return Bench(
-        name=truth.name or "rig",
-        plant=plant,
-        point=point,
-        limits=truth.limits or Limits(),
-        noise=truth.noise or Noise(),
-    )
+    if isinstance(truth, Preset) and model(truth.model).inputs != ("voltage",):
+        raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
+    found = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
+    return replace(found, name=truth.name or "rig")
 
 
 def bench_parameters(rig: Rig, bench: Preset | Rig | None) -> Mapping[str, float]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ambid.acquire.default_daq import is_made_up, with_default_daq
 from ambid.acquire.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
-from ambid.acquire.devices.benches import Bench, bench_of
+from ambid.acquire.devices.benches import bench_of
 from ambid.acquire.devices.played import Pace, PlayedDevice
 from ambid.acquire.program import counts_of
 from ambid.acquire.protocol.table import table
@@ -24,6 +24,7 @@ from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
 from ambid.simulate.plant import Equations, Standing
+from ambid.simulate.rig_bench import Bench
 from ambid.track.blocks import Block
 
 Integers = NDArray[np.int64]
