@@ -93,7 +93,7 @@ def test_joint_filters_follow_physical_parameters_from_an_identified_start(metho
     [
         ("kalman", {}, "unknown"),
         ("rls", {"orders": None}, "wants --input"),
-        ("rls", {"orders": {"na": 1, "nb": 1, "nk": "auto"}}, "nothing is chosen"),
+        ("rls", {"orders": {"na": 1, "nb": 1, "nk": "auto"}}, "cannot choose it"),
         ("rls", {"step": 0.1}, "no --step"),
         ("lms", {"memory": 1.0}, "no --memory"),
         ("iv", {}, "--reference"),

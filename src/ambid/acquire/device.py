@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Literal, Protocol, Self
 
 from ambid.errors import DeviceError
@@ -118,9 +118,7 @@ class Device(Protocol):
         """Open, identify and configure."""
         ...
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object, /) -> None:
         """Stop, and let go."""
         ...
 

@@ -48,18 +48,19 @@ class Course:
     program: Program | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class RunReport:
-    """What came of a run."""
+    """What came of a run; counted while it goes on."""
 
-    samples: int  # passed on
     wanted: int  # samples that the course asks for
-    lost: int  # samples of the wanted ones, up to the last one that came, that never came
-    first: int  # number of the first sample that was passed on, and of the one after the last; equal where none was
-    after: int
-    fault: DeviceEvent | None  # what ended the run early
-    interrupted: bool  # whether it was ended by request
-    events: tuple[DeviceEvent, ...]  # all that the device told meanwhile
+    samples: int = 0  # passed on
+    # samples of the wanted ones, up to the last one that came, that never came; those that come again make up for none
+    lost: int = 0
+    first: int = 0  # number of the first sample that was passed on, and of the one after the last; equal where none was
+    after: int = 0
+    fault: DeviceEvent | None = None  # what ended the run early
+    interrupted: bool = False  # whether it was ended by request
+    events: tuple[DeviceEvent, ...] = ()  # all that the device told meanwhile
 
     @property
     def complete(self) -> bool:
@@ -96,7 +97,7 @@ def run(
         raise
     device.stop()
     made.hear()
-    return made.report()
+    return made.report
 
 
 class _Run:
@@ -107,24 +108,17 @@ class _Run:
     ) -> None:
         self._rate_hz = rate_hz = device.info.rate_hz
         self._device, self._taps, self._on_event = device, taps, on_event
-        self._wanted = max(1, round(course.seconds * rate_hz))
+        self.report = RunReport(wanted=max(1, round(course.seconds * rate_hz)))
         self._settling = round(course.settle_s * rate_hz)
         self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
         self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
         self._unheard = 0
         self._from: int | None = None  # number from which samples are passed on, once that is known
-        self._first: int | None = None
-        self._after = 0
-        self._samples = 0
-        self._lost = 0  # numbers that were passed over; those that come again make up for none of them
-        self._fault: DeviceEvent | None = None
-        self._interrupted = False
-        self._events: list[DeviceEvent] = []
 
     @property
     def going(self) -> bool:
         """Whether nothing has ended the run yet."""
-        return self._fault is None and not self._interrupted
+        return self.report.fault is None and not self.report.interrupted
 
     def forget(self) -> None:
         """Throw away what an earlier run left unread: its samples are of another course."""
@@ -144,22 +138,23 @@ class _Run:
         """Pass blocks on until all wanted samples are there."""
         if not self.going:
             return
+        made = self.report
         for frame in self._frames(stopped):
             block = self._after_lead(frame.block)
             if block is None:
                 continue
-            if self._first is None:
-                self._first = self._after = block.first
-            end = self._first + self._wanted
+            if not made.samples:
+                made.first = made.after = block.first
+            end = made.first + made.wanted
             if block.first >= end:
                 return
             kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
             for tap in self._taps:
                 tap.take(replace(frame, block=kept))
-            self._samples += len(kept.values)
-            self._lost += max(0, kept.first - self._after)
-            self._after = max(self._after, kept.first + len(kept.values))
-            if self._after >= end:
+            made.samples += len(kept.values)
+            made.lost += max(0, kept.first - made.after)
+            made.after = max(made.after, kept.first + len(kept.values))
+            if made.after >= end:
                 return
 
     def lead_in(self, program: Program) -> None:
@@ -194,43 +189,30 @@ class _Run:
     def hear(self) -> None:
         """Take what the device tells."""
         for event in self._device.events():
-            self._events.append(event)
-            if event.kind in _ENDING and self._fault is None:
-                self._fault = event
+            self.report.events += (event,)
+            if event.kind in _ENDING and self.report.fault is None:
+                self.report.fault = event
             if self._on_event is not None:
                 self._on_event(event)
-
-    def report(self) -> RunReport:
-        first = self._after if self._first is None else self._first
-        return RunReport(
-            samples=self._samples,
-            wanted=self._wanted,
-            lost=self._lost,
-            first=first,
-            after=self._after,
-            fault=self._fault,
-            interrupted=self._interrupted,
-            events=tuple(self._events),
-        )
 
     def _frames(self, stopped: Callable[[], bool]) -> Iterator[Frame]:
         """Blocks as they come, until a fault, a wish to end, or the device's own end."""
         silent = 0
         while True:
             if stopped():
-                self._interrupted = True
+                self.report.interrupted = True
                 return
             frame = self._device.read(_LOOK_S)
             self.hear()
             if frame is not None:
                 silent = 0
-                sound = _before(frame, self._fault)
+                sound = _before(frame, self.report.fault)
                 if sound is not None:
                     yield sound
                 if sound is not frame:
                     return
                 continue
-            if self._fault is not None or self._device.ended:
+            if self.report.fault is not None or self._device.ended:
                 return
             silent += 1
             if silent > _SILENT_LOOKS:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, Orders, io_data
+from ambid.blackbox.data import IOData, Orders, check_order_names, io_data, order_per_input, single_order
 from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, Source
@@ -106,7 +106,7 @@ def _coefficients(
     u, y, sizes = data.u, data.y, (np.ones(data.u.shape[1]), np.ones(1))
     estimator: Any
     if method in REGRESSIONS:
-        na, nb, nk = _arx_orders(method, data, orders)
+        na, nb, nk = _arx_orders(f"--method {method}", data, orders)
         u, y, sizes = _scale(method, data)
         estimator = _arx(method, (na, nb, nk), data, samples, step)
         label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
@@ -153,20 +153,17 @@ def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]
     return (u - means[0]) / sizes[0], (y - means[1]) / sizes[1], sizes
 
 
-def _arx_orders(method: str, data: IOData, orders: Orders | None) -> tuple[int, tuple[int, ...], tuple[int, ...]]:
+def _arx_orders(who: str, data: IOData, orders: Orders | None) -> tuple[int, tuple[int, ...], tuple[int, ...]]:
     """Return na, and nb and nk of each input."""
-    n, given = data.u.shape[1], dict(orders or {})
-    known = set(given) == {"na", "nb", "nk"} and all(value != "auto" for value in given.values())
-    if not known or not n:
+    names = ("na", "nb", "nk")
+    if orders is None or not data.inputs:
         raise EstimationError(
-            f"--method {method} wants --input, --output and --orders na=2,nb=2,nk=1 as numbers: on-line nothing is"
-            " chosen. Give them"
+            f"{who} wants --input, --output and --orders na=2,nb=2,nk=1 as numbers: on-line nothing is chosen. Give"
+            " them"
         )
-    per_input = [x if isinstance(x, tuple) else (x,) * n for x in (given["nb"], given["nk"])]
-    if any(len(x) != n for x in per_input):
-        raise EstimationError(f"--orders: nb and nk want one number, or one for each of {n} inputs. Correct them")
-    nb, nk = (tuple(int(i) for i in x) for x in per_input)
-    return int(str(given["na"])), nb, nk
+    check_order_names(who, orders, names, names)
+    nb, nk = (order_per_input(who, orders, name, least, data.n_inputs) for name, least in (("nb", 1), ("nk", 0)))
+    return single_order(who, orders, "na", 0), nb, nk
 
 
 def _arx(

@@ -24,7 +24,6 @@ from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 from operator import index
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 from zlib import crc32
 
@@ -240,9 +239,7 @@ class BlockRing:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

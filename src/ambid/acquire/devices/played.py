@@ -11,7 +11,6 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Literal, NoReturn, Self
 
 from ambid.acquire.device import MODES, Counters, DeviceEvent, DeviceInfo, Mode, Program, SelfTest, State, check_mode
@@ -52,10 +51,7 @@ class PlayedDevice(ABC):
         self._samples = self._lost = 0
 
     # What the two differ in.
-    @property
-    @abstractmethod
-    def info(self) -> DeviceInfo:
-        """Who is there."""
+    _info: DeviceInfo
 
     @abstractmethod
     def _opened(self) -> None:
@@ -82,6 +78,11 @@ class PlayedDevice(ABC):
 
     # The contract.
     @property
+    def info(self) -> DeviceInfo:
+        """Who is there."""
+        return self._info
+
+    @property
     def state(self) -> State:
         """The state now."""
         with self._lock:
@@ -96,9 +97,7 @@ class PlayedDevice(ABC):
             self._open = True
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._lock:
             if self._open:
                 self.stop()

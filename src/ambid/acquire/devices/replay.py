@@ -57,11 +57,6 @@ class ReplayDevice(PlayedDevice):
         self._info = DeviceInfo(kind="replay", port=port, rate_hz=record.rate_hz, columns=columns)
         self._row = self._base = 0
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Who is there."""
-        return self._info
-
     def _opened(self) -> None:
         self._row = 0
 

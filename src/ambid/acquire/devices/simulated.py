@@ -80,11 +80,6 @@ class SimulatedDevice(PlayedDevice):
         )
         self._seed = seed
 
-    @property
-    def info(self) -> DeviceInfo:
-        """Who is there."""
-        return self._info
-
     def _opened(self) -> None:
         from ambid.acquire.devices import _kernels as k
 
