@@ -1,7 +1,8 @@
 """Many start values, one search: the weak-form candidates of all bands and delays are scored by the likelihood.
 
-Each candidate is scored on the busiest stretch of the record, the best on all of it and at several noise levels;
-candidates that differ in more than chance are searched a little way, and the search goes on from the winner.
+Each candidate is scored on the busiest stretch of the record, the best on a longer one and at several noise levels;
+candidates that differ in more than chance are searched a little way, and the search goes on from the winner: first on
+the longer stretch, then on all of the record.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation import start as weak_form
 from ambid.estimation.likelihood import evaluate, search, with_linear_part
+from ambid.estimation.linear import triangle_of
 from ambid.estimation.predictor import assemble_all
 from ambid.estimation.problem import PredictorProblem, Scales, all_scales, noise_floor
 from ambid.estimation.sensitivity import Workspace
@@ -27,10 +29,10 @@ Delay = float | Literal["auto"]
 MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
 FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
-_REGRESSED = 1 << 17  # samples that start values are regressed from
+_REGRESSED = 1 << 17  # samples that start values are regressed from, and that a search begins on
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
-_KEPT = 6  # candidates scored on the whole record
+_KEPT = 6  # candidates scored on all that start values are regressed from
 _RACE = 3  # candidates searched a little way
 _CLOSE = 0.5  # difference of the criterion per sample within which candidates race
 _ALIKE = 0.3  # relative difference of all parameters within which candidates are taken for the same
@@ -49,7 +51,7 @@ class Signals:
 class Candidate:
     """A place to search from."""
 
-    criterion: float  # at `vector`, see `ambid.estimation.likelihood.criterion`
+    criterion: float  # at `vector`, see `ambid.estimation.likelihood.criterion`; where it was compared with others
     problem: PredictorProblem
     vector: Array  # (size,)
     work: Workspace | None = None  # of the problem
@@ -86,7 +88,9 @@ def starts(
             "start values"
         )
     racers = _unlike(scored)[:_RACE]
-    return sorted((race(c, tick) for c in racers), key=lambda c: c.criterion) if len(racers) > 1 else racers
+    if len(racers) > 1:
+        racers = sorted((race(c, tick) for c in racers), key=lambda c: c.criterion)
+    return [_widen(c, signals, tick) for c in racers]
 
 
 def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
@@ -97,6 +101,27 @@ def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
         if close and not any(candidate.like(r) for r in found):
             found.append(candidate)
     return found
+
+
+def _widen(candidate: Candidate, signals: Signals, tick: Callable[[], None] | None) -> Candidate:
+    """Search on the stretch that a candidate of a long record is for, and go on to all of it.
+
+    Passes over a long record cost most of the time: they are for the last steps.
+    """
+    part = candidate.problem
+    if part.y.shape[0] == signals.y.shape[0]:
+        return candidate
+    whole = _centre(signals)
+    problem = replace(part, u=whole.u, y=whole.y)
+    fit, work = search(part, candidate.vector, tick=tick, work=candidate.work), Workspace(problem)
+    if fit.status != "converged":
+        return replace(candidate, problem=problem, vector=at_first_sample(problem, candidate.vector), work=work)
+    work.near(triangle_of([fit.J]))
+    return replace(candidate, problem=problem, vector=at_first_sample(problem, fit.vector), work=work)
+
+
+def _centre(signals: Signals) -> Signals:
+    return replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
 
 
 def race(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
@@ -121,15 +146,16 @@ def race(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
 def _scored(
     model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delays: Sequence[float]
 ) -> list[Candidate]:
-    """Return the best candidates of all bands and delays, each at several noise levels."""
-    centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
-    part = busiest(centred.u, _REGRESSED)
-    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([centred.u[part], centred.y[part]]).T, strict=True))
+    """Return the best candidates of all bands and delays, each at several noise levels, for the busiest stretch."""
+    centred = _centre(signals)
+    stretch = busiest(centred.u, _REGRESSED)
+    part = replace(centred, u=centred.u[stretch], y=centred.y[stretch])
+    columns = dict(zip((*model.inputs, *model.outputs), np.hstack([part.u, part.y]).T, strict=True))
     moments = weak_form.moments(columns, model.inputs, signals.rate_hz)
     found, work = [], None
     kept = _unlike(_coarse(model, centred, parameters, moments, delays))[:_KEPT]
     for candidate in sorted(kept, key=lambda c: c.problem.delay):
-        problem = replace(candidate.problem, u=centred.u, y=centred.y)
+        problem = replace(candidate.problem, u=part.u, y=part.y)
         work = Workspace(problem) if work is None else work.of(problem)
         for level in _LEVELS:
             vector = at_first_sample(problem, _with_level(problem, candidate.vector, level))

@@ -36,6 +36,7 @@ from ambid.bearing.multistart import (
 )
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.likelihood import Fit, evaluate, search
+from ambid.estimation.linear import least_squares
 from ambid.estimation.problem import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.sensitivity import Workspace, innovations
@@ -72,7 +73,8 @@ def unexplained(fit: Fit) -> float:
 
     Returns at most 1; 1 where there is no predictor.
     """
-    e = None if fit.status == "failed" else innovations(fit.problem, fit.vector)
+    work = None if fit.work is None else fit.work.of(fit.problem)
+    e = None if fit.status == "failed" else innovations(fit.problem, fit.vector, work)
     if e is None:
         return 1.0
     u = fit.problem.u[fit.problem.skip :]
@@ -92,8 +94,7 @@ def explained_by_past(e: Array, u: Array, depth: int) -> float:
     Z, E = Z[sound], E[sound]
     if E.shape[0] < 4 * Z.shape[1]:
         return 0.0
-    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
-    left = E - Z @ np.linalg.lstsq(Z, E, rcond=1e-10)[0]
+    left = E - Z @ least_squares(Z, E)
     before, after = E.T @ E / E.shape[0], left.T @ left / (E.shape[0] - Z.shape[1])
     gained = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
     return 1.0 - float(np.exp(gained / E.shape[1])) if np.isfinite(gained) else 0.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.innovations import stable
-from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of
+from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of, workspace_near
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import Workspace, linearise, products
@@ -198,7 +198,7 @@ def _gram(a: Array) -> Array:
 
 def _scores(fit: Fit) -> Array:
     """Scores of the stretches of the record, (n_stretches, size)."""
-    work = Workspace(fit.problem) if fit.work is None else fit.work.of(fit.problem)
+    work = workspace_near(fit, fit.problem)
     found = products(fit.problem, fit.vector, weight_of(fit.covariance), work, stretches=STRETCHES)
     if found is None:
         raise ValueError("the fit has no predictor; it has failed")

@@ -11,7 +11,7 @@ from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.record import Record
 from ambid.signals.conditioning import equal_runs, finite, runs
-from ambid.signals.delay import fit_arx
+from ambid.signals.delay import lagged_triangle
 
 _ZERO_JUMP = 8.0  # robust sd of the sample-to-sample change that a fall to zero has to exceed, going and coming
 
@@ -268,8 +268,9 @@ def outlier_sizes(x: Array, threshold: float = 6.0, width: int = 1) -> Array:
     clean, sizes = x, np.zeros(x.size)
     # An outlier spoils the predictor and the prediction of its neighbours: repeat with the found ones bridged.
     for _ in range(5):
-        forward = _errors(x, clean, width, spread)
-        backward = [e[::-1] for e in _errors(x[::-1], clean[::-1], width, spread)]
+        ahead, behind = _predictors(clean)
+        forward = _errors(x, clean, ahead, width, spread)
+        backward = [e[::-1] for e in _errors(x[::-1], clean[::-1], behind, width, spread)]
         found = _groups(x, forward, backward, threshold, width)
         found[common] = 0.0
         if np.array_equal(found > 0, sizes > 0):
@@ -287,17 +288,34 @@ def _common_levels(x: Array) -> NDArray[np.bool_]:
     return common
 
 
-def _errors(x: Array, clean: Array, width: int, spread: float) -> list[Array]:
+def _predictors(clean: Array) -> tuple[Array, Array]:
+    """Weights of the samples before and of those after, nearest first, then the constant, that predict a sample best.
+
+    Both come from the same windows of neighbouring samples, and so from one triangle.
+    """
+    size, one = float(np.linalg.norm(clean)) or 1.0, 1.0 / np.sqrt(clean.size - _ORDER)
+    scaled = clean / size
+    windows = [(scaled, lag) for lag in range(_ORDER + 1)]
+    triangle = lagged_triangle([*windows, (np.full(clean.size, one), 0)], _ORDER)
+    found = list[Array]()
+    for own, past in ((0, range(1, _ORDER + 1)), (_ORDER, range(_ORDER - 1, -1, -1))):
+        # a record without noise makes the samples dependent: the smallest weights among all predict as well
+        weights: Array = np.linalg.lstsq(triangle[:, [*past, _ORDER + 1]], triangle[:, own], rcond=1e-12)[0]
+        weights[-1] *= one * size
+        found.append(weights)
+    return found[0], found[1]
+
+
+def _errors(x: Array, clean: Array, weights: Array, width: int, spread: float) -> list[Array]:
     """Errors of the 1 to `width` step predictions of x from the clean past, in local robust sd."""
-    weights = fit_arx(clean, (), _ORDER, ()).coefficients
+    padded = np.concatenate((np.full(_ORDER + width - 1, clean[0]), clean[:-1]))
     errors = []
-    lagged = [np.concatenate((np.full(lag, clean[0]), clean[:-lag])) for lag in range(1, _ORDER + width)]
+    past = list(np.eye(_ORDER + 1)[:_ORDER])  # newest first: samples, then predictions, by the weights of the samples
     for horizon in range(1, width + 1):
-        past = lagged[horizon - 1 :]  # newest first: samples up to t - horizon, then the predictions on the way to t
-        for _ in range(horizon):
-            terms = zip(weights[:_ORDER], past, strict=False)
-            past = [sum((w * p for w, p in terms), np.full(x.size, weights[-1])), *past]
-        error = x - past[0]
+        past = [weights[:_ORDER] @ np.array(past) + weights[-1] * np.eye(_ORDER + 1)[-1], *past[:-1]]
+        first = width - horizon
+        usual = np.convolve(padded[first : first + x.size + _ORDER - 1], past[0][:_ORDER], mode="valid")
+        error = x - (usual + past[0][-1])
         errors.append(error / _local_scale(error, spread))
     return errors
 
@@ -344,6 +362,7 @@ def _groups(x: Array, forward: list[Array], backward: list[Array], threshold: fl
 
 _FEWEST = 5  # samples at a limit that count as evidence
 _PILE = 3.0  # how many times the fullest of the neighbouring levels a limit has to hold
+_ROUND_OFF = 1e-9  # of the range: levels that only this keeps apart are one
 _NEIGHBOURS = 10  # levels beside the limit that tell how many samples a level holds there
 
 
@@ -450,6 +469,8 @@ def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | 
         if not limits[0] < limits[1]:
             raise RecordError(f"limits {limits} of channel {name!r}; the lower must be under the upper one. Swap them")
         lower, upper = (_limit(limits[0], x <= limits[0]), _limit(limits[1], x >= limits[1]))
+    elif not _may_pile(x):
+        lower = upper = None
     else:
         values, counts = np.unique(x, return_counts=True)
         lower, upper = _pile(x, values, counts), _pile(-x, -values[::-1], counts[::-1])
@@ -463,6 +484,15 @@ def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | 
         n_samples=x.size,
         first_s=record.start_s + min(firsts) / record.rate_hz if firsts else None,
     )
+
+
+def _may_pile(x: Array) -> bool:
+    """Whether as many samples as a limit holds at least lie together at an end: most channels need no sorting."""
+    if x.size < 2 * _FEWEST:
+        return True
+    parted = np.partition(x, (_FEWEST - 1, x.size - _FEWEST))
+    ends = (np.sort(parted[:_FEWEST]), np.sort(parted[-_FEWEST:]))
+    return any(bool(np.all(np.diff(end) <= _ROUND_OFF * (ends[1][-1] - ends[0][0]))) for end in ends)
 
 
 def _limit(value: float, at: np.ndarray) -> Limit | None:
@@ -481,7 +511,7 @@ def _limit(value: float, at: np.ndarray) -> Limit | None:
 def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
     """Return the lower extreme of `x` as a limit if samples pile up at it; `values`: its levels, in order."""
     # Levels that only round-off keeps apart are one, as in a computed sine with a whole number of samples per period.
-    apart = np.diff(values) > 1e-9 * (values[-1] - values[0])
+    apart = np.diff(values) > _ROUND_OFF * (values[-1] - values[0])
     level_of = np.concatenate(([0], np.cumsum(apart)))
     held = np.bincount(level_of, weights=counts)
     if held.size < 3 or held[0] < max(_FEWEST, 1 + _PILE * held[1 : 1 + _NEIGHBOURS].max()):

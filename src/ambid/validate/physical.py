@@ -27,7 +27,7 @@ from ambid.estimation.likelihood import Fit, extend, free_one, search, weight_of
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.parts import Check
 from ambid.estimation.prediction import sparse_gain
-from ambid.estimation.sensitivity import Products, Workspace, products
+from ambid.estimation.sensitivity import Products, products
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
@@ -85,9 +85,8 @@ def innovation_products(fit: Fit, e: Array) -> Products:
     problem, weight = fit.problem, weight_of(fit.covariance)
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input
     own, inputs = _lags(len(e))
-    work = fit.work if fit.work is not None else Workspace(problem)
     lagged = ((e @ weight.T, own), (u, inputs))
-    found = products(problem, fit.vector, weight, work.of(problem), lagged, STRETCHES)
+    found = products(problem, fit.vector, weight, workspace_near(fit, problem), lagged, STRETCHES)
     if found is None:
         raise ValueError("the fit has no predictor; it has failed")
     return found
