@@ -9,6 +9,7 @@ import pytest
 from ambid.errors import RecordError
 from ambid.record import Channel, Record, read_record, write_record
 from ambid.record.csv_format import read_csv, write_csv
+from ambid.record.csv_kernels import powers_of_ten, read_rows
 from tests.measured import ABSENT, RECORDS
 
 DATA = RECORDS
@@ -124,7 +125,9 @@ def test_writer_refuses_what_the_reader_would_refuse(tmp_path):
         write_csv(good, tmp_path / "no" / "a.csv")
 
 
-def test_long_files_keep_their_order_and_name_a_late_fault(tmp_path):
+@pytest.mark.parametrize("long", [1 << 30, 0], ids=["by NumPy", "compiled"])
+def test_long_files_keep_their_order_and_name_a_late_fault(tmp_path, monkeypatch, long):
+    monkeypatch.setattr("ambid.record._csv_text._LONG", long)
     values = np.random.default_rng(1).standard_normal((50_000, 3))
     rows = [",".join(map(repr, row)) for row in values.tolist()]
     header = "a [V],b [A],c [m]"
@@ -136,6 +139,31 @@ def test_long_files_keep_their_order_and_name_a_late_fault(tmp_path):
         read_csv(path, rate_hz=1e4)
     cut = read_csv(path, rate_hz=1e4, gaps="cut")
     np.testing.assert_array_equal(np.column_stack([c.values for c in cut.channels]), values[:45_678])
+
+
+def test_compiled_reading_gives_the_nearest_double():
+    rng, powers = np.random.default_rng(5), powers_of_ten()
+    x = np.concatenate(
+        [
+            rng.standard_normal(20_000) * 10.0 ** rng.integers(-30, 30, 20_000),
+            rng.integers(-(10**6), 10**6, 5000) / 1000,
+            np.nextafter(2.0 ** rng.integers(-60, 60, 1000), 0.0),
+            [0.0, -0.0, 1e22, 5e-70, 2.0**53 + 2.0],
+        ]
+    )
+    for style in ("r", ".17g", ".9g", ".12f"):
+        cells = [repr(v) if style == "r" else format(v, style) for v in x.tolist() if style != ".12f" or abs(v) < 1e3]
+        text, found = np.frombuffer(("\n".join(cells) + "\n").encode(), dtype=np.uint8), np.empty((len(cells), 1))
+        assert read_rows(text, 0, ord(","), powers, found) == text.size
+        np.testing.assert_array_equal(found[:, 0], [float(cell) for cell in cells])
+
+
+@pytest.mark.parametrize(
+    "row", ["1,", ",1", "1", "1,2,3", "1,x", "1,nan", "1,2e", "1,.", "1,1e999", "1,1e23", "1, 2", "1;2", ""]
+)
+def test_compiled_reading_leaves_what_is_not_plain(row):
+    text = np.frombuffer(f"{row}\n".encode(), dtype=np.uint8)
+    assert read_rows(text, 0, ord(","), powers_of_ten(), np.empty((1, 2))) == -1
 
 
 @pytest.mark.skipif(not DATA.exists(), reason=ABSENT)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
-from ambid.record._csv_text import Header, data_rows, find_header, read_values
+from ambid.record._csv_text import Header, data_rows, find_header, read_plain, read_values
 from ambid.record.files import file_bytes, gunzipped, sha256_of, utf8_text
 from ambid.record.record import Channel, Record, Step
 from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly, usual_rate
@@ -71,12 +71,16 @@ def _content(path: Path, gaps: GapPolicy) -> _Content:
             raise RecordError(f"record {path} is empty inside its gzip wrapping. Export or copy it again")
     elif data[:2] == b"\x1f\x8b":
         raise RecordError(f"record {path} is gzipped although its name does not say so. Rename it to {path.name}.gz")
-    lines = utf8_text(data, path).split("\n")
-    del data
-    header = find_header(lines, path)
+    plain = read_plain(data, path)
+    if plain is None:
+        lines = utf8_text(data, path).split("\n")
+        del data
+        header = find_header(lines, path)
+        values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
+    else:
+        header, values = plain
     if header.comments:
         provenance["comment"] = "\n".join(header.comments)
-    values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     time, time_unit = _time_column(header, path)
     if time is not None and time_unit is not None:
         values[:, time] = time_unit.to_si(values[:, time])

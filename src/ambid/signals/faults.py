@@ -300,7 +300,9 @@ def _predictors(clean: Array) -> tuple[Array, Array]:
     found = list[Array]()
     for own, past in ((0, range(1, _ORDER + 1)), (_ORDER, range(_ORDER - 1, -1, -1))):
         # a record without noise makes the samples dependent: the smallest weights among all predict as well
-        weights: Array = np.linalg.lstsq(triangle[:, [*past, _ORDER + 1]], triangle[:, own], rcond=1e-12)[0]
+        weights = np.asarray(
+            np.linalg.lstsq(triangle[:, [*past, _ORDER + 1]], triangle[:, own], rcond=1e-12)[0], dtype=np.float64
+        )
         weights[-1] *= one * size
         found.append(weights)
     return found[0], found[1]
