@@ -44,6 +44,8 @@ _HINT = 1e-3  # of the leakage: how much it rises where only its promise is aske
 _KNEES = (0.4, 1.0, 3.0)  # times the knee at which a search begins
 _LIKELY = 0.5  # share of its price that a rising leakage must promise to be searched
 _STRETCH = 4000  # samples of each record on which laws are compared
+_FAR, _CLOSE = 1e-3, 1e-9  # damping with which the search over all samples begins
+_LONGER = 64000  # samples of each record on which the search goes on, where there are many more
 
 
 def estimate_bearing(
@@ -88,8 +90,12 @@ def estimate_bearing(
                               asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
                 if law != fit.problem.law:
                     fit = _extended(fit, law, known, short, linear, ticks[-3])
-        whole = replace(fit.problem, records=tuple(records))
-        fit = search(whole, fit.vector, tick=ticks[-2])
+        whole, near = replace(fit.problem, records=tuple(records)), _FAR
+        if max(r.u.size for r in records) > 2 * _LONGER:  # a step or two over all samples will do from there
+            longer = tuple(r.first(_LONGER) for r in records)
+            fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-2])
+            near = _CLOSE if fit.status == "converged" else _FAR
+        fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
         fit = rescue(
             fit if delay is not None or fit.status == "failed" else _with_fraction(fit, ticks[-1]), records,
             lambda f: f if delay is not None or f.status == "failed" else _with_fraction(f, again),

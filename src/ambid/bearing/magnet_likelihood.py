@@ -38,6 +38,7 @@ class Linear:
     r: Array  # (n_rows,), J'r is half the gradient of the criterion
     criterion: float
     scores: Array  # (n_stretches, size), half gradients of the stretches of the records
+    innovations: tuple[Innovations, ...]  # of each record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -239,20 +240,26 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
     """
     prior, J_prior = prior_rows(problem, vector)
     total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], list[Array]()
+    innovations = list[Innovations]()
     stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:  # the kernel leaves Python's lock
         for one in threads.map(lambda r: _of_record(problem, vector, r, stretch), range(len(problem.records))):
             if one is None:
                 return None
-            total += one[0]
+            innovations.append(one[0])
+            total += _sum(one[0])
             scores += [*one[1]]
             parts += one[2]
     whole = triangle_of([np.vstack(parts)])
-    return Linear(J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores))
+    return Linear(
+        J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores), innovations=tuple(innovations)
+    )
 
 
-def _of_record(problem: BearingProblem, vector: Array, r: int, stretch: int) -> tuple[float, Array, list[Array]] | None:
-    """What a record adds to the criterion, the scores of stretches, and the triangle; None without a predictor."""
+def _of_record(
+    problem: BearingProblem, vector: Array, r: int, stretch: int
+) -> tuple[Innovations, Array, list[Array]] | None:
+    """Innovations of a record, the scores of its stretches, and the triangle; None without a predictor."""
     n = problem.records[r].u.size
     found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
     own, blocks, columns = np.zeros((-(-n // stretch), problem.size)), list[Array](), np.zeros(0, dtype=np.int64)
@@ -266,11 +273,11 @@ def _of_record(problem: BearingProblem, vector: Array, r: int, stretch: int) -> 
             own[b, columns] += rows[:, :-1].T @ rows[:, -1]
         blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
     if not blocks:
-        return _sum(found), own, []
+        return found, own, []
     short = triangle_of([np.vstack(blocks)])
     triangle = np.zeros((columns.size + 1, problem.size + 1))
     triangle[: short.shape[0], np.append(columns, problem.size)] = short
-    return _sum(found), own, [triangle]
+    return found, own, [triangle]
 
 
 def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
@@ -285,15 +292,21 @@ def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
 
 
 def search(
-    problem: BearingProblem, start: Array, *, iterations: int = _ITERATIONS, tick: Tick | None = None
+    problem: BearingProblem,
+    start: Array,
+    *,
+    iterations: int = _ITERATIONS,
+    damping: float = 1e-3,
+    tick: Tick | None = None,
 ) -> BearingFit:
     """Minimise the criterion from `start`.
 
-    `start`: (size,); `iterations`: bound on linearisations. Returns with status ``"failed"`` where there is no
+    `start`: (size,); `iterations`: bound on linearisations; `damping`: at the beginning, small where the start is good.
+    Returns with status ``"failed"`` where there is no
     predictor at `start`.
     """
     upper = problem.upper()
-    vector, damping, count, status = np.minimum(start, upper), 1e-3, 1, "stalled"
+    vector, count, status = np.minimum(start, upper), 1, "stalled"
     at = linearise(problem, vector)
     if at is None:
         return BearingFit(problem=problem, vector=vector, at=None, criterion=np.inf, status="failed", evaluations=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet_likelihood import BearingFit, criterion, run, search
+from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
 from ambid.bearing.rescue import FAR, explained_by_past, look_elsewhere
 from ambid.estimation.global_search import STAGE, global_search
@@ -104,9 +104,8 @@ def failure(fit: BearingFit) -> str:
 
 def _unexplained(fit: BearingFit, r: int) -> float:
     """Part of the normalised errors' variance that a regression on past errors and voltages explains, by record."""
-    found = run(fit.problem, fit.vector, r)
-    if found is None:
-        return 1.0
+    assert fit.at is not None
+    found = fit.at.innovations[r]
     e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
     return explained_by_past(e, fit.problem.records[r].u[: e.shape[0], None], _PAST)
 

@@ -43,7 +43,7 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     A lag between current and force (an eddy pole) leaves the innovations white, as the levels of the noise grow over
     it, but not independent of past voltages.
     """
-    found = run(fit.problem, fit.vector, r)
+    found = run(fit.problem, fit.vector, r) if fit.at is None else fit.at.innovations[r]
     assert found is not None
     outputs = (1,) if fit.problem.records[r].held else (0, 1)
     n, first = found.e.shape[0], fit.problem.skip
