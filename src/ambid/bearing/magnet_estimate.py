@@ -232,19 +232,16 @@ def _carried(fit: BearingFit, problem: BearingProblem) -> np.ndarray:
 def _with_fraction(fit: BearingFit, tick: Tick | None) -> BearingFit:
     """Free a delay that was whole where the score test says so; put one back that came out whole."""
     price = float(np.log(fit.problem.n_used))
-    for rate, delay in fit.problem.delays.items():
+    for rate in fit.problem.delays:
         if rate not in fit.problem.free_delay:
-            free = replace(fit.problem, free_delay=fit.problem.free_delay | {rate})
-            start = _carried(fit, free)
-            place, gain, from_here = len(free.estimated) + free.rates.index(rate), 0.0, start
-            for shift in (0.0, -1e-9) if delay >= 1.0 else (0.0,):  # the slope differs on the two sides
-                beside = start.copy()
-                beside[place] += shift
-                at = linearise(free, beside)
-                if at is not None and promise(at) > gain:
-                    gain, from_here = promise(at), beside
-            if gain > price:
-                found = search(free, from_here, tick=tick)
+            assert fit.at is not None
+            either = fit.problem.settled.index(rate)
+            gains = [promise(fit.at, delay=2 * either + side) for side in (0, 1)]  # the slope differs on the two sides
+            if max(gains) > price:
+                free = replace(fit.problem, free_delay=fit.problem.free_delay | {rate})
+                start = _carried(fit, free)
+                start[len(free.estimated) + free.rates.index(rate)] -= 1e-9 * (gains[1] > gains[0])
+                found = search(free, start, tick=tick)
                 fit = found if fit.criterion - found.criterion > price else fit
         if rate in fit.problem.free_delay:
             total = fit.problem.delay_at(fit.vector, rate)

@@ -1,12 +1,12 @@
-"""The plant of the predictor, compiled: rates of change, Jacobian, derivatives by the numbers.
+"""The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
 
 Physical numbers `theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and
 the delay beyond whole samples.
 
-The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
-
-Physical numbers `theta` (20) as in `_plant_kernels`. Columns of all sensitivities: the active ones of these, then the
-log noise levels.
+A sensitivity is a lane: of a number, of a delay that becomes shorter instead of longer (`EARLY`: the slopes differ
+where it is whole), or of the logarithm of a noise level. Lanes are the last axis of rows of constant length in one
+array `X`, and what multiplies them stands in an array `C`: so the compiler sees that nothing overlaps, and uses vector
+instructions. The number of states is the length of a tuple, so that it unrolls the loops over them.
 """
 
 from __future__ import annotations
@@ -22,433 +22,476 @@ from ambid.compiled import compiled
 from ambid.physics.coenergy_law import coenergy_derivatives
 
 Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+States = tuple[int, ...]
 
 MAGNET = 9
 MASS, RESISTANCE, DAMPING, GRAVITY, POLE, X_OFF, I_OFF, V_OFF, V_DROP, I_DROP, LATE = range(MAGNET, MAGNET + 11)
-N_NUMBERS = LATE + 1
+EARLY, LEVEL = LATE + 1, LATE + 2
+"""Kinds of lanes: numbers, the delay either way, then five noise levels."""
+
+PITCH = 32
+"""Lanes that there is room for."""
+
+# rows of `X`: state, covariance, each kind of lane but the magnet's, slopes of the law, derivatives of A, F and E, room
+_S, _P, _KIND = 0, 5, 30
+_LAW = _KIND + LEVEL + 5 - MAGNET
+_A, _F, _E = _LAW + 7, _LAW + 32, _LAW + 57
+_U, _K, _SUM, _ROW = _E + 10, _E + 35, _E + 40, _E + 45
+ROOM = (_ROW + 2) * PITCH
+"""Length of `X`."""
+
+# where the lanes of each kind begin in `X`
+(
+    _MASS,
+    _RESISTANCE,
+    _DAMPING,
+    _GRAVITY,
+    _POLE,
+    _X_OFF,
+    _,
+    _V_OFF,
+    _V_DROP,
+    _I_DROP,
+    _LATE,
+    _EARLY,
+    _SENSOR,
+    _,
+    _FORCE,
+) = (PITCH * (_KIND + kind) for kind in range(15))
+
+# places in `C`: A, F, H and T = P F' in rows of five, E in rows of two, then numbers
+_CA, _CF, _CH, _CT, _CE, _CN = 0, 25, 50, 75, 100, 110
 
 # Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
 _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 
 @compiled
-def drop_of(i: float, th: Array) -> tuple[float, float, float]:
-    """Return what transistors and diodes take of the voltage at a current, its slope, and the slope over v_drop."""
+def drop_of(i: float, th: Array) -> tuple[float, float]:
+    """Return the share of v_drop that transistors and diodes take of the voltage at a current, and its slope."""
     t = math.tanh(i / th[I_DROP])
-    c = (1.0 - t * t) / th[I_DROP]
-    return th[V_DROP] * t, th[V_DROP] * c, c
+    return t, (1.0 - t * t) / th[I_DROP]
 
 
 @compiled
-def rates(z: Array, volt: Array, th: Array, flags: Flags, w: Array, dw: Array, g: Array, A: Array, G: Array) -> None:
-    """Write the right-hand side g (n,), its Jacobian A (n, n), and its derivatives G (n, 20) by `theta`.
+def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, dw: Array, g: Array) -> tuple[float, float]:
+    """Write the right-hand side g (n,) at a state under a voltage; return the drop's share and slope, see `drop_of`.
 
-    `volt` is the voltage and its derivative by the delay. Position, velocity and current, then the force behind the
-    eddy pole, then a drifting force, where `flags` (exponential, pair, eddy, drift, locked) have them.
+    Position, velocity and current, then the force behind the eddy pole, then a drifting force, where `flags`
+    (exponential, pair, eddy, drift, held) have them.
     """
-    for a in range(g.size):
-        g[a] = 0.0
-        for b in range(g.size):
-            A[a, b] = 0.0
-        for b in range(N_NUMBERS):
-            G[a, b] = 0.0
     x, v, i = z[0], z[1], z[2]
     _energy(x, i, th, flags[0], flags[1], w, dw)
-    m, ell = th[MASS], w[3]
     if not flags[4]:
-        pull = z[3] if flags[2] else w[0]
-        net = pull - th[DAMPING] * v
-        last = g.size - 1
+        net = (z[3] if flags[2] else w[0]) - th[DAMPING] * v
         if flags[3]:
-            net += z[last]
-            A[1, last] = 1.0 / m
-        g[0] = v
-        g[1] = net / m + th[GRAVITY]
-        A[0, 1] = 1.0
-        A[1, 1] = -th[DAMPING] / m
-        if flags[2]:
-            A[1, 3] = 1.0 / m
-        else:
-            A[1, 0] = w[1] / m
-            A[1, 2] = w[2] / m
-            for q in range(MAGNET):
-                G[1, q] = dw[0, q] / m
-        G[1, MASS] = -net / m**2
-        G[1, DAMPING] = -v / m
-        G[1, GRAVITY] = 1.0
-    drop, steep, c = drop_of(i, th)
-    rate = (volt[0] + th[V_OFF] - drop - th[RESISTANCE] * i - w[2] * v) / ell
-    g[2] = rate
-    A[2, 0] = (-w[5] * v - rate * w[6]) / ell
-    A[2, 1] = -w[2] / ell
-    A[2, 2] = (-th[RESISTANCE] - steep - w[6] * v - rate * w[7]) / ell
-    for q in range(MAGNET):
-        G[2, q] = (-dw[2, q] * v - rate * dw[3, q]) / ell
-    G[2, RESISTANCE] = -i / ell
-    G[2, V_OFF] = 1.0 / ell
-    G[2, V_DROP] = -math.tanh(i / th[I_DROP]) / ell
-    G[2, I_DROP] = th[V_DROP] * c * i / th[I_DROP] / ell
-    G[2, LATE] = volt[1] / ell
+            net += z[z.size - 1]
+        g[0], g[1] = v, net / th[MASS] + th[GRAVITY]
     if flags[2]:
         g[3] = th[POLE] * (w[0] - z[3])
-        A[3, 0], A[3, 2], A[3, 3] = th[POLE] * w[1], th[POLE] * w[2], -th[POLE]
-        for q in range(MAGNET):
-            G[3, q] = th[POLE] * dw[0, q]
-        G[3, POLE] = w[0] - z[3]
+    share, steep = drop_of(i, th)
+    g[2] = (volt + th[V_OFF] - th[V_DROP] * share - th[RESISTANCE] * i - w[2] * v) / w[3]
+    return share, steep
 
 
-Integers = NDArray[np.int64]
+@compiled
+def jacobian(z: Array, th: Array, flags: Flags, w: Array, g: Array, steep: float, C: Array) -> None:
+    """Write the Jacobian of the right-hand side to `C`, where `rates` was asked for last."""
+    v, per = z[1], 1.0 / w[3]
+    if not flags[4]:
+        light = 1.0 / th[MASS]
+        C[_CA + 1] = 1.0
+        C[_CA + 6] = -th[DAMPING] * light
+        if flags[3]:
+            C[_CA + 4 + z.size] = light
+        if flags[2]:
+            C[_CA + 8] = light
+            C[_CA + 15], C[_CA + 17], C[_CA + 18] = th[POLE] * w[1], th[POLE] * w[2], -th[POLE]
+        else:
+            C[_CA + 5], C[_CA + 7] = w[1] * light, w[2] * light
+    C[_CA + 10] = (-w[5] * v - g[2] * w[6]) * per
+    C[_CA + 11] = -w[2] * per
+    C[_CA + 12] = (-th[RESISTANCE] - th[V_DROP] * steep - w[6] * v - g[2] * w[7]) * per
+
+
+@compiled
+def _padded(active: Integers) -> int:
+    """Return the number of lanes, with some that stay empty so that vector instructions leave none over."""
+    return min((active.size + 7) // 8 * 8, PITCH)
+
+
+@compiled
+def _law_lanes(active: Integers, chain: Array, dw: Array, X: Array) -> None:
+    """Write the slopes of the law by the magnet's numbers to their lanes."""
+    for j in range(active.size):
+        q = active[j]
+        if q < MAGNET:
+            for a in range(7):
+                X[(_LAW + a) * PITCH + j] = dw[a, q] * chain[j]
+
+
+@compiled
+def _stage_factors(
+    z: Array, th: Array, flags: Flags, w: Array, g: Array, drop: tuple[float, float], volts: Array, where: float,
+    C: Array,
+) -> None:  # fmt: skip
+    """Write how the numbers act by themselves on the right-hand side, see `_stage_lanes`."""
+    v, i, m, per, (share, steep) = z[1], z[2], th[MASS], 1.0 / w[3], drop
+    free = 0.0 if flags[4] else 1.0
+    C[_CN] = 0.0 if flags[2] else free / m
+    C[_CN + 1], C[_CN + 2], C[_CN + 3] = -free * (g[1] - th[GRAVITY]) / m, -free * v / m, free
+    C[_CN + 4], C[_CN + 5], C[_CN + 6], C[_CN + 7] = -v * per, -g[2] * per, -i * per, per
+    C[_CN + 8], C[_CN + 9] = (volts[2] + volts[3] * where) * per, (volts[4] + volts[5] * where) * per
+    C[_CN + 10], C[_CN + 11] = -share * per, th[V_DROP] * steep * i / th[I_DROP] * per
+    C[_CN + 12] = th[POLE] if flags[2] else 0.0
+    C[_CN + 13] = w[0] - z[3] if flags[2] else 0.0
 
 
 @compiled(fastmath={"contract"})
-def _left(M: Array, X: Array, factor: float, out: Array) -> None:
-    """Add factor M X to `out`, X (n, columns, p) a matrix for each of p numbers."""
-    for a in range(out.shape[0]):
-        for c in range(X.shape[0]):
-            f = factor * M[a, c]
-            if f != 0.0:
-                for b in range(X.shape[1]):
-                    for j in range(X.shape[2]):
-                        out[a, b, j] += f * X[c, b, j]
-
-
-@compiled(fastmath={"contract"})
-def _right(X: Array, M: Array, factor: float, out: Array) -> None:
-    """Add factor X M to `out`, X (n, n, p) a matrix for each of p numbers."""
-    for c in range(X.shape[1]):
-        for b in range(M.shape[1]):
-            f = factor * M[c, b]
-            if f != 0.0:
-                for a in range(X.shape[0]):
-                    for j in range(X.shape[2]):
-                        out[a, b, j] += f * X[a, c, j]
-
-
-@compiled(fastmath={"contract"})
-def _sum(x: Array, factor: float, y: Array, out: Array) -> None:
-    """Write x + factor y to `out`, all of one shape."""
-    for a in range(x.shape[0]):
-        for b in range(x.shape[1]):
-            for j in range(x.shape[2]):
-                out[a, b, j] = x[a, b, j] + factor * y[a, b, j]
+def _stage_lanes(states: States, p: int, forth: float, weight: float, C: Array, X: Array) -> None:
+    """Take the lanes of the state through one stage: K <- A (S + forth K) + what acts by itself; add to their sum."""
+    n = len(states)
+    m0, m1, m2, m3 = C[_CN], C[_CN + 1], C[_CN + 2], C[_CN + 3]
+    e0, e1, e2, e3, e4 = C[_CN + 4], C[_CN + 5], C[_CN + 6], C[_CN + 7], C[_CN + 8]
+    e5, e6, e7, f0, f1 = C[_CN + 9], C[_CN + 10], C[_CN + 11], C[_CN + 12], C[_CN + 13]
+    for j in range(min(p, PITCH)):
+        for a in range(n):
+            X[(_U + a) * PITCH + j] = X[(_S + a) * PITCH + j] + forth * X[(_K + a) * PITCH + j]
+        pull, motion, field = X[_LAW * PITCH + j], X[(_LAW + 2) * PITCH + j], X[(_LAW + 3) * PITCH + j]
+        for a in range(n):
+            X[(_K + a) * PITCH + j] = 0.0
+        X[(_K + 1) * PITCH + j] = m0 * pull + m1 * X[_MASS + j] + m2 * X[_DAMPING + j] + m3 * X[_GRAVITY + j]
+        X[(_K + 2) * PITCH + j] = (
+            e0 * motion + e1 * field + e2 * X[_RESISTANCE + j] + e3 * X[_V_OFF + j] + e4 * X[_LATE + j]
+            + e5 * X[_EARLY + j] + e6 * X[_V_DROP + j] + e7 * X[_I_DROP + j]
+        )  # fmt: skip
+        if n > 3:
+            X[(_K + 3) * PITCH + j] = f0 * pull + f1 * X[_POLE + j]
+        for a in range(n):
+            s = X[(_K + a) * PITCH + j]
+            for c in range(n):
+                s += C[_CA + 5 * a + c] * X[(_U + c) * PITCH + j]
+            X[(_K + a) * PITCH + j] = s
+            X[(_SUM + a) * PITCH + j] += weight * s
 
 
 @compiled
 def _advance(
-    z: Array, S: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
-    steps: int, slopes: bool, w: Array, dw: Array, g: Array, A: Array, G: Array, room: Array,
+    states: States, z: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
+    steps: int, w: Array, dw: Array, g: Array, at: Array, to: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
     """Carry state and sensitivities over one sample in place by `steps` classical Runge-Kutta steps.
 
-    `volts`: mean and slope of the voltage over the sample, and their derivatives by the delay.
+    `volts`: mean and slope of the voltage over the sample, and their derivatives by a longer and by a shorter delay.
     """
-    n, n_a = z.size, active.size
-    at, to, volt, K, Ss, St = np.empty(n), np.empty(n), np.empty(2), room[0], room[1], room[2]
-    step = h / steps
+    n, p, step = len(states), _padded(active), h / steps
     for k in range(steps):
         for a in range(n):
-            to[a] = z[a]
-            g[a] = 0.0
-        if slopes:
-            _sum(K, -1.0, K, K)
-            _sum(S, 0.0, K, Ss)
+            to[a], g[a] = z[a], 0.0
+            for j in range(p):
+                X[(_K + a) * PITCH + j] = 0.0
+                X[(_SUM + a) * PITCH + j] = X[(_S + a) * PITCH + j]
         for stage in range(4):
             forth = 0.0 if stage == 0 else (step if stage == 3 else 0.5 * step)
             weight = step / 6.0 if stage in (0, 3) else step / 3.0
             where = (k + forth / step) / steps - 0.5
-            volt[0] = volts[0] + volts[1] * where
-            volt[1] = volts[2] + volts[3] * where
             for a in range(n):
                 at[a] = z[a] + forth * g[a]
-            rates(at, volt, th, flags, w, dw, g, A, G)
+            drop = rates(at, volts[0] + volts[1] * where, th, flags, w, dw, g)
             for a in range(n):
                 to[a] += weight * g[a]
-            if slopes:
-                _sum(S, forth, K, St)
-                _sum(K, -1.0, K, K)
-                _left(A, St, 1.0, K)
-                for a in range(1, n):
-                    for j in range(n_a):
-                        K[a, 0, j] += G[a, active[j]] * chain[j]
-                _sum(Ss, weight, K, Ss)
+            if p:
+                jacobian(at, th, flags, w, g, drop[1], C)
+                _law_lanes(active, chain, dw, X)
+                _stage_factors(at, th, flags, w, g, drop, volts, where, C)
+                _stage_lanes(states, p, forth, weight, C, X)
         for a in range(n):
             z[a] = to[a]
-        if slopes:
-            _sum(Ss, 0.0, K, S)
+            for j in range(p):
+                X[(_S + a) * PITCH + j] = X[(_SUM + a) * PITCH + j]
 
 
-@compiled
+@compiled(fastmath={"contract"})
 def _bend(
-    z: Array, S: Array, th: Array, active: Integers, chain: Array, flags: Flags, volt: Array, h: float, w: Array,
-    dw: Array, g: Array, A: Array, dA: Array, dE: Array,
+    states: States, p: int, z: Array, th: Array, flags: Flags, volts: Array, h: float, w: Array, g: Array,
+    drop: tuple[float, float], C: Array, X: Array,
 ) -> None:  # fmt: skip
-    """Write the total derivatives of A and E of `_spread` by all numbers: by themselves, and through the state."""
-    n, p, n_a = S.shape[0], S.shape[2], active.size
-    m, ell, last, rate, v, i = th[MASS], w[3], n - 1, g[2], z[1], z[2]
-    push = 3 if flags[2] else 1
-    gain = th[POLE] if flags[2] else 1.0 / m
-    bf = 0.0 if flags[4] else 1.0 / m
-    _, steep, c = drop_of(i, th)
-    t, wide = math.tanh(i / th[I_DROP]), th[I_DROP]
-    _sum(dA, -1.0, dA, dA)
-    for j in range(p):
-        dx, dv, di = S[0, 0, j], S[1, 0, j], S[2, 0, j]
-        q = active[j] if j < n_a else -1
-        f = chain[j] if j < n_a else 0.0
-        xx, xi, ii = w[4] * dx + w[5] * di, w[5] * dx + w[6] * di, w[6] * dx + w[7] * di
-        xxi, xii, iii = w[8] * dx + w[9] * di, w[9] * dx + w[10] * di, w[10] * dx + w[11] * di
-        if 0 <= q < MAGNET:
-            xx, xi, ii = xx + dw[1, q] * f, xi + dw[2, q] * f, ii + dw[3, q] * f
-            xxi, xii, iii = xxi + dw[4, q] * f, xii + dw[5, q] * f, iii + dw[6, q] * f
-        dm = f if q == MASS else 0.0
-        dr, dc, da = f if q == RESISTANCE else 0.0, f if q == DAMPING else 0.0, f if q == POLE else 0.0
-        d_drop, d_wide = f if q == V_DROP else 0.0, f if q == I_DROP else 0.0
-        d_volt = (f if q == V_OFF else 0.0) + (volt[1] * f if q == LATE else 0.0)
-        d_drop_all = t * d_drop + steep * (di - i / wide * d_wide)
-        d_steep = c * d_drop + th[V_DROP] * (-2.0 * t * c / wide * di + (2.0 * t * i / wide - 1.0) * c / wide * d_wide)
-        dgain = da if flags[2] else -dm / m**2
-        if not flags[4]:
-            dA[push, 0, j] += gain * xx + dgain * w[1]
-            dA[push, 2, j] += gain * xi + dgain * w[2]
-            dA[1, 1, j] += -dc / m + th[DAMPING] * dm / m**2
-            if flags[2]:
-                dA[1, 3, j] = -dm / m**2
-                dA[3, 3, j] = -da
-            if flags[3]:
-                dA[1, last, j] = -dm / m**2
-        d_rate = (d_volt - d_drop_all - dr * i - th[RESISTANCE] * di - xi * v - w[2] * dv - rate * ii) / ell
-        dA[2, 0, j] = (-xxi * v - w[5] * dv - d_rate * w[6] - rate * xii - A[2, 0] * ii) / ell
-        dA[2, 1, j] = (-xi - A[2, 1] * ii) / ell
-        dA[2, 2, j] = (-dr - d_steep - xii * v - w[6] * dv - d_rate * w[7] - rate * iii - A[2, 2] * ii) / ell
-        dbf = 0.0 if flags[4] else -dm / m**2
-        dbv = -ii / ell**2
+    """Write the derivatives of A, F and E of `_spread` by all lanes: by themselves, and through the state."""
+    n = len(states)
+    v, i, m, rate, (share, steep) = z[1], z[2], th[MASS], g[2], drop
+    free, eddy, drift = (0.0 if flags[4] else 1.0), (1.0 if flags[2] else 0.0), (1.0 if flags[3] else 0.0)
+    light, heavy, per = free / m, -free / (m * m), 1.0 / w[3]
+    near, through, pole = light * (1.0 - eddy), heavy * (1.0 - eddy), th[POLE] * eddy
+    R, wide, damping = th[RESISTANCE], th[I_DROP], th[DAMPING]
+    slope, curl, turn = th[V_DROP] * steep, 2.0 * share / wide, i / wide
+    w1, w2, w4, w5, w6, w7, w8, w9, w10, w11 = w[1], w[2], w[4], w[5], w[6], w[7], w[8], w[9], w[10], w[11]
+    a20, a21, a22, late, early, half = C[_CA + 10], C[_CA + 11], C[_CA + 12], volts[2], volts[4], 0.5 * h * h
+    for j in range(min(p, PITCH)):
+        dx, dv, di = X[_S * PITCH + j], X[(_S + 1) * PITCH + j], X[(_S + 2) * PITCH + j]
+        dm, d_R, d_drop, d_wide = X[_MASS + j], X[_RESISTANCE + j], X[_V_DROP + j], X[_I_DROP + j]
+        xx = w4 * dx + w5 * di + X[(_LAW + 1) * PITCH + j]
+        xi = w5 * dx + w6 * di + X[(_LAW + 2) * PITCH + j]
+        ii = w6 * dx + w7 * di + X[(_LAW + 3) * PITCH + j]
+        xxi = w8 * dx + w9 * di + X[(_LAW + 4) * PITCH + j]
+        xii = w9 * dx + w10 * di + X[(_LAW + 5) * PITCH + j]
+        iii = w10 * dx + w11 * di + X[(_LAW + 6) * PITCH + j]
+        X[(_A + 5) * PITCH + j] = near * xx + through * w1 * dm
+        X[(_A + 6) * PITCH + j] = -light * X[_DAMPING + j] - heavy * damping * dm
+        X[(_A + 7) * PITCH + j] = near * xi + through * w2 * dm
+        if n > 3:
+            X[(_A + 8) * PITCH + j] = heavy * eddy * dm
+            d_pole = eddy * X[_POLE + j]
+            X[(_A + 15) * PITCH + j] = pole * xx + w1 * d_pole
+            X[(_A + 17) * PITCH + j] = pole * xi + w2 * d_pole
+            X[(_A + 18) * PITCH + j] = -d_pole
+            X[(_A + 4 + n) * PITCH + j] += heavy * drift * dm
+        d_volt = X[_V_OFF + j] + late * X[_LATE + j] + early * X[_EARLY + j] - share * d_drop
+        d_volt -= slope * (di - turn * d_wide) + d_R * i + R * di + xi * v + w2 * dv
+        d_rate = (d_volt - rate * ii) * per
+        d_slope = steep * d_drop + slope * ((curl * i - 1.0) / wide * d_wide - curl * di)
+        X[(_A + 10) * PITCH + j] = -(xxi * v + w5 * dv + d_rate * w6 + rate * xii + a20 * ii) * per
+        X[(_A + 11) * PITCH + j] = -(xi + a21 * ii) * per
+        X[(_A + 12) * PITCH + j] = -(d_R + d_slope + xii * v + w6 * dv + d_rate * w7 + rate * iii + a22 * ii) * per
+        d_light, d_per = heavy * dm, -ii * per * per
         for a in range(n):
-            dE[a, 0, j] = 0.5 * h * h * (dA[a, 1, j] * bf + A[a, 1] * dbf)
-            dE[a, 1, j] = 0.5 * h * h * (dA[a, 2, j] / ell + A[a, 2] * dbv)
-        dE[1, 0, j] += h * dbf
-        dE[2, 1, j] += h * dbv
-
-
-@compiled
-def _double(F: Array, dF: Array, E: Array, dE: Array, slopes: bool, T: Array, T2: Array, dT: Array) -> None:
-    """Make F and E of a step those of two, in place: E <- E + F E, F <- F F, with their derivatives."""
-    n = F.shape[0]
-    if slopes:
+            by_force = X[(_A + 5 * a + 1) * PITCH + j] * light + C[_CA + 5 * a + 1] * d_light
+            by_volt = X[(_A + 5 * a + 2) * PITCH + j] * per + C[_CA + 5 * a + 2] * d_per
+            X[(_E + 2 * a) * PITCH + j] = half * by_force
+            X[(_E + 2 * a + 1) * PITCH + j] = half * by_volt
+        X[(_E + 2) * PITCH + j] += h * d_light
+        X[(_E + 5) * PITCH + j] += h * d_per
         for a in range(n):
-            for d in range(2):
-                for j in range(dE.shape[2]):
-                    s = dE[a, d, j]
+            for b in range(n):
+                s = 0.0
+                for c in range(1, n):
+                    s += C[_CH + 5 * a + c] * X[(_A + 5 * c + b) * PITCH + j]
+                if a > 0:
                     for c in range(n):
-                        s += dF[a, c, j] * E[c, d] + F[a, c] * dE[c, d, j]
-                    dT[a, d, j] = s
+                        s += X[(_A + 5 * a + c) * PITCH + j] * C[_CH + 5 * c + b]
+                X[(_F + 5 * a + b) * PITCH + j] = s
+
+
+@compiled(fastmath={"contract"})
+def _double(states: States, p: int, C: Array, X: Array) -> None:
+    """Make F and E of a step those of two, in place: E <- E + F E, F <- F F, with their derivatives."""
+    n = len(states)
+    for j in range(min(p, PITCH)):
         for a in range(n):
             for d in range(2):
-                for j in range(dE.shape[2]):
-                    dE[a, d, j] = dT[a, d, j]
-        _sum(dT, -1.0, dT, dT)
-        _right(dF, F, 1.0, dT)
-        _left(F, dF, 1.0, dT)
-        _sum(dT, 0.0, dF, dF)
-    for a in range(n):
+                s = X[(_E + 2 * a + d) * PITCH + j]
+                for c in range(n):
+                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CE + 2 * c + d]
+                    s += C[_CF + 5 * a + c] * X[(_E + 2 * c + d) * PITCH + j]
+                X[(_K + 2 * a + d) * PITCH + j] = s
+            for b in range(n):
+                s = 0.0
+                for c in range(n):
+                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CF + 5 * c + b]
+                    s += C[_CF + 5 * a + c] * X[(_F + 5 * c + b) * PITCH + j]
+                X[(_U + 5 * a + b) * PITCH + j] = s
+        for a in range(n):
+            for d in range(2):
+                X[(_E + 2 * a + d) * PITCH + j] = X[(_K + 2 * a + d) * PITCH + j]
+            for b in range(n):
+                X[(_F + 5 * a + b) * PITCH + j] = X[(_U + 5 * a + b) * PITCH + j]
+    for a in range(n):  # T serves as room
         for d in range(2):
-            s = E[a, d]
+            s = C[_CE + 2 * a + d]
             for c in range(n):
-                s += F[a, c] * E[c, d]
-            T2[a, d] = s
+                s += C[_CF + 5 * a + c] * C[_CE + 2 * c + d]
+            C[_CN + 2 * a + d] = s
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += F[a, c] * F[c, b]
-            T[a, b] = s
+                s += C[_CF + 5 * a + c] * C[_CF + 5 * c + b]
+            C[_CT + 5 * a + b] = s
     for a in range(n):
         for d in range(2):
-            E[a, d] = T2[a, d]
+            C[_CE + 2 * a + d] = C[_CN + 2 * a + d]
         for b in range(n):
-            F[a, b] = T[a, b]
+            C[_CF + 5 * a + b] = C[_CT + 5 * a + b]
+
+
+@compiled(fastmath={"contract"})
+def _spread_lanes(states: States, p: int, drift: bool, q2: Array, C: Array, X: Array) -> None:
+    """Carry the derivatives of the covariance: dP <- F dP F' + dF T + (dF T)' + that of the noise, T = P F'."""
+    n = len(states)
+    for j in range(min(p, PITCH)):
+        for a in range(n):
+            for b in range(n):
+                s = 0.0
+                for c in range(n):
+                    s += C[_CF + 5 * a + c] * X[(_P + 5 * c + b) * PITCH + j]
+                X[(_U + 5 * a + b) * PITCH + j] = s
+        for a in range(n):
+            for b in range(a, n):
+                s = 0.0
+                for d in range(2):
+                    f, g = C[_CE + 2 * a + d], C[_CE + 2 * b + d]
+                    s += q2[d] * (g * X[(_E + 2 * a + d) * PITCH + j] + f * X[(_E + 2 * b + d) * PITCH + j])
+                    s += f * g * X[_FORCE + d * PITCH + j]
+                for c in range(n):
+                    s += X[(_U + 5 * a + c) * PITCH + j] * C[_CF + 5 * b + c]
+                    s += X[(_F + 5 * a + c) * PITCH + j] * C[_CT + 5 * c + b]
+                    s += X[(_F + 5 * b + c) * PITCH + j] * C[_CT + 5 * c + a]
+                X[(_P + 5 * a + b) * PITCH + j] = s
+                X[(_P + 5 * b + a) * PITCH + j] = s
+    if drift:
+        for j in range(min(p, PITCH)):
+            X[(_P + 6 * (n - 1)) * PITCH + j] += X[_FORCE + 2 * PITCH + j]
 
 
 @compiled
 def _spread(
-    z: Array, S: Array, P: Array, dP: Array, th: Array, active: Integers, chain: Array, flags: Flags,
-    level2: Array, q2: Array, volts: Array, h: float, steps: int, slopes: bool, w: Array, dw: Array, g: Array,
-    A: Array, G: Array, dA: Array, F: Array, dF: Array, T: Array, dT: Array, E: Array, dE: Array, T2: Array, H: Array,
+    states: States, z: Array, P: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
+    volts: Array, h: float, steps: int, w: Array, dw: Array, g: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
     """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the linearised plant.
 
-    `q2` is `level2`, force, voltage and drift, with what is not known of force and voltage of this sample. A is the
+    `q2`: variances of force, voltage and drift, with what is not known of force and voltage of this sample. A is the
     Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B of a
     step, put together over `steps` of them, a power of two.
     """
+    n, p = len(states), _padded(active)
     h /= steps
-    n, p, n_a = z.size, S.shape[2], active.size
-    volt = np.empty(2)
-    volt[0], volt[1] = volts[0], volts[2]
-    rates(z, volt, th, flags, w, dw, g, A, G)
-    m, ell, last = th[MASS], w[3], n - 1
-    bf = 0.0 if flags[4] else 1.0 / m
+    drop = rates(z, volts[0], th, flags, w, dw, g)
+    jacobian(z, th, flags, w, g, drop[1], C)
+    light, per, half = 0.0 if flags[4] else 1.0 / th[MASS], 1.0 / w[3], 0.5 * h * h
     for a in range(n):
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += A[a, c] * A[c, b]
-            F[a, b] = h * A[a, b] + 0.5 * h * h * s
-        F[a, a] += 1.0
-        E[a, 0] = 0.5 * h * h * A[a, 1] * bf
-        E[a, 1] = 0.5 * h * h * A[a, 2] / ell
-    E[1, 0] += h * bf
-    E[2, 1] += h / ell
-    if slopes:
-        _bend(z, S, th, active, chain, flags, volt, h, w, dw, g, A, dA, dE)
-        _sum(dF, -1.0, dF, dF)
-        for a in range(n):
-            for b in range(n):
-                H[a, b] = 0.5 * h * h * A[a, b]
-            H[a, a] += 0.5 * h  # dF = H dA + dA H
-        _left(H, dA, 1.0, dF)
-        _right(dA, H, 1.0, dF)
+                s += C[_CA + 5 * a + c] * C[_CA + 5 * c + b]
+            C[_CF + 5 * a + b] = h * C[_CA + 5 * a + b] + half * s
+            C[_CH + 5 * a + b] = half * C[_CA + 5 * a + b]  # dF = H dA + dA H
+        C[_CF + 6 * a] += 1.0
+        C[_CH + 6 * a] += 0.5 * h
+        C[_CE + 2 * a] = half * C[_CA + 5 * a + 1] * light
+        C[_CE + 2 * a + 1] = half * C[_CA + 5 * a + 2] * per
+    C[_CE + 2] += h * light
+    C[_CE + 5] += h * per
+    if p:
+        _law_lanes(active, chain, dw, X)
+        if n > 3:
+            for j in range(p):
+                X[(_A + 4 + n) * PITCH + j] = 0.0
+        _bend(states, p, z, th, flags, volts, h, w, g, drop, C, X)
     done = 1
     while done < steps:
-        _double(F, dF, E, dE, slopes, T, T2, dT)
+        _double(states, p, C, X)
         done *= 2
     for a in range(n):
         for b in range(n):
             s = 0.0
             for c in range(n):
-                s += P[a, c] * F[b, c]
-            T[a, b] = s  # P F'
-    if slopes:
-        _sum(dT, -1.0, dT, dT)
-        for a in range(n):
-            for b in range(n):
-                T2[a, b] = F[b, a]
-        _left(F, dP, 0.5, dT)  # dT = F dP/2 + dF P, so that dP+ = dT F' + F dT' + noise
-        _right(dF, P, 1.0, dT)
-        _sum(dP, -1.0, dP, dP)
-        _right(dT, T2, 1.0, dP)
-        for a in range(n):
-            for b in range(a, n):
-                f00, f01 = E[b, 0] * q2[0], E[a, 0] * q2[0]
-                f10, f11 = E[b, 1] * q2[1], E[a, 1] * q2[1]
-                for j in range(p):
-                    noise = f00 * dE[a, 0, j] + f01 * dE[b, 0, j] + f10 * dE[a, 1, j] + f11 * dE[b, 1, j]
-                    dP[a, b, j] += dP[b, a, j] + noise
-                    dP[b, a, j] = dP[a, b, j]
-                for d in range(2):
-                    dP[a, b, n_a + 2 + d] += 2.0 * level2[d] * E[a, d] * E[b, d]
-                    dP[b, a, n_a + 2 + d] = dP[a, b, n_a + 2 + d]
-        if flags[3]:
-            dP[last, last, n_a + 4] += 2.0 * q2[2]
+                s += P[a, c] * C[_CF + 5 * b + c]
+            C[_CT + 5 * a + b] = s
+    if p:
+        _spread_lanes(states, p, flags[3], q2, C, X)
     for a in range(n):
         for b in range(a, n):
-            s = E[a, 0] * E[b, 0] * q2[0] + E[a, 1] * E[b, 1] * q2[1]
+            s = C[_CE + 2 * a] * C[_CE + 2 * b] * q2[0] + C[_CE + 2 * a + 1] * C[_CE + 2 * b + 1] * q2[1]
             for c in range(n):
-                s += F[a, c] * T[c, b]
+                s += C[_CF + 5 * a + c] * C[_CT + 5 * c + b]
             P[a, b] = s
             P[b, a] = s
     if flags[3]:
-        P[last, last] += q2[2]
+        P[n - 1, n - 1] += q2[2]
 
 
 @compiled(fastmath={"contract"})
+def _correct_lanes(states: States, p: int, e: float, s: float, C: Array, X: Array) -> None:
+    """Correct the lanes; those of prediction and variance become rows of the likelihood, see `_correct`."""
+    n = len(states)
+    root, narrow, per = 1.0 / math.sqrt(s), 1.0 / (s * math.sqrt(2.0)), 1.0 / s
+    for j in range(min(p, PITCH)):
+        de, ds = -X[_ROW * PITCH + j], X[(_ROW + 1) * PITCH + j]
+        X[_ROW * PITCH + j], X[(_ROW + 1) * PITCH + j] = de * root, ds * narrow
+        for a in range(n):
+            gain = C[_CN + a] * per
+            X[(_U + a) * PITCH + j] = (X[(_K + a) * PITCH + j] - gain * ds) * per
+            X[(_S + a) * PITCH + j] += X[(_U + a) * PITCH + j] * e + gain * de
+        for a in range(n):
+            gain = C[_CN + a] * per
+            for b in range(a, n):
+                t = X[(_U + a) * PITCH + j] * C[_CN + b] + gain * X[(_K + b) * PITCH + j]
+                X[(_P + 5 * a + b) * PITCH + j] -= t
+                X[(_P + 5 * b + a) * PITCH + j] = X[(_P + 5 * a + b) * PITCH + j]
+
+
+@compiled
 def _correct(
-    e: float, de: Array, c: int, r2: float, level: int, z: Array, S: Array, P: Array, dP: Array, slopes: bool,
-    rows: Array, col: Array, dcol: Array, dk: Array,
+    states: States, e: float, o: int, r2: float, p: int, z: Array, P: Array, C: Array, X: Array, rows: Array
 ) -> float:  # fmt: skip
-    """Take in one measured output, state number `c`; return its innovation variance.
+    """Take in one measured output, 0 position or 1 current; return its innovation variance.
 
     `rows` (2, p + 1) gets the rows of the likelihood: innovation over its deviation, and (1 - e^2/s)/sqrt(2) with the
     derivative ds/(s sqrt(2)): their inner products are gradient and Fisher information of (log s + e^2/s)/2.
     """
-    n, p = S.shape[0], S.shape[2]
+    n, at = len(states), 2 * o
     for a in range(n):
-        col[a] = P[a, c]
-    s: float = col[c] + r2
-    if slopes:
-        root, narrow = math.sqrt(s), 1.0 / (s * math.sqrt(2.0))
+        C[_CN + a] = P[a, at]
+    s: float = P[at, at] + r2
+    if p:
+        for j in range(p):
+            X[_ROW * PITCH + j] = X[(_S + at) * PITCH + j] + X[_X_OFF + o * PITCH + j]
+            X[(_ROW + 1) * PITCH + j] = X[(_P + 6 * at) * PITCH + j] + X[_SENSOR + o * PITCH + j]
         for a in range(n):
             for j in range(p):
-                dcol[a, j] = dP[a, c, j]
-        ds = dk[n]
+                X[(_K + a) * PITCH + j] = X[(_P + 5 * a + at) * PITCH + j]
+        _correct_lanes(states, p, e, s, C, X)
+        p = rows.shape[1] - 1
         for j in range(p):
-            ds[j] = dcol[c, j]
-        ds[level] += 2.0 * r2
-        for j in range(p):
-            rows[0, j] = de[j] / root
-            rows[1, j] = ds[j] * narrow
-        rows[0, p], rows[1, p] = e / root, (1.0 - e * e / s) / math.sqrt(2.0)
-        for a in range(n):
-            f = col[a] / s
-            for j in range(p):
-                dk[a, j] = (dcol[a, j] - f * ds[j]) / s
-                S[a, 0, j] += dk[a, j] * e + f * de[j]
-        for a in range(n):
-            f = col[a] / s
-            for b in range(a, n):
-                t = col[b]
-                for j in range(p):
-                    dP[a, b, j] -= dk[a, j] * t + f * dcol[b, j]
-                    dP[b, a, j] = dP[a, b, j]
+            rows[0, j], rows[1, j] = X[_ROW * PITCH + j], X[(_ROW + 1) * PITCH + j]
+        rows[0, p], rows[1, p] = e / math.sqrt(s), (1.0 - e * e / s) / math.sqrt(2.0)
     for a in range(n):
-        z[a] += col[a] * e / s
+        z[a] += C[_CN + a] * e / s
         for b in range(n):
-            P[a, b] -= col[a] * col[b] / s
+            P[a, b] -= C[_CN + a] * C[_CN + b] / s
     return s
 
 
 @compiled
 def predict(
-    u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, end: int, whole: int, th: Array,
-    active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array, S: Array,
-    dP: Array, slopes: bool, e: Array, s: Array, rows: Array,
+    states: States, u: Array, loose: Array, knock: Array, y: Array, valid: Flags, first: int, end: int, whole: int,
+    th: Array, active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array,
+    X: Array, e: Array, s: Array, rows: Array,
 ) -> bool:  # fmt: skip
     """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite.
 
-    `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what is not known of the force, and of
-    the motional voltage; `y` (n, 2) position and current, `valid` (n, 2): which of them are measured. `z` (n_states,)
-    and `P` hold the state before sample `first`, `S` (n_states, 1, p) and `dP` (n_states, n_states, p) their
-    derivatives, and all move along. `noise2` holds the squares of the levels of position,
-    current, force, voltage and drift (of one sample). `e`, `s` (n, 2) get innovations and their variances; `rows`
-    (4 (end - first), p + 1) the rows of the likelihood, where `slopes` wants them.
+    `states`: as many as there are; `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what
+    is not known of the force, and of the motional voltage; `y` (n, 2) position and current, `valid` (n, 2): which of
+    them are measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or twice the
+    square of a level; without lanes the criterion alone. `noise2` holds the squares of the levels of position, current,
+    force, voltage and drift (of one sample). `z`, `P` and `X` (`ROOM`,), which is zero at first, hold state, covariance
+    and their derivatives before sample `first`, and move along. `e`, `s` (n, 2) get innovations and their variances;
+    `rows` (4 (end - first), p + 1) the rows of the likelihood.
     """
-    n, n_a = z.size, active.size
-    p = n_a + 5
-    w, dw = np.zeros(12), np.zeros((7, MAGNET))
-    g, A, G = np.zeros(n), np.zeros((n, n)), np.zeros((n, N_NUMBERS))
-    room = np.zeros((3, n, 1, p))
-    dA, dF, dT, dE = np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, n, p)), np.zeros((n, 2, p))
-    F, T, E, T2, H = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2)), np.zeros((n, n)), np.zeros((n, n))
-    col, dcol, dk, de, volts = np.zeros(n), np.zeros((n, p)), np.zeros((n + 1, p)), np.zeros(p), np.zeros(4)
-    none, q2 = np.zeros((2, p + 1)), np.zeros(3)
+    n, p = len(states), active.size
+    w, dw, C = np.zeros(12), np.zeros((7, MAGNET)), np.zeros(_CN + 14)
+    g, at, to, volts, q2 = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6), np.zeros(3)
+    for j in range(p):
+        if active[j] >= MAGNET:
+            X[(_KIND + active[j] - MAGNET) * PITCH + j] = chain[j]
     phi = th[LATE]
     for k in range(first, end):
-        for c in range(2):
-            if not valid[k, c]:
-                continue
-            at = 0 if c == 0 else 2
-            error = y[k, c] - z[at] - th[X_OFF + c]
-            if slopes:
-                for j in range(p):
-                    de[j] = -S[at, 0, j]
-                for j in range(n_a):
-                    if active[j] == X_OFF + c:
-                        de[j] -= chain[j]
-                # the derivative of the innovation is -(d prediction); the correction adds K (dy - dC z) = K de
-            row = 4 * (k - first) + 2 * c
-            out = rows[row : row + 2] if slopes else none
-            s[k, c] = _correct(error, de, at, noise2[c], n_a + c, z, S, P, dP, slopes, out, col, dcol, dk)
-            e[k, c] = error
+        for o in range(2):
+            if valid[k, o]:
+                e[k, o] = y[k, o] - z[2 * o] - th[X_OFF + o]
+                row = 4 * (k - first) + 2 * o if p else 0
+                s[k, o] = _correct(states, e[k, o], o, noise2[o], _padded(active), z, P, C, X, rows[row : row + 2])
         late, now = u[k - whole - 1], u[k - whole]
         volts[0], volts[1] = phi * late + (1.0 - phi) * now, 6.0 * phi * (1.0 - phi) * (now - late)
         volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
-        for d in range(3):
-            q2[d] = noise2[2 + d]
-        q2[0] += knock[k, 0]
-        q2[1] += max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
-        _spread(
-            z, S, P, dP, th, active, chain, flags, noise2[2:], q2, volts, h, steps, slopes, w, dw, g, A, G, dA, F, dF,
-            T, dT, E, dE, T2, H,
-        )  # fmt: skip
-        _advance(z, S, th, active, chain, flags, volts, h, steps, slopes, w, dw, g, A, G, room)
+        if whole > 0:
+            soon = u[k - whole + 1]
+            volts[4], volts[5] = now - soon, -6.0 * (soon - now)
+        q2[0] = noise2[2] + knock[k, 0]
+        q2[1] = noise2[3] + max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
+        q2[2] = noise2[4]
+        _spread(states, z, P, th, active, chain, flags, q2, volts, h, steps, w, dw, g, C, X)
+        _advance(states, z, th, active, chain, flags, volts, h, steps, w, dw, g, at, to, C, X)
         low, high = z[0] + th[1], th[1] - z[0]
         if not flags[0] and (low <= 0.0 or (flags[1] and high <= 0.0)):
             return False

@@ -37,6 +37,8 @@ class Linear:
     J: Array  # (n_rows, size), J'J is the Fisher information, priors included
     r: Array  # (n_rows,), J'r is half the gradient of the criterion
     criterion: float
+    # (n_rows, 2 n_settled), columns that J would have for each delay that is whole and settled, longer and shorter
+    J_delay: Array
     scores: Array  # (n_stretches, size), half gradients of the stretches of the records
     innovations: tuple[Innovations, ...]  # of each record
 
@@ -87,13 +89,16 @@ def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
     return found
 
 
-def sweep(problem: BearingProblem, vector: Array, r: int, found: Innovations, *, slopes: bool) -> Iterator[Rows | None]:
+def sweep(
+    problem: BearingProblem, vector: Array, r: int, found: Innovations, *, slopes: bool, delays: bool = False
+) -> Iterator[Rows | None]:
     """Run the predictor over one record block after block, so that memory does not grow with it.
 
-    `vector`: (size,); `r`: which record; `found`: gets the innovations; `slopes`: whether the likelihood.s rows are
-    wanted. Yields None, and ends, where there is no predictor.
+    `vector`: (size,); `r`: which record; `found`: gets the innovations; `slopes`: whether the likelihood's rows are
+    wanted; `delays`: with columns behind the vector's for a delay that is settled, see `Linear`. Yields None, and ends,
+    where there is no predictor.
     """
-    from ambid.bearing.magnet_kernels import predict
+    from ambid.bearing.magnet_kernels import EARLY, LATE, LEVEL, ROOM, predict
 
     record, n_e = problem.records[r], len(problem.estimated)
     theta, whole = problem.theta(vector, record.rate_hz)
@@ -101,38 +106,41 @@ def sweep(problem: BearingProblem, vector: Array, r: int, found: Innovations, *,
     if not possible or abs(theta[problem.law.names.index("k_asym")]) >= 1.0:
         yield None
         return
-    names = [n.name for n in problem.numbers]
-    active = [names.index(n.name) for n in problem.estimated]
-    chain, columns = problem.chain(vector), list(range(n_e))
-    if record.rate_hz in problem.free_delay:
-        active.append(len(names))
-        chain = np.append(chain, 1.0)
-        columns.append(n_e + problem.rates.index(record.rate_hz))
-    place, levels = problem.noise_slices[r], problem.levels(r)
-    columns += [place.start + levels.index(j) if j in levels else -1 for j in range(5)]
-    used, p = np.flatnonzero(np.array(columns) >= 0), len(columns)
     noise2, flags = problem.noise2(vector, r), problem.flags(r)
+    lanes, chain, columns = list[int](), np.zeros(0), np.zeros(0, dtype=np.int64)
+    if slopes:
+        names, place, levels = [n.name for n in problem.numbers], problem.noise_slices[r], problem.levels(r)
+        lanes, beside = [names.index(n.name) for n in problem.estimated], list[int]()
+        columns = np.concatenate([np.arange(n_e), np.arange(place.start, place.stop)])
+        lanes += [LEVEL + level for level in levels]
+        if record.rate_hz in problem.free_delay:
+            beside = [n_e + problem.rates.index(record.rate_hz)]
+        elif delays:
+            first = problem.size + 2 * problem.settled.index(record.rate_hz)
+            beside = [first, first + 1] if whole > 0 else [first]
+        lanes, columns = lanes + [LATE, EARLY][: len(beside)], np.append(columns, beside).astype(np.int64)
+        chain = np.concatenate([problem.chain(vector), 2.0 * noise2[list(levels)], np.ones(len(beside))])
+    p = len(lanes)
     rows = np.zeros((4 * _BLOCK if slopes else 1, p + 1))
     steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
-    valid, numbers = record.valid & np.array([not record.held, True]), np.array(active, dtype=np.int64)
+    valid, numbers = record.valid & np.array([not record.held, True]), np.array(lanes, dtype=np.int64)
     for first, last in record.parts:
         begin = max(first + (_ABOUT if first else 0), problem.skip)
         if last - begin < _ABOUT:
             continue
         z, P = _initial(problem, r, begin)
-        S, dP = np.zeros((z.size, 1, p)), np.zeros((z.size, z.size, p))
+        X, states = np.zeros(ROOM), (0,) * z.size
         for at in range(begin, last, _BLOCK):
             end, rows[:] = min(at + _BLOCK, last), 0.0
             done = predict(
-                record.u, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2, flags,
-                1.0 / record.rate_hz, steps, z, P, S, dP, slopes, found.e, found.s, rows,
+                states, record.u, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2, flags,
+                1.0 / record.rate_hz, steps, z, P, X, found.e, found.s, rows,
             )  # fmt: skip
             if not done:
                 yield None
                 return
             if slopes:
-                own = rows[: 4 * (end - at), [*used, p]].reshape(end - at, 4, -1)
-                yield Rows(first=at, rows=own, columns=np.array(columns)[used])
+                yield Rows(first=at, rows=rows[: 4 * (end - at)].reshape(end - at, 4, -1), columns=columns)
 
 
 def _knocks(problem: BearingProblem, r: int) -> Array:
@@ -239,8 +247,8 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
     `vector`: (size,). Returns none where there is no predictor.
     """
     prior, J_prior = prior_rows(problem, vector)
-    total, parts, scores = float(prior @ prior), [np.column_stack([J_prior, prior])], list[Array]()
-    innovations = list[Innovations]()
+    total, scores, innovations = float(prior @ prior), list[Array](), list[Innovations]()
+    parts = [np.column_stack([J_prior, np.zeros((prior.size, 2 * len(problem.settled))), prior])]
     stretch = max(1, sum(r.u.size for r in problem.records) // _BATCHES)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:  # the kernel leaves Python's lock
         for one in threads.map(lambda r: _of_record(problem, vector, r, stretch), range(len(problem.records))):
@@ -252,8 +260,9 @@ def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
             parts += one[2]
     whole = triangle_of([np.vstack(parts)])
     return Linear(
-        J=whole[:, :-1], r=whole[:, -1], criterion=total, scores=np.array(scores), innovations=tuple(innovations)
-    )
+        J=whole[:, : problem.size], r=whole[:, -1], criterion=total, J_delay=whole[:, problem.size : -1],
+        scores=np.array(scores), innovations=tuple(innovations),
+    )  # fmt: skip
 
 
 def _of_record(
@@ -262,8 +271,9 @@ def _of_record(
     """Innovations of a record, the scores of its stretches, and the triangle; None without a predictor."""
     n = problem.records[r].u.size
     found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
-    own, blocks, columns = np.zeros((-(-n // stretch), problem.size)), list[Array](), np.zeros(0, dtype=np.int64)
-    for part in sweep(problem, vector, r, found, slopes=True):
+    width = problem.size + 2 * len(problem.settled)
+    own, blocks, columns = np.zeros((-(-n // stretch), width)), list[Array](), np.zeros(0, dtype=np.int64)
+    for part in sweep(problem, vector, r, found, slopes=True, delays=True):
         if part is None or not np.all(np.isfinite(part.rows)):
             return None
         columns, m = part.columns, part.rows.shape[0]
@@ -273,19 +283,21 @@ def _of_record(
             own[b, columns] += rows[:, :-1].T @ rows[:, -1]
         blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
     if not blocks:
-        return found, own, []
+        return found, own[:, : problem.size], []
     short = triangle_of([np.vstack(blocks)])
-    triangle = np.zeros((columns.size + 1, problem.size + 1))
-    triangle[: short.shape[0], np.append(columns, problem.size)] = short
-    return found, own, [triangle]
+    triangle = np.zeros((columns.size + 1, width + 1))
+    triangle[: short.shape[0], np.append(columns, width)] = short
+    return found, own[:, : problem.size], [triangle]
 
 
-def promise(at: Linear, loose: NDArray[np.bool_] | None = None) -> float:
+def promise(at: Linear, loose: NDArray[np.bool_] | None = None, delay: int | None = None) -> float:
     """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
 
-    `loose`: (size,), bool, which numbers may move; None: all.
+    `loose`: (size,), bool, which numbers may move; None: all; `delay`: column of `J_delay` that may, too.
     """
     J = at.J if loose is None else at.J[:, loose]
+    if delay is not None:
+        J = np.column_stack([J, at.J_delay[:, delay]])
     found = directions(J)
     # as strict as ever: with the common tolerance a search in loud noise counted as ended, its deviations too small
     return float(np.sum((found.U.T @ at.r)[found.s > 1e-10 * found.s[0]] ** 2))

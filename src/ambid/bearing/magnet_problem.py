@@ -141,6 +141,11 @@ class BearingProblem:
         """Sampling rates whose delay is in the vector."""
         return tuple(r for r in self.delays if r in self.free_delay)
 
+    @property
+    def settled(self) -> tuple[float, ...]:
+        """The other sampling rates."""
+        return tuple(r for r in self.delays if r not in self.free_delay)
+
     def levels(self, r: int) -> tuple[int, ...]:
         """Return which noise levels record `r` has, as places in `LEVELS`."""
         if self.records[r].held:
