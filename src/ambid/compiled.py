@@ -10,6 +10,7 @@ quarter of a second. A kernel that was compiled before needs only the run time; 
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import re
 from collections.abc import Callable
@@ -43,7 +44,7 @@ def _compile(function: F, options: dict[str, Any]) -> F:
     from numba import njit
 
     _listen()
-    made: F = njit(cache=True, nogil=True, **options)(function)
+    made: F = njit(**options, cache=True, nogil=True, no_cfunc_wrapper=True)(function)  # type: ignore[call-overload]
     kept = getattr(made, "_cache", None)
     if kept is not None:  # None where NUMBA_DISABLE_JIT leaves plain Python
         index = kept._cache_file
@@ -64,21 +65,30 @@ def _load(kept: Any, signature: object, target: Any) -> Any:
 
 @cache
 def _listen() -> None:
-    """Hear when something is compiled."""
+    """Hear when something is compiled: say so once, and collect no garbage meanwhile (a twentieth of the time)."""
     from numba.core.event import Event, Listener, register
 
-    class First(Listener):
+    class Hear(Listener):
+        depth, collects = 0, True
+
         def on_start(self, event: Event) -> None:
             del event
             global announce
             say, announce = announce, None
             if say is not None:
                 say()
+            if not self.depth:
+                self.collects = gc.isenabled()
+                gc.disable()
+            self.depth += 1
 
         def on_end(self, event: Event) -> None:
             del event
+            self.depth -= 1
+            if not self.depth and self.collects:
+                gc.enable()
 
-    register("numba:compile", First())  # type: ignore[no-untyped-call]
+    register("numba:compile", Hear())  # type: ignore[no-untyped-call]
 
 
 @cache

@@ -8,6 +8,7 @@ import pytest
 from ambid.recursive.square_root import covariance_of, factors_of
 from ambid.track import rpem_kernels as kernels
 from ambid.track.evidence import Evidence, EvidenceSum
+from ambid.track.rpem import ParameterFilter
 
 P = 7
 
@@ -72,9 +73,11 @@ def test_a_positive_number_loses_at_most_half_and_the_covariance_is_that_of_the_
 def test_walk_lets_active_numbers_walk():
     rng = np.random.default_rng(4)
     covariance, rates, active = spd(rng), rng.uniform(size=P), rng.uniform(size=P) > 0.4
-    F = factors_of(covariance)
-    kernels.walk(F, rates, active, 0.3, np.empty(P))
-    np.testing.assert_allclose(covariance_of(F), covariance + np.diag(0.3 * rates * active), rtol=1e-12, atol=1e-14)
+    found = ParameterFilter(np.zeros(P), covariance)
+    found.active = active
+    found.walk(rates, 0.3)
+    np.testing.assert_allclose(found.covariance, covariance + np.diag(0.3 * rates * active), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(found.sd, np.sqrt(np.diag(found.covariance)), rtol=1e-12)
 
 
 def test_fold_keeps_the_normal_equations():
@@ -108,12 +111,12 @@ def test_far_is_what_it_says():
     rng = np.random.default_rng(8)
     J, q, at = np.triu(rng.normal(size=(P, P))), rng.normal(size=P), rng.normal(size=P)
     covariance, never = spd(rng), np.full(P, np.inf)
-    F, length, sd = factors_of(covariance), np.sum((J @ (q - at)) ** 2), np.sqrt(np.diag(covariance))
-    assert not kernels.far(q, at, J, F, never, 1.01 * length)
-    assert kernels.far(q, at, J, F, never, 0.99 * length)
+    found, length, sd = ParameterFilter(q, covariance), np.sum((J @ (q - at)) ** 2), np.sqrt(np.diag(covariance))
+    assert not found.far(at, J, never, 1.01 * length)
+    assert found.far(at, J, never, 0.99 * length)
     just = (q - at) ** 2 / sd
-    assert not kernels.far(q, at, J, F, 1.01 * just, np.inf)
-    assert kernels.far(q, at, J, F, np.where(np.arange(P) == 4, 0.99, 1.01) * just, np.inf)
+    assert not found.far(at, J, 1.01 * just, np.inf)
+    assert found.far(at, J, np.where(np.arange(P) == 4, 0.99, 1.01) * just, np.inf)
 
 
 def likelihood(J, r, at, q, covariance, variance, noise):
@@ -129,26 +132,18 @@ def likelihood(J, r, at, q, covariance, variance, noise):
 
 
 @pytest.mark.parametrize("first", [0, 5])
-def test_walk_score_is_the_slope_of_the_exact_likelihood(first):
+def test_the_walk_score_is_the_slope_of_the_exact_likelihood(first):
     rng = np.random.default_rng(9)
     count, p, noise = 9, 4, 1.3
     J = np.array([np.triu(rng.normal(size=(p, p))) for _ in range(count)])
     r, at = rng.normal(size=(count, p)), rng.normal(size=(count, p))
     q, covariance, variance = rng.normal(size=p), spd(rng, p), rng.uniform(0.05, 0.5, p)
     ring = np.roll(np.arange(count), -first)
-    squares, powers, end, known = kernels.walk_score(
-        J,
-        r,
-        at,
-        count,
-        first,
-        q,
-        covariance,
-        np.sqrt(variance),
-        noise,
-        np.empty((count, p, p)),
-        np.empty((count, p, 2)),
-    )
+    end, known, found = q.copy(), covariance.copy(), np.empty((4, p))
+    K, N = np.empty((count, p, p + 2)), np.empty((p, p))
+    kernels.filter_ring(J, r, at, count, first, end, known, np.sqrt(variance), noise, K)
+    kernels.smooth_ring(J, count, first, K, found, N)
+    squares, powers = found[:2]
     slope = np.empty(p)
     for j in range(p):
         h = 1e-5 * np.eye(p)[j]

@@ -7,6 +7,8 @@ root (Bierman 1977, ch. III, V and VI). Functions that take fewer than n numbers
 
 from __future__ import annotations
 
+from math import sqrt
+
 from ambid.arrays import Array
 from ambid.compiled import compiled
 
@@ -37,6 +39,13 @@ def variance(F: Array, i: int) -> float:
     for j in range(i + 1, F.shape[0]):
         total += F[j, j] * F[j, i] * F[j, i]
     return float(total)
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def deviations(F: Array, sd: Array) -> None:
+    """Fill sd with the standard deviations of all states."""
+    for i in range(sd.size):
+        sd[i] = sqrt(variance(F, i))
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
@@ -81,6 +90,17 @@ def widen(F: Array, a: Array, q: float) -> None:
             for i in range(j):
                 F[j, i] = a[i] / x
             return
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def walk(F: Array, q: Array, a: Array) -> None:
+    """Let states walk at random: the variance of each grows by that in q (n,); `a` (n,) is scratch."""
+    for i in range(q.size):
+        if q[i] > 0.0:
+            for j in range(i):
+                a[j] = 0.0
+            a[i] = 1.0
+            widen(F, a[: i + 1], q[i])
 
 
 @compiled(error_model="numpy", fastmath={"contract"})

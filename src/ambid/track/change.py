@@ -27,6 +27,7 @@ _INDEPENDENT = 0.7
 _PASSED = 0.03  # share of quiet statistics above the point by which overdispersion is learned, as in the kernels
 _GAIN, _NOISE_GAIN = 0.002, 2e-4  # per test, per block: of learning overdispersion and noise level
 _TESTS: dict[int, tuple[Literal["number", "all", "noise"], int]] = {1: ("number", 0), 2: ("all", -2), 3: ("noise", -1)}
+_RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
 _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
 
 
@@ -129,15 +130,16 @@ class ChangeDetector:
         self._marks = _marks(tests, p, min(false_alarms_per_hour / hourly, 0.01))
         self.threshold = float(self._marks[0, 0])
         self._tested = np.array([self.names.index(h) for h in self.hypotheses], dtype=np.int64)
-        self._bases, self._notes = np.zeros((levels, 4, p, p + 1)), np.zeros((levels, 4, 4))
+        self._bases, self._notes = np.zeros((4 * levels, p, p + 1)), np.zeros((4 * levels, 4))
         self._counts, self._blocks, self._point = np.zeros(levels, dtype=np.int64), 0, np.zeros(p)
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
         self._drift = np.zeros(p)
         self.drift = self._drift if drift is None else drift
-        self._state = np.array([math.log(overdispersion), 0.0, _GAIN, _NOISE_GAIN, float(longest), 1.0])
+        self.noise, self._longest = overdispersion, longest
+        self._wait = 0  # blocks until statistics are quiet again
         self._scratch = np.zeros((p, p + 1)), np.zeros((p + 1, p)), np.zeros((p, p)), np.zeros((p, p + 1))
-        self._now, self._found, self._result = np.zeros(tests), np.zeros(10), np.zeros(10 + tests)
+        self._found = np.zeros((len(lengths), 10 + tests))
         self._settle, self._seen, self._from = round(settle_s / block_s), 0, -1
 
     @property
@@ -151,14 +153,6 @@ class ChangeDetector:
     @drift.setter
     def drift(self, value: ArrayLike) -> None:
         self._drift[:] = value
-
-    @property
-    def noise(self) -> float:  # noqa: D102
-        return math.exp(self._state[0])
-
-    @noise.setter
-    def noise(self, value: float) -> None:
-        self._state[0] = math.log(value)
 
     def update(self, evidence: Evidence, estimate: Array, covariance: Array) -> Alarm | None:
         """Take in one block.
@@ -176,10 +170,10 @@ class ChangeDetector:
         if not self._blocks:
             self._point = evidence.at
         slot = self._counts[0] % 4
-        base, before = self._bases[0, slot], self._history[self._blocks % len(self._history)]
+        base, before = self._bases[slot], self._history[self._blocks % len(self._history)]
         base[:, :p], base[:, p] = evidence.J, evidence.residual(self._point)
         before[:, :p], before[:, p] = covariance, estimate - self._point
-        note = self._notes[0, slot]
+        note = self._notes[slot]
         note[:] = evidence.rest, evidence.freedom, evidence.first, self._blocks
         if not math.isfinite(base.sum() + before.sum() + note[0]):
             raise EstimationError(
@@ -187,14 +181,28 @@ class ChangeDetector:
             )
         self._counts[0] += 1
         self._blocks += 1
-        if self._seen <= self._settle:
-            self._learn_fast()
-        result = self._result
-        watch(
+        settling, calm = self._seen < self._settle, self._wait <= 0
+        self._seen += 1
+        self._found[:, 0] = 0.0
+        passed = watch(
             self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._tested,
-            self._drift, self._state, self._scratch, self._now, self._found, result,
+            self._drift, self._longest, (-1.0 if settling else _GAIN) if calm else 0.0, self.noise, *self._scratch,
+            self._found,
         )  # fmt: skip
-        return self._alarm(evidence.last) if result[0] else None
+        if passed and not settling:
+            self._wait = self._longest
+            return self._alarm(evidence.last)
+        if not calm:
+            self._wait -= 1
+        elif evidence.freedom:
+            self._follow_noise(evidence, settling=settling)
+        return None
+
+    def _follow_noise(self, evidence: Evidence, *, settling: bool) -> None:
+        """Follow the median of the unexplained part in small steps, in larger ones while settling."""
+        gain = max(1.0 / (self._seen + _SETTLE_NOISE), _NOISE_GAIN) if settling else _NOISE_GAIN
+        middle = self.noise * (1.0 - 2.0 / (9.0 * evidence.freedom)) ** 3
+        self.noise *= math.exp(gain if evidence.rest / evidence.freedom > middle else -gain)
 
     def restart(self, from_sample: int) -> None:
         """Forget all windows, as after a change that was handled; what was learned of quiet times stays.
@@ -202,23 +210,32 @@ class ChangeDetector:
         `from_sample`: blocks that begin before it are not looked at.
         """
         self._counts[:], self._blocks = 0, 0
-        self._state[1] = 0.0
+        self._wait = 0
         self._from = from_sample
 
-    def _learn_fast(self) -> None:
-        """Learn fast while settling, and slowly from its end on."""
-        self._seen += 1
-        settling = self._seen <= self._settle
-        self._state[3] = max(1.0 / (self._seen + _SETTLE_NOISE), _NOISE_GAIN) if settling else _NOISE_GAIN
-        self._state[5] = 0.0 if settling else 1.0
+    def _kind(self, row: Array) -> int:
+        """Which test an alarm comes from: 1 of one number, 2 of all together, 3 of what no number explains."""
+        (one, joint, rest), (top, together, left, noise) = self._marks[0, [0, -2, -1]], row[[4, 7, 8, 9]]
+        if top <= one:
+            return 2 if together > joint else 3
+        # the one number stands for the change if what it leaves is chance or less than what it explains; where the
+        # unexplained part rose as well, this is the transient of a change, or none that it could name
+        clean = left <= rest or noise < _RAISED
+        return 1 if clean and together - top < max(joint, top) else 2
+
+    def _order(self, row: Array) -> float:
+        """How much a window shows: one that names a number comes before one that cannot."""
+        one, joint, rest = self._marks[0, [0, -2, -1]]
+        return float(row[4] / one + 1e9 if self._kind(row) == 1 else max(row[7] / joint, row[8] / rest))
 
     def _alarm(self, end: int) -> Alarm:
-        """Put the result of the compiled test into words."""
-        code, n, onset, best, top, size, sd, joint, rest, noise = (float(v) for v in self._result[:10])
-        ranked = sorted(zip(self.hypotheses, self._result[10:].tolist(), strict=False), key=lambda item: -item[1])
-        moved = code == 1.0
+        """Put the window that shows most into words."""
+        row = max(self._found[self._found[:, 0] > 0.0], key=self._order)
+        code, (n, onset, best, top, size, sd, joint, rest, noise) = self._kind(row), row[1:10].tolist()
+        ranked = sorted(zip(self.hypotheses, row[10:].tolist(), strict=False), key=lambda item: -item[1])
+        moved = code == 1
         others = tuple((name, value) for name, value in ranked if not moved or name != self.hypotheses[int(best)])
-        by, place = _TESTS[int(code)]
+        by, place = _TESTS[code]
         return Alarm(
             kind="moved" if moved else "unexplained",
             by=by,

@@ -266,20 +266,30 @@ class EvidenceStream:
         # a lag before now belongs to delays below zero, which no predictor has: its columns are zero
         self._lags = np.array([max(problem.delay + lag, 0) for lag in problem.lags], dtype=np.int64)
         self._history = np.zeros((int(self._lags.max()) + 1, n_u))
-        self._x, self._s = np.zeros(n), np.zeros((n, p))
+        self._s = np.zeros((n, p + 1))  # sensitivities, and in the last column the state
         self._rows = np.zeros((p + 1, min(block, _ROOM) * n_y))
         self._triangle = np.zeros((p + 1, p + 1))
         self._counts = np.zeros(6, dtype=np.int64)
         self._counts[4] = block
         self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
-        self._W = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(numbers.innovation_covariance)))
-        self._H, self._fresh = self._W @ at.C, True
+        root = np.linalg.cholesky(numbers.innovation_covariance)
+        self._W, self.unit = np.linalg.inv(root), root.T * problem.scales.output
+        self._M, self._fresh = self._stacked(at), True
+        self._scratch = np.zeros(self._M.shape[1]), np.zeros((n + n_y, p + 1))
         self.latest: Evidence | None = None
+
+    def _stacked(self, at: Linearisation) -> Array:
+        """Return what gives the next state and, below it, the weighted innovations, shape (n + n_outputs, n_l)."""
+        n, (n_y, _) = at.C.shape[1], self._W.shape
+        first = n + self._lags.size * self.numbers.problem.u.shape[1]
+        errors = np.zeros((n_y, at.M.shape[1]))
+        errors[:, :n], errors[:, first : first + n_y] = -self._W @ at.C, self._W
+        return np.vstack([at.M, errors])
 
     def relinearise(self, at: Linearisation) -> None:
         """Go on with the predictor of another point; the state moves along to first order."""
-        self._x += self._s @ (at.at - self.at.at)
-        self.at, self._H = at, self._W @ at.C
+        self._s[:, -1] += self._s[:, :-1] @ (at.at - self.at.at)
+        self.at, self._M = at, self._stacked(at)
 
     def restart(self, sample: int) -> None:
         """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is
@@ -305,7 +315,8 @@ class EvidenceStream:
         """Take samples until a block is complete, they are used up, or one is not finite.
 
         Returns `used`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
-        (used, n_outputs), innovations in scaled output units; `evidence`: of the block that these samples complete.
+        (used, n_outputs), weighted innovations, which `unit` (n_outputs, n_outputs) brings to SI; `evidence`: of the
+        block that these samples complete.
         """
         u, y = samples.u, samples.y
         if self._fresh and y.shape[0]:
@@ -313,8 +324,8 @@ class EvidenceStream:
         errors = np.empty_like(y)
         forcing = self._nothing_like(y.shape[0]) if samples.forcing is None else samples.forcing
         used = advance(
-            u, y, forcing, self.at.M, self.at.D, self.at.C, self._H, self._W, self._scale, self._lags, self._history,
-            self._x, self._s, self._rows, self._triangle, self._counts, errors,
+            u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
+            self._triangle, self._counts, errors, *self._scratch,
         )  # fmt: skip
         self.sample += used
         return used, errors[:used], self._evidence() if self._counts[2] == self._counts[4] else None
@@ -347,15 +358,15 @@ class EvidenceStream:
         self._history[:] = (u[0] - self._scale[0, :n_u]) / self._scale[1, :n_u]
         measured = (y[0] - self._scale[0, n_u:]) / self._scale[1, n_u:]
         # outputs are states in scaled units of their own: C picks and scales them
+        self._s[:] = 0.0
         for j, state in enumerate(model.states):
             row = outputs.index(state) if state in outputs else -1
-            self._x[j] = measured[row] / self.at.C[row, j] if row >= 0 else 0.0
-        self._s[:] = 0.0
+            self._s[j, -1] = measured[row] / self.at.C[row, j] if row >= 0 else 0.0
         self._counts[3] = self.settling_samples
         self._fresh = False
 
     def _evidence(self) -> Evidence:
-        p, n_y = self._s.shape[1], self._W.shape[0]
+        p, n_y = self._s.shape[1] - 1, self._W.shape[0]
         found = Evidence(
             names=self.numbers.names,
             at=self.at.at,

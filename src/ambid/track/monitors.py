@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.recursive.lines import Event
+from ambid.recursive.square_root_kernels import deviations
 from ambid.track.evidence import Evidence
-from ambid.track.rpem_kernels import fold
-from ambid.track.supervise_kernels import deviations
+from ambid.track.rpem_kernels import absorb, fold
 
 
 class ErrorLevel:
@@ -132,7 +132,9 @@ class ExcitationMonitor:
         self._keep = math.sqrt(self._decay)
         self.duration_s = 0.0
         self._R, self._rows = np.zeros((p, p)), np.zeros((p, p))
-        self._scratch = np.zeros((p, p)), np.zeros((2, p))
+        # the ridge stands for what would be known otherwise, with all numbers free to move
+        self._ridge, self._F, self._none = np.eye(p) / _RIDGE**2, np.empty((p, p)), np.zeros(p)
+        self._scratch = np.ones(p, dtype=np.bool_), np.zeros(p, dtype=np.bool_), 1.0, np.zeros((p + 2, p))
         self._fresh = np.ones(p, dtype=np.bool_)
         self._known, self._rate = self._limits[1]
         self.sd = np.full(p, 1.0 / _RIDGE)
@@ -157,7 +159,9 @@ class ExcitationMonitor:
         self._R *= self._keep
         self._R[np.abs(self._R) < _NOTHING] = 0.0
         fold(self._R, self._rows, len(self.names), 1)
-        deviations(self._R, _RIDGE, *self._scratch, self.sd)
+        self._F[:] = self._ridge
+        absorb(self._none, self._F, self._R, self._none, self._none, *self._scratch)
+        deviations(self._F, self.sd)
         self.duration_s = duration
         if duration < _FILLED * self._window:
             return ()

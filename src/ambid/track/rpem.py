@@ -23,10 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
-from ambid.recursive.square_root import covariance_of, factors_of, root_of_factors
+from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.square_root_kernels import deviations, walk
 from ambid.track.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
 from ambid.track.numbers import TrackedNumbers, tracked_numbers
-from ambid.track.rpem_kernels import absorb, far, walk, walk_score
+from ambid.track.rpem_kernels import absorb, filter_ring, smooth_ring
 
 Flags = NDArray[np.bool_]
 
@@ -56,15 +57,16 @@ class ParameterFilter:
     @property
     def sd(self) -> Array:
         """Standard deviations of `q`, shape (p,)."""
-        half = root_of_factors(self._F)
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", half, half)))
+        sd = np.empty(self.q.size)
+        deviations(self._F, sd)
+        return sd
 
     def walk(self, variance: Array, time: float = 1.0) -> None:
         """Let the active numbers walk.
 
         `variance`: (p,), of the walks, per second; `time`: s.
         """
-        walk(self._F, variance, self.active, time, self._scratch[0])
+        walk(self._F, np.where(self.active, time * variance, 0.0), self._scratch[0])
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
         """Take in a block's evidence.
@@ -84,13 +86,15 @@ class ParameterFilter:
         `at`: (p,); `J`: (p, p), upper triangle of a block's evidence; `curved`: (p,), squared moves over standard
         deviations that are too much; `most`: |J (q - at)|^2 that is too much.
         """
-        return bool(far(self.q, at, J, self._F, curved, most))
+        move = self.q - at
+        length = J @ move
+        return bool(length @ length > most or (move * move > curved * self.sd).any())
 
     def widen(self, place: int, sd: float) -> None:
         """Forget what is known of one number, but not the others: it may have moved by about `sd`."""
         variance = np.zeros(self.q.size)
         variance[place] = sd * sd
-        walk(self._F, variance, np.ones_like(self.active), 1.0, self._scratch[0])
+        walk(self._F, variance, self._scratch[0])
 
     def set(self, q: Array, covariance: Array) -> None:
         """Go on from other numbers.
@@ -141,7 +145,7 @@ class DriftRates:
         room = _WINDOW if self.adapts else 0
         self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
         self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
-        self._scratch = np.zeros((room, p, p)), np.zeros((room, p, 2))
+        self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
 
@@ -214,11 +218,11 @@ class DriftRates:
     def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
         first = (self._next - count) % _WINDOW
-        found: tuple[Array, Array, Array, Array] = walk_score(
-            self._J, self._r, self._at, count, first, self._q[first], self._P[first], step, noise,
-            *self._scratch,
-        )  # fmt: skip
-        return found
+        q, P, (K, N) = self._q[first].copy(), self._P[first].copy(), self._scratch
+        found = np.empty((4, q.size))
+        filter_ring(self._J, self._r, self._at, count, first, q, P, step, noise, K)
+        smooth_ring(self._J, count, first, K, found, N)
+        return found[0], found[1], q, P
 
 
 Memory = float | Literal["auto", "all"]
@@ -319,7 +323,6 @@ class PhysicalRpem(PhysicalEstimator):
         self.n_linearised = self.n_unreached = 0
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
-        self._unit = numbers.problem.scales.output
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
@@ -358,7 +361,7 @@ class PhysicalRpem(PhysicalEstimator):
                 self.n_rejected += 1
                 k += 1
                 self.stream.restart(self.stream.sample + 1)
-        errors *= self._unit
+        errors @= self.stream.unit
         return errors.reshape(np.shape(outputs))
 
     def _one(self, samples: Samples) -> Array:
@@ -371,7 +374,7 @@ class PhysicalRpem(PhysicalEstimator):
             self.n_rejected += 1
             self.stream.restart(self.stream.sample + 1)
             return np.full(samples.y.shape, np.nan)
-        return errors * self._unit
+        return errors @ self.stream.unit
 
     def take(self, evidence: Evidence) -> None:
         """Take in the evidence of a block.

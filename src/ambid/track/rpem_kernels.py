@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.square_root_kernels import project, shrink, variance, widen
+from ambid.recursive.square_root_kernels import project, shrink, widen
 
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -24,101 +24,78 @@ _MOST = 0.5  # part of a positive number by which one block may lower it
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
+def _step(M: Array, D: Array, s: Array, w: Array, f: Array) -> None:
+    """Fill f with what w makes of state, sensitivities and weighted innovations; see `advance`."""
+    (n_x, width), high = s.shape, f.shape[0]
+    for i in range(high):
+        for q in range(width):
+            f[i, q] = M[i, 0] * s[0, q]
+        for j in range(1, n_x):
+            v = M[i, j]
+            for q in range(width):
+                f[i, q] += v * s[j, q]
+    for c in range(w.size):
+        v = w[c]
+        for i in range(n_x):
+            for q in range(width - 1):
+                f[i, q] += v * D[c, i, q]
+        if c >= n_x:
+            for i in range(high):
+                f[i, width - 1] += v * M[i, c]
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
 def advance(
-    u: Array,
-    y: Array,
-    forcing: Array,
-    M: Array,
-    D: Array,
-    C: Array,
-    H: Array,
-    W: Array,
-    scale: Array,
-    lags: Integers,
-    history: Array,
-    x: Array,
-    s: Array,
-    rows: Array,
-    triangle: Array,
-    counts: Integers,
-    errors: Array,
-) -> int:
+    u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array, s: Array,
+    rows: Array, triangle: Array, counts: Integers, errors: Array, w: Array, f: Array,
+) -> int:  # fmt: skip
     """Run until a block is complete, samples are used up, or one is not finite; return how many were used.
 
-    `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `errors` (n_samples, n_y) gets
-    innovations in scaled units, `W` weights them, and `H` is W C. `rows` (p + 1, room) holds rows that are not folded
-    yet. `counts`: place of the next input in `history`, rows and samples of the present block, samples still to settle,
-    samples of a block.
+    `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `M` (n_x + n_y, n_l) gives the next
+    state and the weighted innovations, `s` (n_x, p + 1) holds the sensitivities and in its last column the state.
+    `errors` (n_samples, n_y) gets the weighted innovations. `rows` (p + 1, room) holds rows that are not folded yet.
+    `counts`: place of the next input in `history`, rows and samples of the present block, samples still to settle,
+    samples of a block. `w` (n_l,) and `f` (n_x + n_y, p + 1) are scratch.
     """
-    (n_x, n_l), (n_u, n_y), p = M.shape, (u.shape[1], y.shape[1]), s.shape[1]
+    n_x, n_u, n_y, p = s.shape[0], u.shape[1], y.shape[1], s.shape[1] - 1
     depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
-    w, f, first_y = np.empty(n_l), np.empty((n_x, p)), n_x + lags.size * n_u
     for k in range(y.shape[0]):
-        now, finite = counts[0], True
+        now, column, total = counts[0], n_x, 0.0
         for j in range(n_u):
             history[now, j] = (u[k, j] - scale[0, j]) / scale[1, j]
-            finite = finite and math.isfinite(u[k, j])
-        for j in range(n_y):
-            w[first_y + j] = (y[k, j] - scale[0, n_u + j]) / scale[1, n_u + j]
-            finite = finite and math.isfinite(y[k, j])
-        w[first_y + n_y] = 1.0
-        for j in range(n_f):
-            w[first_y + n_y + 1 + j] = forcing[k, j]
-            finite = finite and math.isfinite(forcing[k, j])
-        if not finite:
-            return k
-        column = n_x
+            total += u[k, j]
         for lag in lags:
-            at = (now - lag) % depth
             for j in range(n_u):
-                w[column] = history[at, j]
+                w[column] = history[(now - lag) % depth, j]
                 column += 1
-        for j in range(n_x):
-            w[j] = x[j]
+        for j in range(n_y):
+            w[column] = (y[k, j] - scale[0, n_u + j]) / scale[1, n_u + j]
+            total += y[k, j]
+            column += 1
+        w[column] = 1.0
+        for j in range(n_f):
+            w[column + 1 + j] = forcing[k, j]
+            total += forcing[k, j]
+        if not math.isfinite(total):
+            return k
         counts[0] = (now + 1) % depth
+        for j in range(n_x):
+            w[j] = s[j, p]
+        _step(M, D, s, w, f)
+        r, settled = counts[1], counts[3] == 0
         for i in range(n_y):
-            v = w[first_y + i]
-            for j in range(n_x):
-                v -= C[i, j] * x[j]
-            errors[k, i] = v
-        if counts[3] > 0:
-            counts[3] -= 1
-        else:
-            r = counts[1]
-            for i in range(n_y):
-                for q in range(p):
-                    v = 0.0
-                    for j in range(n_x):
-                        v -= H[i, j] * s[j, q]
-                    rows[q, r + i] = v
-                v = 0.0
-                for j in range(n_y):
-                    v += W[i, j] * errors[k, j]
-                rows[p, r + i] = v
+            errors[k, i] = f[n_x + i, p]
+            if settled:
+                for q in range(p + 1):
+                    rows[q, r + i] = f[n_x + i, q]
+        for i in range(n_x):
+            for q in range(p + 1):
+                s[i, q] = f[i, q]
+        if settled:
             counts[1] = r + n_y
             counts[2] += 1
-        # next state and sensitivities
-        for i in range(n_x):
-            for q in range(p):
-                f[i, q] = 0.0
-        for c in range(n_l):
-            v = w[c]
-            for i in range(n_x):
-                for q in range(p):
-                    f[i, q] += v * D[c, i, q]
-        for i in range(n_x):
-            for j in range(n_x):
-                v = M[i, j]
-                for q in range(p):
-                    f[i, q] += v * s[j, q]
-        for i in range(n_x):
-            for q in range(p):
-                s[i, q] = f[i, q]
-        for i in range(n_x):
-            v = 0.0
-            for c in range(n_l):
-                v += M[i, c] * w[c]
-            x[i] = v
+        else:
+            counts[3] -= 1
         if counts[1] + n_y > room or counts[2] == counts[4]:
             fold(triangle, rows, counts[1], counts[1])
             counts[1] = 0
@@ -201,61 +178,32 @@ def absorb(
     return total, part
 
 
-@compiled(error_model="numpy")
-def walk(F: Array, rates: Array, active: Flags, time: float, f: Array) -> None:
-    """Let the active numbers walk: their variances grow by time x rates; `f` (p,) is scratch."""
-    for j in range(rates.size):
-        if active[j] and rates[j] > 0.0:
-            for i in range(f.size):
-                f[i] = 1.0 if i == j else 0.0
-            widen(F, f, time * rates[j])
-
-
-@compiled(error_model="numpy")
-def far(q: Array, at: Array, J: Array, F: Array, curved: Array, most: float) -> bool:
-    """Return whether |J (q - at)|^2 passes `most`, or a squared move its standard deviation times `curved`."""
-    p, total = q.size, 0.0
-    for a in range(p):
-        v = 0.0
-        for k in range(a, p):
-            v += J[a, k] * (q[k] - at[k])
-        total += v * v
-        if (q[a] - at[a]) ** 2 > curved[a] * math.sqrt(variance(F, a)):
-            return True
-    return total > most
-
-
 @compiled(error_model="numpy", fastmath={"contract"})
-def walk_score(
-    J: Array, r: Array, at: Array, count: int, first: int, q0: Array, P0: Array, step: Array, noise: float,
-    K: Array, errors: Array,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return sums of lambda_j^2 and N_jj over a ring of `count` blocks, and estimate and covariance after the last.
+def filter_ring(
+    J: Array, r: Array, at: Array, count: int, first: int, q: Array, P: Array, step: Array, noise: float, K: Array
+) -> None:
+    """Take `q` (p,) and `P` (p, p) from before a ring of `count` blocks to behind it.
 
-    The difference of the sums is twice the score.
-
-    Kalman filter forward over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from
-    one block to the next; then the disturbance smoother backward (Koopman and Shephard 1992; Durbin and Koopman 2012,
-    sec. 4.5 and 6.4). J (size, p, p) upper triangular; `K` (size, p, p) and `errors` (size, p, 2) are scratch. Inner
+    Kalman filter over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from one block
+    to the next. J (size, p, p) upper triangular; `K` (size, p, p + 2) keeps gains, residuals and their variances. Inner
     loops run along rows of symmetric matrices: they take no sums, so that vector instructions fit.
     """
-    size, p = J.shape[0], J.shape[1]
-    q, P = q0.copy(), P0.copy()
+    size, p = r.shape
     for b in range(count):
         block = (first + b) % size
         for i in range(p):
             z, g = J[block, i], K[b, i]
             v, F = r[block, i], noise
-            for a in range(i, p):
-                v += z[a] * (q[a] - at[block, a])
-            g[:] = 0.0
-            for c in range(i, p):
+            for a in range(p):
+                g[a] = z[i] * P[i, a]
+            for c in range(i + 1, p):
                 w = z[c]
                 for a in range(p):
                     g[a] += w * P[c, a]
             for a in range(i, p):
+                v += z[a] * (q[a] - at[block, a])
                 F += g[a] * z[a]
-            errors[b, i, 0], errors[b, i, 1] = v, F
+            g[p], g[p + 1] = v, F
             for a in range(p):
                 w = g[a] / F
                 q[a] -= w * v
@@ -264,8 +212,20 @@ def walk_score(
         if b < count - 1:
             for a in range(p):
                 P[a, a] += step[a] * step[a]
-    lam, N, drop = np.zeros(p), np.zeros((p, p)), np.zeros(p)
-    squares, powers = np.zeros(p), np.zeros(p)
+
+
+@compiled(error_model="numpy", fastmath={"contract"})
+def smooth_ring(J: Array, count: int, first: int, K: Array, found: Array, N: Array) -> None:
+    """Fill the first rows of `found` (4, p) with the sums of lambda_j^2 and of N_jj, twice the score their difference.
+
+    Disturbance smoother backward over what `filter_ring` kept (Koopman and Shephard 1992; Durbin and Koopman 2012, sec.
+    4.5 and 6.4). `N` (p, p) is scratch.
+    """
+    size, p, squares, powers, lam, drop = J.shape[0], J.shape[1], found[0], found[1], found[2], found[3]
+    for a in range(p):
+        squares[a] = powers[a] = lam[a] = 0.0
+        for c in range(p):
+            N[a, c] = 0.0
     for b in range(count - 1, -1, -1):
         block = (first + b) % size
         if b < count - 1:
@@ -273,27 +233,23 @@ def walk_score(
                 squares[a] += lam[a] * lam[a]
                 powers[a] += N[a, a]
         for i in range(p - 1, -1, -1):
-            z, g, v, F = J[block, i], K[b, i], errors[b, i, 0], errors[b, i, 1]
+            z, g = J[block, i], K[b, i]
             # L = I - K z / F:  lambda <- -z error / F + L^T lambda,  N <- z z^T / F + L^T N L
-            dot, twice = v, 0.0
-            drop[:] = 0.0
+            F, dot, twice = g[p + 1], g[p], 0.0
+            for a in range(p):
+                drop[a] = 0.0
             for c in range(p):
-                w = g[c]
-                dot += w * lam[c]
+                w = g[c] / F
+                dot += g[c] * lam[c]
                 for a in range(p):
                     drop[a] += w * N[c, a]
             for a in range(p):
                 twice += g[a] * drop[a]
-            twice = (1.0 + twice / F) / F
+            twice = (1.0 + twice) / F
             for a in range(p):
-                drop[a] /= F
-            for a in range(i, p):
-                w = z[a]
+                w = z[a] if a >= i else 0.0
                 lam[a] -= w * dot / F
                 for c in range(p):
-                    N[a, c] += w * (z[c] * twice - drop[c]) if c >= i else -w * drop[c]
-            for a in range(p):
-                w = drop[a]
+                    N[a, c] -= w * drop[c]
                 for c in range(i, p):
-                    N[a, c] -= w * z[c]
-    return squares, powers, q, P
+                    N[a, c] += (w * twice - drop[a]) * z[c]
