@@ -70,16 +70,14 @@ def test_several_records_to_files_and_table(at, ambid) -> None:
     assert again["checks"] == document["validation"]["checks"]
 
 
-def test_the_rig_says_what_is_known(at, ambid) -> None:
+def test_the_rig_says_what_is_known_and_the_options_change_it(at, ambid) -> None:
     words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--to", "0.7", "--json", "-")
     of_rig = json.loads(ambid(*words, "--report", at / "ball.html").out)
     assert (at / "ball.html").read_text(encoding="utf-8").count("data:image/png") == 3
     assert of_rig["law"]["gap"] == "hyperbolic"
     assert of_rig["parameters"]["s"]["role"] == of_rig["parameters"]["m"]["role"] == "fixed"
     assert of_rig["delay"]["voltage"]["how"] == "given"
-    more = RIG.replace("[magnet]\n", "[magnet]\neddy = true\ndrift = true\n")
-    (at / "changed.toml").write_text(more, encoding="utf-8")
-    changed = json.loads(ambid(*words, "--rig", at / "changed.toml").out)
+    changed = json.loads(ambid(*words, "--eddy", "--drift").out)
     assert changed["law"]["eddy"]
     assert changed["law"]["drift"]
     assert changed["parameters"]["a"]["unit"] == "rad/s"
@@ -91,7 +89,11 @@ def test_the_rig_says_what_is_known(at, ambid) -> None:
     [
         (("r1.csv", "r2.csv"), "2 records are given; the linear model takes one"),
         (("r1.csv", "--held", "r2.csv"), "--held is for the nonlinear magnet"),
-        (("r1.csv", "--nonlinear", "--rig", "exponential.toml"), "a pair has the hyperbolic law"),
+        (("r1.csv", "--magnet", "pair"), "--magnet is for the nonlinear magnet"),
+        (("r1.csv", "--off-below", "0.1"), "--off-below is for the nonlinear magnet"),
+        (("r1.csv", "--nonlinear", "--magnet", "triple"), "'triple' is not one of"),
+        (("r1.csv", "--nonlinear", "--magnet", "pair", "--rig", "exponential.toml"), "a pair has the hyperbolic law"),
+        (("r1.csv", "--nonlinear", "--off-below", "inf"), "--off-below is inf"),
         (("r1.csv", "./r1.csv", "--nonlinear"), "given twice"),
         (("r1.csv", "--nonlinear", "--held", "r1.csv"), "given twice"),
         (("r1.csv", "--nonlinear", "--validate", "fast.csv"), "fast.csv, to judge on, is sampled at 4000 Hz"),
@@ -106,7 +108,7 @@ def test_what_makes_no_sense_is_refused_in_one_line_and_nothing_is_written(at, a
     rigs = {
         "coil": 'model = "coil"',
         "wrong": 'model = "one-axis"\n[magnet.parameters]\nL_leek = { unit = "H" }',
-        "exponential": 'model = "one-axis"\n[magnet]\nkind = "pair"\ngap = "exponential"',
+        "exponential": 'model = "one-axis"\n[magnet]\ngap = "exponential"',
     }
     for name, text in rigs.items():
         (at / f"{name}.toml").write_text(f'schema = "ambid.rig/1"\n{text}\n', encoding="utf-8")
@@ -157,13 +159,12 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
 def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     copy = at / "copy.csv"
     copy.write_bytes(Path("r1.csv").read_bytes())
-    (at / "off.toml").write_text(RIG.replace("[magnet]\n", "[magnet]\noff_below = 1e300\n"), encoding="utf-8")
     words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear")
     for more, said in (
         ((copy,), "r1.csv and copy.csv hold the same samples; they would count twice. Leave one out"),
         (("--held", copy), "r1.csv and copy.csv hold the same samples"),
         (("--validate", copy), "copy.csv, to judge on, holds samples that the estimate is fitted to"),
-        (("--rig", at / "off.toml"), "every voltage is at or below off_below"),
+        (("--off-below", "1e300"), "every voltage is at or below off_below"),
     ):
         found = ambid(*words, *more)
         assert found.code == 2, found.out + found.err

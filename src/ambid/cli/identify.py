@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -30,6 +32,26 @@ def command(
     held: Annotated[
         list[Path] | None,
         option("--held RECORD", "Nonlinear: a record with the rotor held at rest, which shows the coil; repeat."),
+    ] = None,
+    magnet: Annotated[
+        Literal["auto", "single", "pair"] | None,
+        option(
+            "--magnet",
+            "Nonlinear: one magnet, or two that oppose each other; auto looks at the sign of the current.",
+            "as the rig says, or auto",
+        ),
+    ] = None,
+    eddy: Annotated[bool, switch("--eddy", "Nonlinear: the force follows the current with a pole a/(s + a).")] = False,
+    drift: Annotated[
+        bool, switch("--drift", "Nonlinear: let a slowly walking force take up what the law leaves over.")
+    ] = False,
+    off_below: Annotated[
+        float | None,
+        option(
+            "--off-below V",
+            "Nonlinear: at or below this voltage the power stage is off, and the coil's voltage not known.",
+            "as the rig says",
+        ),
     ] = None,
     second: Annotated[Path | None, option("--validate RECORD2", "Judge the estimate on this second record.")] = None,
     from_s: opt.From = None,
@@ -57,20 +79,18 @@ def command(
     from ambid.report.estimate_text import estimate_text
 
     stop, kept = Stop(), tuple(held or ())
+    own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
     with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
         if nonlinear:
+            if off_below is not None and not isfinite(off_below):
+                raise AmbidError(f"--off-below is {off_below}; it is a voltage in V. Give a number")
             opt.refuse_twice([*records, *kept])
         else:
-            refuse_given({"--held": kept}, "{} is for the nonlinear magnet. Give --nonlinear too, or leave {} out")
-            if len(records) > 1:
-                raise AmbidError(
-                    f"{len(records)} records are given; the linear model takes one, since k_x, k_i and L differ from"
-                    " one operating point to the next. Give --nonlinear for one model of all, or one record"
-                )
+            _check_linear(records, {"held": kept, **own})
         with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
             estimate, used = (
-                job.identify_nonlinear_used(records, rig, held=kept, tick=interruptible(show, stop), **how)
+                job.identify_nonlinear_used(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
                 else job.identify_used(records[0], rig, tick=show, **how)
             )
@@ -89,3 +109,16 @@ def command(
         raise typer.Exit(stop.code or INTERRUPTED)
     validated = estimate.validation is None or bool(estimate.validation["passed"])
     end(failed=strict and not (estimate.passed and validated))
+
+
+def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
+    """Refuse what only the nonlinear magnet has."""
+    refuse_given(
+        {f"--{name.replace('_', '-')}": x for name, x in given.items()},
+        "{} is for the nonlinear magnet. Give --nonlinear too, or leave {} out",
+    )
+    if len(records) > 1:
+        raise AmbidError(
+            f"{len(records)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
+            "operating point to the next. Give --nonlinear for one model of all, or one record"
+        )

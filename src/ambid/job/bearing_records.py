@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 
@@ -39,14 +39,32 @@ class TakenRecord:
     start_s: float  # time of its first sample in s
 
 
-def bearing_rig(rig: Rig | str | Path | None) -> Rig:
-    """Return a rig with a `magnet`, of which nothing is known where it says nothing."""
-    bench = known_rig(rig)
+class MagnetWords(TypedDict, total=False):
+    """What a caller says of a nonlinear bearing beside its rig."""
+
+    magnet: Literal["auto", "single", "pair"] | None  # None: as the rig says
+    eddy: bool  # beside what the rig says
+    drift: bool
+    off_below: float | None  # in V; None: as the rig says
+
+
+class BearingWords(MagnetWords, Reading, total=False):
+    """That, and how records are read."""
+
+
+def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> Rig:
+    """Return a rig whose `magnet` is known as it says, but for what is given here."""
+    bench, off_below = known_rig(rig), words.get("off_below")
     if bench.model != "one-axis":
         raise EstimationError(
             f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
         )
-    return replace(bench, magnet=bench.magnet or RigMagnet())
+    known = bench.magnet or RigMagnet()
+    known = replace(
+        known, kind=words.get("magnet") or known.kind, eddy=known.eddy or words.get("eddy", False),
+        drift=known.drift or words.get("drift", False), off_below=known.off_below if off_below is None else off_below,
+    )  # fmt: skip
+    return replace(bench, magnet=known)
 
 
 def numbers_of(rig: Rig) -> dict[str, Parameter]:
@@ -155,10 +173,11 @@ def take_all(
     held: Sequence[Source],
     validate: Source | None,
     rig: Rig,
-    how: Reading,
+    words: BearingWords,
     say: Tick,
 ) -> tuple[tuple[TakenRecord, ...], TakenRecord | None]:
     """Read the records of one identification: those to identify from, and the one to validate on."""
+    how: Reading = {k: words[k] for k in Reading.__annotations__ if k in words}  # type: ignore[assignment, literal-required]
     if not records:
         raise EstimationError("no record, or every one holds the rotor; forces want one in which it moves. Give one")
     taken: list[TakenRecord] = []
@@ -203,7 +222,7 @@ def _refuse_senseless(record: BearingRecord) -> None:
     if np.all(record.loose > 0.0):
         raise EstimationError(
             f"{record.name}: every voltage is at or below off_below, where the stage is off; none would be known. "
-            "Correct magnet.off_below (in V)"
+            "Correct --off-below or magnet.off_below (in V)"
         )
     channels = {"voltage": record.u, "position": record.y[:, 0], "current": record.y[:, 1]}
     if record.held:

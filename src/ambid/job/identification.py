@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.estimation.likelihood import Fit
     from ambid.estimation.parts import Check
-    from ambid.job.bearing_records import TakenRecord
+    from ambid.job.bearing_records import BearingWords, TakenRecord
     from ambid.report.figures import BearingEvidence, Evidence
 
 
@@ -160,7 +160,7 @@ def identify_nonlinear(
     held: Sequence[Source] = (),
     validate: Source | None = None,
     tick: Tick | None = None,
-    **reading: Unpack[Reading],
+    **words: Unpack[BearingWords],
 ) -> NonlinearBearingEstimate:
     """Identify one nonlinear bearing from several records at several operating points at once.
 
@@ -178,8 +178,10 @@ def identify_nonlinear(
         A further record, of a rotor that moves, to validate the estimate on.
     tick : callable, optional
         As `identify`.
-    **reading
-        As `identify`; the part of every record in which the rotor moves.
+    **words
+        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps`` as `identify`, the part of every record in which the rotor moves;
+        ``magnet``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
+        `ambid.job.bearing_records.MagnetWords`.
 
     Returns
     -------
@@ -192,7 +194,7 @@ def identify_nonlinear(
     EstimationError
         If nothing can be identified from the records.
     """
-    return identify_nonlinear_used(records, rig, held=held, validate=validate, tick=tick, **reading)[0]
+    return identify_nonlinear_used(records, rig, held=held, validate=validate, tick=tick, **words)[0]
 
 
 def identify_nonlinear_used(
@@ -202,7 +204,7 @@ def identify_nonlinear_used(
     held: Sequence[Source],
     validate: Source | None,
     tick: Tick | None,
-    **reading: Unpack[Reading],
+    **words: Unpack[BearingWords],
 ) -> tuple[NonlinearBearingEstimate, tuple[TakenRecord, ...]]:
     """Return what `identify_nonlinear` does, and the records as they were used, held ones last."""
     from ambid.bearing.magnet_estimate import estimate_bearing
@@ -211,8 +213,8 @@ def identify_nonlinear_used(
     from ambid.job.bearing_records import bearing_rig, laws_of, numbers_of, take_all
     from ambid.validate.nonlinear_bearing import validation
 
-    say, clock, bench = tick or silent, Clock(), bearing_rig(rig)
-    taken, second = take_all(records, held, validate, bench, reading, say)
+    say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
+    taken, second = take_all(records, held, validate, bench, words, say)
     clock.lap("read")
     assert bench.magnet is not None
     laws, extend = laws_of(bench.magnet, [t.record for t in taken if not t.record.held])
