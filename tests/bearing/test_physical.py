@@ -11,7 +11,7 @@ from ambid.bearing.linear import greybox
 from ambid.bearing.physical import agreement, physical_parameters
 from ambid.bearing.physical_target import physical_response
 from ambid.bearing.uncertainty import uncertainty
-from ambid.blackbox import structures
+from ambid.blackbox import fit as structures
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel

@@ -10,7 +10,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
-from ambid.bearing.rescue import FAR, explained_by_past, look_elsewhere
+from ambid.bearing.rescue import FAR, PAST, look_elsewhere
+from ambid.estimation.criteria import explained_by_past
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.problem import noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -107,7 +108,8 @@ def _unexplained(fit: BearingFit, r: int) -> float:
     assert fit.at is not None
     found = fit.at.innovations[r]
     e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
-    return explained_by_past(e, fit.problem.records[r].u[: e.shape[0], None], _PAST)
+    u = fit.problem.records[r].u[: e.shape[0], None]
+    return explained_by_past([(e, ((e, PAST), (u, _PAST)))])[0]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

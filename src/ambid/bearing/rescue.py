@@ -34,9 +34,9 @@ from ambid.bearing.multistart import (
     fixed_values,
     race,
 )
+from ambid.estimation.criteria import explained_by_past
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.likelihood import Fit, evaluate, search
-from ambid.estimation.linear import least_squares
 from ambid.estimation.problem import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.sensitivity import Workspace, innovations
@@ -45,7 +45,7 @@ from ambid.physics.parameters import Parameter
 
 EVALUATIONS = 1200  # of the likelihood, unless the caller says otherwise: 1 to 2 s, and as much for local searches
 FAR = 0.5  # part of the innovations' variance that a linear regression may explain before a fit counts as failed
-_PAST = 10  # samples of innovations that it looks at
+PAST = 10  # samples of innovations that it looks at
 _INPUTS = FARTHEST + 4  # and of inputs: a delay that was missed shows there
 _LOOKED = 2048  # samples that it looks at
 _BETTER = 0.5  # of the criterion, its numbers paid for (BIC), by which a fit must be better
@@ -79,25 +79,7 @@ def unexplained(fit: Fit) -> float:
         return 1.0
     u = fit.problem.u[fit.problem.skip :]
     at = busiest(u, _LOOKED)
-    return explained_by_past(e[at], u[at], _INPUTS)
-
-
-def explained_by_past(e: Array, u: Array, depth: int) -> float:
-    """Return the part of the variance of `e` that its last samples, and the last `depth` of `u`, explain.
-
-    `e`: (n_samples, n_outputs); `u`: (n_samples, n_inputs); rows with anything that is not finite are left out.
-    """
-    first, n = max(_PAST, depth), e.shape[0]
-    past = [x[first - k : n - k] for x, most in ((e, _PAST), (u, depth)) for k in range(1, most + 1)]
-    Z, E = np.hstack([*past, np.ones((max(n - first, 0), 1))]), e[first:]
-    sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(E), axis=1)
-    Z, E = Z[sound], E[sound]
-    if E.shape[0] < 4 * Z.shape[1]:
-        return 0.0
-    left = E - Z @ least_squares(Z, E)
-    before, after = E.T @ E / E.shape[0], left.T @ left / (E.shape[0] - Z.shape[1])
-    gained = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
-    return 1.0 - float(np.exp(gained / E.shape[1])) if np.isfinite(gained) else 0.0
+    return explained_by_past([(e[at], ((e[at], PAST), (u[at], _INPUTS)))])[0]
 
 
 F = TypeVar("F", Fit, BearingFit)

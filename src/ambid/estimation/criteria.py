@@ -18,16 +18,19 @@ multiplied.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import erfc, exp, inf, lgamma, log, sqrt
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
+from ambid.estimation.linear import least_squares
 
 CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
 EXACT = 1e-26  # part of the output's energy below which nothing is left to explain
 _SKIP = 100  # samples left out at the start, at most a tenth of the record
+_VANISHED = 1e-14  # variance of errors, scaled, below which nothing is left
 _FLOOR = 1e-13  # least error over the size of the output: below is rounding
 
 
@@ -111,3 +114,30 @@ def chi_squared_tail(degrees: int, x: float) -> float:
         return 0.0 if half == inf else 1.0
     terms = (exp((j + shift) * log(half) - half - lgamma(j + shift + 1.0)) for j in range(degrees // 2))
     return min(1.0, sum(terms, erfc(sqrt(half)) if shift else 0.0))
+
+
+def explained_by_past(parts: Sequence[tuple[Array, Sequence[tuple[Array, int]]]]) -> tuple[float, float, int]:
+    """Return what a linear regression on the past makes of errors; little where a search ended well.
+
+    `parts`: by record the errors (n_samples, n_outputs), and signals (n_samples, n) each with how many of its last
+    samples are looked at; rows that are not finite are left out. Returns the part of the variance that it explains,
+    corrected for chance, and chi-squared with its degrees of freedom if the past says nothing; 0 where rows are few.
+    """
+    rows, targets = [], []
+    for e, known in parts:
+        first, n = max(most for _, most in known), e.shape[0]
+        past = [x[first - k : n - k] for x, most in known for k in range(1, most + 1)]
+        rows.append(np.hstack([*past, np.ones((max(n - first, 0), 1))]))
+        targets.append(e[first:])
+    Z, E = np.concatenate(rows), np.concatenate(targets)
+    sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(E), axis=1)
+    Z, E = Z[sound], E[sound]
+    (n, p), k = E.shape, Z.shape[1]
+    if n < 4 * k:
+        return 0.0, 0.0, p * k
+    left = E - Z @ least_squares(Z, E)
+    before, after = (np.linalg.slogdet(x.T @ x / n + _VANISHED * np.eye(p))[1] for x in (E, left))
+    gained, by_chance = float(before - after), -p * log(1.0 - k / n)
+    if not np.isfinite(gained):
+        return 0.0, 0.0, p * k
+    return 1.0 - exp((by_chance - gained) / p), n * gained, p * k

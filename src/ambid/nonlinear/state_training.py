@@ -14,7 +14,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.linear import information_inverse, least_squares
+from ambid.estimation.criteria import explained_by_past
+from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped
@@ -312,25 +313,17 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
     """
     from scipy.stats import chi2
 
-    rows, targets = [], []
     problem = state.problem(data)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = problem.errors(state.vector)[1]
-    for e, (_, u) in zip(errors, problem.parts, strict=True):
-        known = np.hstack([e] * (state.layout.gain or not inputs) + [u[:, :-1]] * inputs)
-        n = e.shape[0]
-        past = [known[_PAST - k : n - k] for k in range(1, _PAST + 1)]
-        rows.append(np.hstack([*past, np.ones((n - _PAST, 1))]))
-        targets.append(e[_PAST:])
-    Z, E = np.concatenate(rows), np.concatenate(targets)
-    if not np.all(np.isfinite(E)):
+    if not all(np.all(np.isfinite(e)) for e in errors):
         return Misfit(share=1.0, p=0.0)
-    left = E - Z @ least_squares(Z, E)
-    n, p, k = *E.shape, Z.shape[1]
-    tiny = 1e-14 * np.eye(p)
-    gained = float(np.linalg.slogdet(E.T @ E / n + tiny)[1] - np.linalg.slogdet(left.T @ left / n + tiny)[1])
-    by_chance = -p * float(np.log(max(1.0 - k / n, 1e-12)))
-    return Misfit(share=1.0 - float(np.exp((by_chance - gained) / p)), p=float(chi2.sf(n * gained, p * k)))
+    parts = [
+        (e, [(e, _PAST)] * (state.layout.gain or not inputs) + [(u[:, :-1], _PAST)] * inputs)
+        for e, (_, u) in zip(errors, problem.parts, strict=True)
+    ]
+    share, statistic, freedom = explained_by_past(parts)
+    return Misfit(share=share, p=float(chi2.sf(statistic, freedom)))
 
 
 # --- standard deviations ---------------------------------------------------------------------------------------------
