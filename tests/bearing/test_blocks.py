@@ -7,47 +7,24 @@ from scipy.linalg import expm
 from ambid.bearing.blocks import block_parameters, three_blocks
 from ambid.errors import EstimationError
 from tests.bearing.benches import run
-
-RATE = 1e4
-TRUTH = np.array([653.5, 1204.0, -30.0, 40.0, 2.0, 15.0])  # K_a, a, K_b, b, K_c, c; the coil of eq. 5.4
+from tests.bearing.block_benches import NOISE, RATE, TRUTH, coefficients, record
 
 
-def _record(seed, *, n=10_000, truth=TRUTH, noise=0.01, gain=0.0):
-    """Blocks in their loop; with `gain`, a controller V = r - gain (position, held) as well."""
-    ka, a, kb, b, kc, c = truth
-    rng = np.random.default_rng(seed)
-    M = np.zeros((4, 4))
-    M[:3, :3] = [[-a, 0, 0], [0, -b, kb], [kc, kc, -c]]
-    M[0, 3] = ka
-    E = expm(M / RATE)
-    r = np.repeat(rng.choice([-1.0, 1.0], n // 40 + 1), 40)[:n]
-    v, y, x = np.empty(n), np.empty((n, 3)), np.zeros(3)
-    e = rng.standard_normal((n, 2)) * noise * np.array([0.4, 0.01])
-    for k in range(n):
-        y[k] = x
-        v[k] = r[k] - gain * (x[2] + e[k, 1])
-        x = E[:3, :3] @ x + E[:3, 3] * v[k]
-    return v + 2.0, y[:, 0] + y[:, 1] + e[:, 0] + 0.2, y[:, 2] + e[:, 1] + 0.01, r
+@pytest.fixture(scope="module")
+def found():
+    """Estimates of a dozen records."""
+    return [three_blocks(*record(seed, 10_000)[:3], RATE, open_loop=True) for seed in range(12)]
 
 
-def _coefficients(found):
-    blocks = found.blocks.values()
-    return (
-        np.array([x for b in blocks for x in (b.gain, b.pole)]),
-        np.array([x for b in blocks for x in (b.gain_sd, b.pole_sd)]),
-    )
-
-
-def test_blocks_and_parameters_with_intervals_that_hold():
+def test_blocks_and_parameters_with_intervals_that_hold(found):
     errors, scores, physical = [], [], []
     wanted = block_parameters(TRUTH)[0]
-    for seed in range(12):
-        found = three_blocks(*_record(seed)[:3], RATE, open_loop=True)
-        assert found.status == "converged"
-        value, sd = _coefficients(found)
+    for one in found:
+        assert one.status == "converged"
+        value, sd = coefficients(one)
         errors.append(value - TRUTH)
         scores.append((value - TRUTH) / sd)
-        physical.append([(p.value - w) / p.sd for p, w in zip(found.parameters.values(), wanted, strict=True)])
+        physical.append([(p.value - w) / p.sd for p, w in zip(one.parameters.values(), wanted, strict=True)])
     errors, scores = np.array(errors), np.array(scores)
     assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(12))
     assert np.mean(np.abs(scores) < 1.96) > 0.87
@@ -55,8 +32,7 @@ def test_blocks_and_parameters_with_intervals_that_hold():
     assert np.all(errors.std(axis=0) < np.abs(TRUTH) * [0.001, 0.001, 0.05, 0.05, 0.002, 0.005])
 
 
-def test_first_order_blocks_are_not_doubted_too_often():
-    found = [three_blocks(*_record(s)[:3], RATE, open_loop=True) for s in range(8)]
+def test_first_order_blocks_are_not_doubted_too_often(found):
     assert sum(bool(f.warnings) for f in found) <= 1
 
 
@@ -82,27 +58,27 @@ def test_a_false_root_of_the_instruments_is_not_taken_for_the_coil(seed):
 def test_a_controller_wants_the_reference():
     scores = []
     for seed in range(6):
-        *record, r = _record(seed, gain=60.0, noise=0.03)
-        found = three_blocks(*record, RATE, reference=r)
+        *columns, r = record(seed, 10_000, gain=60.0, noise=3 * NOISE)
+        found = three_blocks(*columns, RATE, reference=r)
         assert not any("controller" in w for w in found.warnings)
-        value, sd = _coefficients(found)
+        value, sd = coefficients(found)
         scores.append((value - TRUTH) / sd)
     assert np.mean(np.abs(np.array(scores)) < 1.96) > 0.8
-    assert any("--reference" in w for w in three_blocks(*record, RATE).warnings)
+    assert any("--reference" in w for w in three_blocks(*columns, RATE).warnings)
 
 
 def test_a_magnet_that_pulls_away_has_an_unstable_block():
     truth = np.array([653.5, 1204.0, -30.0, 40.0, 2.0, -1.0])  # c < 0, the whole stable through K_b K_c < 0
-    found = three_blocks(*_record(1, truth=truth)[:3], RATE, open_loop=True)
-    value, sd = _coefficients(found)
+    found = three_blocks(*record(1, 10_000, truth=truth)[:3], RATE, open_loop=True)
+    value, sd = coefficients(found)
     np.testing.assert_array_less(np.abs(value - truth), 5 * sd)
     assert value[5] < 0
 
 
-def test_units_do_not_matter():
-    v, i, x, _ = _record(2)
-    one = _coefficients(three_blocks(v, i, x, RATE, open_loop=True))
-    other = _coefficients(three_blocks(v, i, 1e-6 * x, RATE, open_loop=True))
+def test_units_do_not_matter(found):
+    v, i, x, _ = record(2, 10_000)
+    one = coefficients(found[2])
+    other = coefficients(three_blocks(v, i, 1e-6 * x, RATE, open_loop=True))
     turn = np.array([1, 1, 1e6, 1, 1e-6, 1])
     np.testing.assert_allclose(other[0], one[0] * turn, rtol=1e-6)
     np.testing.assert_allclose(other[1], one[1] * turn, rtol=1e-4)
@@ -117,10 +93,10 @@ def test_derivative_of_the_mapping():
 
 
 def test_a_delay_of_the_voltage_is_taken_off():
-    v, i, x, _ = _record(3)
+    v, i, x, _ = record(3, 10_000)
     # the voltage is logged five samples before it reaches the coil
     found = three_blocks(v[5:], i[:-5], x[:-5], RATE, open_loop=True, delay=5)
-    value, sd = _coefficients(found)
+    value, sd = coefficients(found)
     np.testing.assert_array_less(np.abs(value - TRUTH), 5 * sd)
 
 
@@ -134,8 +110,8 @@ def test_a_bearing_is_not_of_first_order_and_the_result_says_so():
     assert any("first order" in w for w in found.warnings)
 
 
-def test_the_limit_is_printed():
-    text = str(three_blocks(*_record(0)[:3], RATE, open_loop=True))
+def test_the_limit_is_printed(found):
+    text = str(found[0])
     assert "mass is normalised" in text
     assert "m s^2" in text
     assert "k_i" in text
@@ -143,7 +119,7 @@ def test_the_limit_is_printed():
 
 
 def test_refusals():
-    v, i, x, _ = _record(0)
+    v, i, x, _ = record(0, 10_000)
     with pytest.raises(EstimationError, match="constant"):
         three_blocks(np.ones(v.size), i, x, RATE)
     with pytest.raises(EstimationError, match="one length"):
