@@ -32,7 +32,7 @@ from ambid.nonlinear.lpv_choice import (
     error_orders,
     wanted_shapes,
 )
-from ambid.nonlinear.lpv_model import BASES, LEVEL, LpvModel, LpvShape, Schedule, looks_back, regressors
+from ambid.nonlinear.lpv_model import LEVEL, LpvModel, LpvShape, Schedule, looks_back, regressors
 from ambid.nonlinear.records import scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, text, whole
 
@@ -58,24 +58,22 @@ class LpvSettings:
     time_constant: float | None = number(
         "of the low-pass of level, in s; chosen, at least five of the plant's own", 0.0, 1e9
     )
-    exciting: str = choice("yes where the scheduling input acts on the output as well; no", "no", "yes")
     order: int = whole("of the system model; 2", 1, 10, 2)
     nb: int | None = whole("coefficients of each input; order", 0, 50)
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
     degree: int | None = whole("of the coefficients in the scheduling signal; chosen, up to 3", 0, 8)
-    basis: str = choice("legendre (polynomials) or hats (piecewise linear, degree pieces); legendre", *BASES)
     form: str = choice(
         "output (noise on the output) or equation (noise in it; unstable plants); chosen by bic",
         *("auto", "equation", "output"),
     )
-    error_order: int | None = whole("of the error model, 0 for white noise; 5", 0, 20)
-    error_form: str = choice("ar, ma, arma; chosen by bic", "auto", "white", "ar", "ma", "arma")
+    error_order: int = whole("of the error model, 0 for white noise; 5", 0, 20, 5)
+    error_form: str = choice("ar, ma, arma; chosen by bic", "auto", "ar", "ma", "arma")
     iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
 
     @property
     def orders(self) -> tuple[tuple[int, int], ...]:
         """Orders of D and C to try."""
-        return error_orders(self.error_form, self.error_order or 0)
+        return error_orders(self.error_form, self.error_order)
 
 
 def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule, tuple[int, ...]]:
@@ -87,25 +85,14 @@ def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule,
             "schedule. Name one"
         )
     column = _schedule_column(s.schedule, first)
-    excites = s.exciting == "yes"
-    if excites and column < 0:
-        raise EstimationError(
-            f"lpv: exciting = yes says that the scheduling input excites, but schedule = {s.schedule} is none. Leave "
-            "it out"
-        )
     if s.time_constant and s.schedule != LEVEL:
         raise EstimationError(
             f"lpv: time_constant is that of schedule = level; with schedule = {s.schedule} the column is taken as it "
             "is. Leave it out"
         )
-    order = s.error_order
-    if order is None:
-        order = 0 if s.error_form == "white" else 5
-    if order > 0 and s.error_form == "white":
-        raise EstimationError(f"lpv: error_form = white has no coefficients, but error_order = {order}. Leave one out")
     tau = s.time_constant if s.schedule == LEVEL else 0.0
-    s = replace(s, error_order=order, nb=s.order if s.nb is None else s.nb, time_constant=tau)
-    columns = tuple(k for k in range(first.n_inputs) if k != column or excites)
+    s = replace(s, nb=s.order if s.nb is None else s.nb, time_constant=tau)
+    columns = tuple(k for k in range(first.n_inputs) if k != column)
     return s, Schedule(name=s.schedule, column=column), columns
 
 
@@ -122,7 +109,7 @@ def _schedule_column(name: str, first: IOData) -> int:
     if name not in columns:
         raise EstimationError(
             f"lpv: schedule is {name!r}; it must be an input, the output or level: {', '.join((*columns, LEVEL))}. "
-            f"Name the column as an input too; it does not excite unless exciting = yes.{nearest(name, list(columns))}"
+            f"Name the column as an input too; it does not excite.{nearest(name, list(columns))}"
         )
     return first.inputs.index(name) if name in first.inputs else -1
 
@@ -160,12 +147,11 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
 def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, columns: tuple[int, ...]) -> Fitting:
     """A model by least squares: something to hand over when the very next thing is an interruption."""
     assert s.nb is not None
-    assert s.error_order is not None
     tau = 50.0 * records[0].dt if s.time_constant is None else s.time_constant
     last = replace(schedule, time_constant=tau).share(records[0].dt) == 1.0
     shape = LpvShape(
         columns=columns, order=s.order, nb=s.nb, nk=s.nk, ar=0, ma=0, degree=s.degree or 0, form="equation",
-        basis=s.basis, offset="constant" if last else "scheduled",
+        offset="constant" if last else "scheduled",
     )  # fmt: skip
     first = shape.first + s.error_order
     for r, x in enumerate(records):  # before it is said that a scheduling column does not excite
@@ -192,7 +178,7 @@ def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, column
 def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
     """Settings with nothing left open."""
     of = fitting.shape
-    form = {(False, False): "white", (True, False): "ar", (False, True): "ma", (True, True): "arma"}
+    form = {(False, False): s.error_form, (True, False): "ar", (False, True): "ma", (True, True): "arma"}
     found = {
         "degree": of.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(of.ar, of.ma),
         "form": of.form, "error_form": form[of.ar > 0, of.ma > 0],
@@ -203,16 +189,15 @@ def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
 def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> None:
     """Choose and fit, or say why there is no model."""
     ticks = portions(tick, (1.0, 4.0, 10.0, 0.0 if s.degree is not None else 6.0, 10.0))
-    order = s.error_order or 0
     began = perf_counter()
     if ticks[0] is not None:
         ticks[0]("set point", 0.0)
     if s.time_constant is None:
-        fitting.schedule = choose_level(fitting, order, s.degree, ticks[0])
+        fitting.schedule = choose_level(fitting, s.error_order, s.degree, ticks[0])
         fitting.theta = fitting.by_equations(fitting.shape)
     began = fitting.timed("set point", began)
     degrees = DEGREES if s.degree is None else (s.degree,)
-    best = by_degree(fitting, degrees, replace(fitting.shape, ar=order), _CRITERION, ticks[1])
+    best = by_degree(fitting, degrees, replace(fitting.shape, ar=s.error_order), _CRITERION, ticks[1])
     began = fitting.timed("degree", began)
     best = by_form(fitting, wanted_shapes(best.shape, s.form, s.orders), best, ticks[2])
     if s.degree is None and np.isfinite(best.cost):  # a wrong form or error model may have decided on the degree
@@ -312,8 +297,8 @@ def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
         )
     if not of.columns and records[0].n_inputs:
         found.append(
-            f"no input acts on the output: {fitting.schedule.name!r}, the only one, moves coefficients alone. Say "
-            "exciting = yes if it does, or name the input that does"
+            f"no input acts on the output: {fitting.schedule.name!r}, the only one, moves coefficients alone. "
+            "Name the input that does"
         )
     if of.degree == 0:
         found.append(

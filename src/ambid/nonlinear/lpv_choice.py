@@ -17,7 +17,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.blackbox.model import reflect, roots_of
+from ambid.blackbox.roots import reflect, roots_of
+from ambid.estimation.criteria import information
 from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.progress import Tick, portions
@@ -30,7 +31,6 @@ _SLOWER = 5.0  # times the slowest time constant of the linear model: what is fr
 _LEAST, _MOST = 10.0, 0.2  # low-pass: samples at least, part of the shortest record at most
 _GRID = 3.0
 _CLEAR = 10.0  # difference of the criterion from which a faster set point is taken
-_LONG, _ROWS = 4, 20  # lags of the long regression, times the order of C; samples for each of its numbers
 _STEP = 1e-3  # of a logarithm, for a slope by differences
 _EVEN = np.linspace(-1.0, 1.0, 33)
 DEGREES = (0, 1, 2, 3)
@@ -183,7 +183,7 @@ def carry_over(shape: LpvShape, old: LpvShape, theta: Array, at: Array = _EVEN, 
     """
 
     def carried(values: Array, n: int) -> Array:
-        before, after = basis_values(earlier, values.size, shape.basis), basis_values(at, n, shape.basis)
+        before, after = basis_values(earlier, values.size), basis_values(at, n)
         return np.asarray(np.linalg.lstsq(after, before @ values, rcond=None)[0], dtype=np.float64)
 
     out = np.zeros(shape.n_theta)
@@ -219,23 +219,16 @@ class Candidate:
     starts: int = 0
 
     def value(self, criterion: str) -> float:
-        """Return an information criterion, the smaller the better."""
-        return information(criterion, self.cost, self.n, self.shape.n_theta, self.starts)
+        """Return an information criterion, the smaller the better; infinite where the numbers fit anything."""
+        k = self.shape.n_theta
+        if not np.isfinite(self.cost) or self.n <= k + self.starts + 1:
+            return math.inf
+        return information(criterion, self.cost / self.n, k, self.n, k) + 2.0 * self.starts
 
     def summary(self) -> dict[str, object]:
         """Return what it is and how good, for the details of a fit."""
         of, found = self.shape, {k: v if np.isfinite(v := self.value(k)) else None for k in ("aicc", "bic")}
         return {"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found}
-
-
-def information(criterion: str, cost: float, n: int, k: int, starts: int = 0) -> float:
-    """Return an information criterion of `k` numbers from `n` samples, infinite where these fit anything."""
-    if not np.isfinite(cost) or cost < 0 or n <= k + starts + 1:
-        return math.inf
-    each = math.log(n) if criterion == "bic" else 2.0
-    if criterion == "aicc":
-        each *= n / (n - k - 1)
-    return n * math.log(max(cost / n, 1e-300)) + k * each + 2.0 * starts
 
 
 @dataclass(slots=True, kw_only=True)
@@ -293,22 +286,6 @@ class Fitting(Attempt):
     def by_equations(self, shape: LpvShape) -> Array:
         """Return the start of a shape without an error model, by least squares."""
         return least_squares(shape, self.parts(shape), self.first)
-
-    def by_long_regression(self, shape: LpvShape) -> Array | None:
-        """Return the start of an equation with moving-average errors (Hannan and Rissanen 1982).
-
-        Innovations are those of a regression with more lags; None where records are too short for it.
-        """
-        spare = min(x.n_samples for x in self.records) - self.first - shape.ma
-        n, each = sum(x.n_samples for x in self.records), (1 + len(shape.columns)) * (shape.degree + 1)
-        more = min(_LONG * shape.ma, n // (_ROWS * each), spare // 4)
-        if more < 1:
-            return None
-        long = replace(shape, order=shape.order + more, nb=shape.nb + more, ar=0, ma=0)
-        parts, first = self.parts(long), self.first + more
-        theta = least_squares(long, parts, first)
-        found = from_earlier(shape, self.parts(shape), first + shape.ma, long, theta, parts)
-        return None if found is None else found[0]
 
     def search(
         self, shape: LpvShape, starts: Sequence[Array | None], tick: Tick | None, stage: str, *, last: bool = False
@@ -392,15 +369,12 @@ def slowest_mode(a: Array) -> float:
 def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | None) -> Schedule:
     """Choose the low-pass of the set point.
 
-    A linear model with moving-average errors of some `order` says how slow the plant is; pseudo-linear regressions with
+    A linear model with autoregressive errors of some `order` says how slow the plant is; pseudo-linear regressions with
     its errors compare what coefficients that follow each set point explain.
     """
     white = replace(fitting.shape, degree=0)
-    shape = replace(white, ma=order)
-    starts: list[Array | None] = [carry_over(shape, white, fitting.by_equations(white))]
-    if order:
-        starts.append(fitting.by_long_regression(shape))
-    model = fitting.search(shape, starts, tick, "set point")
+    shape = replace(white, ar=order)
+    model = fitting.search(shape, [carry_over(shape, white, fitting.by_equations(white))], tick, "set point")
     a = np.concatenate([[1.0], model.theta[: shape.order]])
     dt, shortest = fitting.records[0].dt, min(x.n_samples for x in fitting.records)
     grid = time_constants(slowest_mode(a), shortest, dt)
@@ -409,7 +383,8 @@ def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | 
     tried = [fitting.schedule.over(fitting.records, tau) for tau in grid]
     for of in tried if len(grid) > 1 and np.isfinite(model.cost) else ():
         found = from_earlier(trial, fitting.parts(trial, of), fitting.first, shape, model.theta, earlier)
-        values.append(np.inf if found is None else information("bic", found[1], model.n, trial.n_theta))
+        cost = np.inf if found is None else found[1]
+        values.append(Candidate(shape=trial, theta=model.theta, cost=cost, n=model.n).value("bic"))
     fitting.limits = grid[0], max(dt * _MOST * shortest, grid[-1])
     chosen = slowest_that_does(grid, values) if values and np.isfinite(min(values)) else grid[0]
     return tried[grid.index(chosen)]
@@ -463,8 +438,6 @@ def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick:
         if shape.form == "output" and both and not earlier[0].shape.is_stable(earlier[0].theta):
             continue  # earlier[0]: the best of the equation form, or of the output form, which is stable
         starts: list[Array | None] = [carry_over(shape, white, process)]
-        if shape.form == "equation" and shape.ma and not shape.ar:
-            starts.append(fitting.by_long_regression(shape))
         for x in earlier[:2]:
             regression = from_earlier(shape, fitting.parts(shape), fitting.first, x.shape, x.theta)
             starts += [carry_over(shape, x.shape, x.theta), None if regression is None else regression[0]]

@@ -2,7 +2,7 @@
 
 p is a column among the inputs (its value now), the output (its last value), or ``level``: the set point, as a causal
 first-order low-pass of the output before the present sample. It is scaled to -1 ... 1 over the training data; a
-coefficient is a sum of Legendre polynomials of it, or of hats (piecewise linear).
+coefficient is a sum of Legendre polynomials of it.
 
 Equation form: A(q, p) y = B(q, p) u + c(p) + v; output form: A(q, p) x = B(q, p) u + c(p), y = x + v; both with the
 error model D(q) v = C(q) e. Coefficients at time t are functions of p(t), and stand before the shifted signals:
@@ -36,7 +36,6 @@ from ambid.nonlinear.records import finite, scaled, with_head
 Complex = NDArray[np.complex128]
 
 LEVEL = "level"
-BASES = ("legendre", "hats")
 _EACH = 4  # samples for each number that stands for what was before
 _STATES = 0.01  # variance of an innovation over that of what a state differs by
 _FAR = 1e6  # times the typical size of the output: a recursion that is beyond has diverged
@@ -105,13 +104,9 @@ class Schedule:
         return np.asarray((np.asarray(p, dtype=np.float64) - self.middle) / self.half)
 
 
-def basis_values(s: Array, n: int, basis: str) -> Array:
-    """Return `n` functions (degree + 1) of the scaled scheduling signal, (n_samples, n)."""
-    from ambid.nonlinear.lagged_kernels import basis_rows
-
-    out = np.empty((s.size, n))
-    basis_rows(np.ascontiguousarray(s), BASES.index(basis), out)
-    return out
+def basis_values(s: Array, n: int) -> Array:
+    """Return `n` Legendre polynomials (degree + 1) of the scaled scheduling signal, (n_samples, n)."""
+    return np.asarray(np.polynomial.legendre.legvander(s, n - 1))
 
 
 # --- equations --------------------------------------------------------------------------------------------------------
@@ -129,7 +124,6 @@ class LpvShape:
     ma: int
     degree: int  # functions of p less one, in A, B, c
     form: str  # whether v enters the difference equation or the output
-    basis: str
     # whether c is a function of p. Where p is the last output itself c(p) says nothing that a_1(p) y(t - 1) does not.
     offset: str = "scheduled"
 
@@ -223,7 +217,7 @@ class LpvShape:
     def is_stable(self, theta: Array) -> bool:
         """Whether the frozen process part is stable over the range of p."""
         s = np.linspace(-1.0, 1.0, 4 * self.degree + 1)
-        rows = basis_values(s, self.degree + 1, self.basis) @ self.split(theta)[0].T
+        rows = basis_values(s, self.degree + 1) @ self.split(theta)[0].T
         return all(stable(np.concatenate([[1.0], row])) for row in rows)
 
     def is_sound(self, theta: Array) -> bool:
@@ -252,7 +246,7 @@ class Part:
 
 def part_of(shape: LpvShape, y: Array, u: Array, s: Array) -> Part:
     """Prepare a scaled record."""
-    phi = basis_values(s, shape.degree + 1, shape.basis)
+    phi = basis_values(s, shape.degree + 1)
     return Part(y=np.ascontiguousarray(y), W=shape.lagged_inputs(u), phi=phi)
 
 
@@ -467,7 +461,7 @@ class LpvModel:
         na, nb, m = of.order, of.nb, len(of.columns)
         G = np.zeros((of.n_process - 1, of.n_theta))
         for k in range(of.n_process - 1):
-            G[k, of.place(k)] = basis_values(s, of.degree + 1, of.basis)[0]
+            G[k, of.place(k)] = basis_values(s, of.degree + 1)[0]
         values = G @ self.theta
         a, b = np.concatenate([[1.0], values[:na]]), values[na:].reshape(m, nb)
         z = roots_of(a)
@@ -522,7 +516,7 @@ class LpvModel:
         level, size = float(self.y_level[0]), float(self.y_scale[0])
         a, b, _, _ = of.split(self.scaled_theta)
         scheduled_run(
-            found, of.lagged_inputs(us), np.ascontiguousarray(s), BASES.index(of.basis), head, a, b,
+            found, of.lagged_inputs(us), np.ascontiguousarray(s), head, a, b,
             self.schedule.share(self.dt), (self.schedule.middle - level) / size, self.schedule.half / size,
         )  # fmt: skip
         out: Array = self.y_level + self.y_scale * found[:, None]
@@ -571,9 +565,12 @@ class LpvModel:
         try:
             m, shape = int(found["n_inputs"]), read_as(LpvShape, found["shape"], "shape")
             schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
-            words = shape.basis in BASES and shape.form in ("equation", "output")
-            if not words or shape.offset not in ("scheduled", "constant") or not schedule.high > schedule.low:
-                raise ValueError("form, basis, offset or range of the schedule make no sense")
+            if (
+                shape.form not in ("equation", "output")
+                or shape.offset not in ("scheduled", "constant")
+                or not schedule.high > schedule.low
+            ):
+                raise ValueError("form, offset or range of the schedule make no sense")
             sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
             if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
                 raise ValueError("columns or orders make no sense")

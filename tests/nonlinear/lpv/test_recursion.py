@@ -8,9 +8,9 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.nonlinear.lpv import lpv
 from ambid.nonlinear.lpv_choice import (
+    Candidate,
     LpvProblem,
     carry_over,
-    information,
     slowest_mode,
     slowest_that_does,
     time_constants,
@@ -19,7 +19,7 @@ from ambid.nonlinear.lpv_model import LpvShape, Schedule, basis_values, beginnin
 from tests.nonlinear.lpv.plants import record
 
 
-def shape_of(form="output", ar=2, ma=1, degree=1, basis="legendre", offset="scheduled"):
+def shape_of(form="output", ar=2, ma=1, degree=1, offset="scheduled"):
     return LpvShape(
         columns=(0,),
         order=2,
@@ -29,7 +29,6 @@ def shape_of(form="output", ar=2, ma=1, degree=1, basis="legendre", offset="sche
         ma=ma,
         degree=degree,
         form=form,
-        basis=basis,
         offset=offset,
     )
 
@@ -40,10 +39,7 @@ def theta_of(shape, seed=0):
     out = 0.03 * np.random.default_rng(seed).standard_normal(shape.n_theta)
     for k, name in enumerate(shape.coefficients):
         where = shape.place(k)
-        if shape.basis == "hats":
-            out[where] += values[name]
-        else:
-            out[where.start] += values[name]
+        out[where.start] += values[name]
     return out
 
 
@@ -54,7 +50,7 @@ def signals(n=60, seed=1):
 
 def by_hand(shape, theta, y, u, s):
     """The difference equations as `shape` writes them, with loops."""
-    phi = basis_values(s, shape.degree + 1, shape.basis)
+    phi = basis_values(s, shape.degree + 1)
     places = [theta[shape.place(k)] for k in range(len(shape.coefficients))]
     c = [phi[:, : x.size] @ x if k < shape.n_process else np.full(s.size, x[0]) for k, x in enumerate(places)]
     a1, a2, b1, b2, offset, d1, d2, c1 = c
@@ -69,10 +65,9 @@ def by_hand(shape, theta, y, u, s):
 
 
 @pytest.mark.parametrize("form", ["equation", "output"])
-@pytest.mark.parametrize("basis", ["legendre", "hats"])
 @pytest.mark.parametrize("offset", ["scheduled", "constant"])
-def test_innovations_are_those_of_the_equations(form, basis, offset):
-    shape = shape_of(form, degree=2, basis=basis, offset=offset)
+def test_innovations_are_those_of_the_equations(form, offset):
+    shape = shape_of(form, degree=2, offset=offset)
     assert shape.n_theta == len(shape.names) == theta_of(shape).size
     assert shape.place(shape.n_process - 1).stop == shape.n_process_theta
     y, u, s = signals()
@@ -253,21 +248,8 @@ def test_what_follows_the_last_output_has_standard_deviations_that_hold():
     assert np.all((z.std(axis=0) > 0.75) & (z.std(axis=0) < 1.25))
 
 
-@pytest.mark.parametrize("basis", ["legendre", "hats"])
-def test_functions_of_p(basis):
-    s = np.linspace(-1.3, 1.3, 41)
-    values = basis_values(s, 4, basis)
-    if basis == "hats":
-        np.testing.assert_allclose(values.sum(axis=1), 1.0)
-        np.testing.assert_allclose(values @ np.linspace(-1, 1, 4), s, atol=1e-12)  # linear beyond the range as well
-        return
-    expected = np.polynomial.legendre.legvander(s, 3)
-    np.testing.assert_allclose(values, expected, atol=1e-13)
-
-
-@pytest.mark.parametrize("basis", ["legendre", "hats"])
-def test_a_model_is_carried_over_to_more_functions_of_p(basis):
-    old, new = shape_of(degree=1, basis=basis), shape_of(degree=2, basis=basis, ar=1)
+def test_a_model_is_carried_over_to_more_functions_of_p():
+    old, new = shape_of(degree=1), shape_of(degree=2, ar=1)
     y, u, s = signals()
     theta = theta_of(old)
     one = errors(old, part_of(old, y, u, s), theta).x
@@ -281,8 +263,15 @@ def test_what_is_tried_for_the_set_point():
     assert time_constants(1e9, 600, 0.01) == pytest.approx([1.2])  # slower than a fifth of the record says nothing
     assert slowest_that_does([1.0, 3.0, 9.0], [0.0, 4.0, 50.0]) == 3.0
     assert slowest_mode(np.poly([np.exp(0.02), np.exp(-0.5)])) == pytest.approx(50.0)
-    assert information("bic", 10.0, 10, 2) == pytest.approx(2 * np.log(10))
-    assert information("aicc", 10.0, 100, 3) > information("aic", 10.0, 100, 3)
-    assert information("bic", np.inf, 10, 2) == np.inf
-    assert information("bic", 1e-30, 10, 9) == np.inf  # as many numbers as samples fit anything
-    assert information("bic", 1e-30, 10, 4, starts=5) == np.inf
+
+
+def test_candidates_are_compared_by_criteria_that_numbers_for_the_beginning_enter():
+    def value(criterion, cost, n, starts=0):
+        shape = shape_of("equation", ar=0, ma=0, degree=0)
+        return Candidate(shape=shape, theta=np.zeros(5), cost=cost, n=n, starts=starts).value(criterion)
+
+    assert value("bic", 10.0, 10) == pytest.approx(5 * np.log(10))
+    assert value("aicc", 10.0, 100) > value("aic", 10.0, 100)
+    assert value("bic", 10.0, 20, starts=3) == pytest.approx(value("bic", 10.0, 20) + 6.0)
+    assert value("bic", np.inf, 10) == np.inf
+    assert value("bic", 1e-30, 10, starts=4) == np.inf  # as many numbers as samples fit anything
