@@ -11,7 +11,8 @@ commute with p, so that this is another model than one with p(t - k).
 
 States of the output form and first innovations, w, are those that make the innovations of the first samples small:
 min |e(theta, w)|^2 + w' Lambda w, with Lambda from their own size beside the innovations'. e is linear in w. Without
-it, a zero of C near the unit circle keeps an error of these alive for its time constant.
+it, a zero of C near the unit circle keeps an error of these alive for its time constant. In a fit these numbers are
+solved for at each theta, and their columns projected out (Golub and Pereyra 1973; Jacobian as in Kaufman 1975).
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.model import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
 from ambid.estimation.documents import fields_json, read_as
+from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.cloud import Cloud
 from ambid.nonlinear.records import finite, scaled, with_head
 
 Complex = NDArray[np.complex128]
 
 LEVEL = "level"
+STEP = 1e-3  # of the logarithm of a time constant, for a slope by differences
 _EACH = 4  # samples for each number that stands for what was before
 _STATES = 0.01  # variance of an innovation over that of what a state differs by
 _FAR = 1e6  # times the typical size of the output: a recursion that is beyond has diverged
@@ -317,6 +320,76 @@ def _pass_on(out: Array, gain: Array, rows: Array) -> None:
     out[first:] = rows
     if lags.size:
         propagate(out[:, None], np.ascontiguousarray(gain)[:, None], np.zeros_like(lags), lags, first)
+
+
+# --- prediction errors ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LpvProblem:
+    """What is searched in (a `estimation.search.Problem`)."""
+
+    shape: LpvShape
+    parts: tuple[Part, ...]  # by record
+    first: int  # errors count from this sample on
+    weight: float = 1.0  # one over the standard deviation of the errors
+    # by record: the same with set points a little slower and faster, where the logarithm of their time constant counts
+    # as one more number
+    beside: tuple[tuple[Part, Part], ...] = ()
+
+    @property
+    def n_errors(self) -> int:
+        """Samples that count."""
+        return sum(max(p.y.size - self.first, 0) for p in self.parts)
+
+    @property
+    def freedom(self) -> float:
+        """Samples less estimated numbers, those of the starts included; at least 1."""
+        return max(float(self.n_errors - self.shape.n_theta - len(self.parts) * self.shape.n_start), 1.0)
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squared weighted innovations; infinite where the predictor is unstable."""
+        total = 0.0
+        if not self.shape.is_sound(theta):
+            return np.inf
+        for part in self.parts:
+            e = self._project(part, theta)[1]
+            if e is None:
+                return np.inf
+            total += float(e @ e)
+        return total * self.weight**2
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of [J | e] without what the starts explain; NaN where the predictor diverges."""
+        P, k, rows = self.shape.n_theta, self.shape.n_start, list[Array]()
+        for r, part in enumerate(self.parts):
+            start, e = self._project(part, theta)
+            found = None if e is None else errors(self.shape, part, theta, start, slopes=2)
+            if found is None or not found.finite:
+                return np.full((P + 1, P + 1 + bool(self.beside)), np.nan)
+            J = [found.J[:, P:], found.J[:, :P]]
+            for slower, faster in self.beside[r : r + 1]:
+                later, sooner = (errors(self.shape, x, theta, start).g for x in (slower, faster))
+                J.append((later - sooner)[:, None] / (2.0 * STEP))
+            R = triangle_of([np.column_stack([*J, found.e])[self.first :]])
+            rows.append(np.asarray(np.linalg.qr(R, mode="r"))[k:, k:])
+        return triangle_of(rows) * self.weight
+
+    def _project(self, part: Part, theta: Array) -> tuple[Array, Array | None]:
+        """Start that explains most, and the innovations with it."""
+        k, P = self.shape.n_start, self.shape.n_theta
+        found = errors(self.shape, part, theta, slopes=1 if k else 0)
+        if not found.finite:
+            return np.zeros(k), None
+        e = found.e[self.first :]
+        if not k:
+            return np.zeros(0), e
+        J = found.J[self.first :, P:]
+        if not np.all(np.isfinite(J)):
+            return np.zeros(k), None
+        R = triangle_of([np.column_stack([J, e])])
+        start = np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=1e-9)[0], dtype=np.float64)
+        return start, e - J @ start
 
 
 # --- what was before a record -----------------------------------------------------------------------------------------

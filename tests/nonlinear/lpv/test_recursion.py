@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.lpv import lpv
-from ambid.nonlinear.lpv_choice import (
-    Candidate,
+from ambid.nonlinear.lpv import Candidate, carry_over, lpv, slowest_mode, slowest_that_does, time_constants
+from ambid.nonlinear.lpv_model import (
     LpvProblem,
-    carry_over,
-    slowest_mode,
-    slowest_that_does,
-    time_constants,
+    LpvShape,
+    Schedule,
+    basis_values,
+    beginning,
+    errors,
+    part_of,
+    settling,
 )
-from ambid.nonlinear.lpv_model import LpvShape, Schedule, basis_values, beginning, errors, part_of, settling
 from tests.nonlinear.lpv.plants import record
 
 
