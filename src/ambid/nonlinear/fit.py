@@ -13,6 +13,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.estimation.parts import FittedModel
+from ambid.estimation.search import Found
 
 Settings = Mapping[str, int | float | str | tuple[int, ...]]
 """What a structure is told: lags, degrees, neurons, ..., by name; what is left out the method chooses and reports."""
@@ -276,6 +277,16 @@ class Attempt:
         now = perf_counter()
         self.timing_s[stage] = self.timing_s.get(stage, 0.0) + now - began
         return now
+
+    def note_curve(self, found: Found, method: str, n: int, size: float) -> None:
+        """Add the learning curve of a search over `n` errors of unit variance, `size` in deviations of the outputs."""
+        curve = LearningCurve(
+            method=method,
+            seconds=np.array(found.seconds),
+            training=np.sqrt(np.array(found.costs) / max(n, 1)) * size,
+            held_out=np.array(found.held_out),
+        )
+        self.curves.append(curve)
 
     def interrupt(self) -> None:
         """Say that the search was interrupted."""

@@ -117,7 +117,12 @@ def model_from_json(found: Mapping[str, Any]) -> NonlinearModel:
         raise EstimationError("the model has no kind; a file of a nonlinear fit names it. Write the file again")
     module, name = _home(found["kind"]).split(":")
     read: Callable[[dict[str, Any]], NonlinearModel] = attrgetter(name)(import_module(module))
-    return read({k: v for k, v in found.items() if k != "kind"})
+    try:
+        return read({k: v for k, v in found.items() if k != "kind"})
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise EstimationError(
+            f"no model of kind {found['kind']} ({type(error).__name__}: {error}). Write the file again"
+        ) from error
 
 
 def _home(kind: str) -> str:

@@ -103,7 +103,6 @@ class HammersteinFunction(LaggedFunction):
     """Sizes of a Hammerstein model of one output."""
 
     kind: ClassVar[str] = "hammerstein"
-    title: ClassVar[str] = "Hammerstein"
     m: int  # inputs
     ny: int
     nu: int

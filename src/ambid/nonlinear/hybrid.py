@@ -67,7 +67,8 @@ from ambid.nonlinear.settings import number, read_settings, whole
 
 MOST_NOISE = 4  # largest order of C that is tried where it is left open
 _NEURONS = (0, 1, 2, 4, 8)
-_AS_GOOD = 1.01
+_AS_GOOD = 1.02
+_FOLDS = 3  # ends of a short record that are held out
 _FEWEST = 20  # held-out samples by which neurons are chosen
 _MOST_ROWS = 6000  # that the choice of neurons looks at
 _DRAWS = 20  # of the hidden layer of a start
@@ -116,7 +117,6 @@ class HybridFunction(LaggedFunction):
     """Terms and sizes of a hybrid model."""
 
     kind: ClassVar[str] = "hybrid"
-    title: ClassVar[str] = "hybrid"
     terms: tuple[tuple[Term, ...], ...]  # of the polynomial, by output, without innovations
     ne: int  # order of C
     p: int  # outputs
@@ -428,19 +428,27 @@ def _choose_neurons(
     s: HybridSettings, function: HybridFunction, linear: Array, parts: Parts, draft: _Hybrid, seed: int,
     tick: Tick | None,
 ) -> int:  # fmt: skip
-    """Choose the number of hidden units by one-step errors behind the parts of the records that are trained on."""
+    """Choose the number of hidden units by one-step errors behind the parts of the records that are trained on.
+
+    A short record has several ends that are held out, one before the other.
+    """
     most = max(_MOST_ROWS // len(parts), 10 * function.lag + 60)
-    training, held = split(tuple((y[:most], u[:most]) for y, u in parts), s.held_out, function.lag)
-    if sum(y.shape[0] - function.lag for y, _ in held) < _FEWEST:
+    parts, share = tuple((y[:most], u[:most]) for y, u in parts), s.held_out
+    n = sum(y.shape[0] - function.lag for y, _ in parts)
+    if n * share < _FEWEST:
         return 0
+    ends = [1.0 - share * j for j in range(int(np.clip(_MOST_ROWS // n, 1, min(_FOLDS, 0.6 / share))))]
 
     def score(of: dict[str, Any], tick: Tick | None) -> float:
-        one, theta = replace(function, neurons=of["neurons"]), linear
-        if one.neurons:
-            theta = train(s, one, linear, training, seed, 2, part_of(tick, 0.0, 0.8))
-        problem = hybrid_problem(one, training, theta, s.prior)
-        theta = search(problem, theta, stage="choice of neurons", tick=part_of(tick, 0.8, 1.0), **_ROUGH).theta
-        return rms_error(one, theta, held)
+        one, squares = replace(function, neurons=of["neurons"]), 0.0
+        for end, own in zip(ends, portions(tick, ends), strict=True):
+            some = tuple((y[: round(end * y.shape[0])], u[: round(end * y.shape[0])]) for y, u in parts)
+            training, held = split(some, share / end, function.lag)
+            theta = train(s, one, linear, training, seed, 2, part_of(own, 0.0, 0.8)) if one.neurons else linear
+            problem = hybrid_problem(one, training, theta, s.prior)
+            theta = search(problem, theta, stage="choice of neurons", tick=part_of(own, 0.8, 1.0), **_ROUGH).theta
+            squares += rms_error(one, theta, held) ** 2
+        return float(np.sqrt(squares / len(ends)))
 
     sizes = [{"neurons": h} for h in _NEURONS]
     found = choose_smallest(sizes, score, draft.details["tried"], _AS_GOOD, tick)

@@ -13,17 +13,15 @@ are `Terms` with basis functions as further inputs. All signals in here are scal
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
 from ambid.nonlinear.blocks import Block, Mask, Table
-from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.records import finite, scaled, with_head
+from ambid.nonlinear.records import ScaledModel, read_numbers, scaled, with_head
 
 _FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has diverged
 
@@ -109,7 +107,6 @@ class LaggedFunction(ABC):
     """The function of a family, in scaled signals."""
 
     kind: ClassVar[str]
-    title: ClassVar[str]  # for messages
     ellipsoid: ClassVar[bool] = False  # whether the ellipsoid alone says where it was trained
     folded: int = 0  # 1 or 2 where the sign of the output is not measured, see `lagged_kernels.run`
 
@@ -140,12 +137,10 @@ class LaggedFunction(ABC):
     @classmethod
     def read_model(cls, found: dict[str, Any]) -> LaggedModel:
         """Read a model of the family back."""
-        try:
-            return cls.from_json(found).model_from_json(found)
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise EstimationError(
-                f"no {cls.title} model ({type(error).__name__}: {error}). Write the file again"
-            ) from error
+        of = cls.from_json(found)
+        n_cloud = np.arange(of.regressors.column.size)[of.in_cloud].size
+        numbers = read_numbers(found, of.n_theta, of.n_inputs, of.n_outputs, n_cloud)
+        return LaggedModel(dt=float(found["dt_s"]), function=of, **numbers)
 
     @property
     def n_outputs(self) -> int:
@@ -345,18 +340,9 @@ class LaggedFunction(ABC):
             out += 0.5 * sign[:-1] * np.concatenate([earlier, J[:-1]])
         return np.asarray(out)
 
-    def model_from_json(self, found: dict[str, Any]) -> LaggedModel:
-        """Return the model whose function this is."""
-        n_cloud = np.arange(self.regressors.column.size)[self.in_cloud].size
-        sizes = {"theta": self.n_theta, "u_level": self.n_inputs, "u_scale": self.n_inputs}
-        sizes |= {"y_level": self.n_outputs, "y_scale": self.n_outputs}
-        arrays: dict[str, Any] = {k: finite(found[k], n, k) for k, n in sizes.items()}
-        cloud = Cloud.from_json(found["cloud"], n_cloud)
-        return LaggedModel(dt=float(found["dt_s"]), function=self, cloud=cloud, **arrays)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LaggedModel:
+class LaggedModel(ScaledModel):
     """A lagged function with its parameters, scaling and training cloud.
 
     The predictor takes innovations before its first prediction as zero. Implements
@@ -365,28 +351,11 @@ class LaggedModel:
 
     dt: float  # s
     function: LaggedFunction
-    # (n_theta,), parameters for signals in deviations from `*_level`, in units of `*_scale` times `function.unit`
-    theta: Array
-    u_level: Array  # (n_inputs,), SI
-    u_scale: Array
-    y_level: Array  # (n_outputs,), SI
-    y_scale: Array
-    cloud: Cloud  # of the training regressors
 
     @property
     def kind(self) -> str:
         """Under which files know it."""
         return self.function.kind
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs."""
-        return self.function.n_inputs
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs."""
-        return self.function.n_outputs
 
     @property
     def lag(self) -> int:
@@ -400,17 +369,8 @@ class LaggedModel:
 
     @cached_property
     def unit(self) -> Array | float:
-        """What a scaled parameter of 1 is in `theta`."""
+        """As `ScaledModel.unit`."""
         return self.function.unit(self.y_scale, self.u_scale)
-
-    @property
-    def scaled_theta(self) -> Array:
-        """Parameters for scaled signals."""
-        return self.theta / self.unit
-
-    def with_theta(self, theta: Array) -> Self:
-        """Return the same model with other parameters."""
-        return replace(self, theta=theta)
 
     def predict(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.predict`; past innovations are its own. NaN from where they diverge on."""
@@ -449,5 +409,4 @@ class LaggedModel:
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
-        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
-        return {"dt_s": self.dt, **self.function.as_json(), **arrays, "cloud": self.cloud.as_json()}
+        return {"dt_s": self.dt, **self.function.as_json(), **self.numbers_json()}

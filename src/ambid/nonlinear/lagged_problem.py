@@ -22,7 +22,7 @@ from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.blocks import Mask
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit
+from ambid.nonlinear.fit import Attempt, NonlinearFit
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Rows
 from ambid.nonlinear.records import Parts, Scaled
 
@@ -370,13 +370,7 @@ class Draft(Attempt):
         """Add the learning curve of a search, and say whether it ended."""
         noise = np.linalg.inv(problem.weight) if np.isfinite(found.cost) else np.eye(problem.weight.shape[0])
         size = float(np.sqrt(np.sum(noise**2) / noise.shape[0]))
-        curve = LearningCurve(
-            method=method,
-            seconds=np.array(found.seconds),
-            training=np.sqrt(np.array(found.costs) / max(problem.n_errors, 1)) * size,
-            held_out=np.array(found.held_out),
-        )
-        self.curves.append(curve)
+        self.note_curve(found, method, problem.n_errors, size)
 
 
 def guarded(identify: Callable[[], None], draft: Attempt, failed: Callable[[str], NonlinearFit]) -> NonlinearFit | None:

@@ -20,12 +20,13 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.roots import reflect, roots_of
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.criteria import information
+from ambid.estimation.documents import plain_json
 from ambid.estimation.linear import information_inverse, triangle_of
 from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit, Settings, failed_fit
+from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged_problem import guarded
 from ambid.nonlinear.lpv_model import (
     LEVEL,
@@ -85,11 +86,6 @@ class LpvSettings:
     error_order: int = whole("of the error model, 0 for white noise; 5", 0, 20, 5)
     error_form: str = choice("ar, ma, arma; chosen by bic", "auto", "ar", "ma", "arma")
     iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
-
-    @property
-    def orders(self) -> tuple[tuple[int, int], ...]:
-        """Orders of D and C to try."""
-        return error_orders(self.error_form, self.error_order)
 
 
 def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule, tuple[int, ...]]:
@@ -175,7 +171,7 @@ def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, column
             scaled_records("lpv", records, lag=first)
         if r == 0 and schedule.column >= 0:
             schedule.over(records, 0.0)
-    least = min(looks_back(x) for x in wanted_shapes(shape, s.form, s.orders))
+    least = min(looks_back(x) for x in wanted_shapes(s, shape))
     data = scaled_records("lpv", records, lag=max(first, least))
     n, k = sum(x.n_samples - first for x in records), shape.n_theta + s.error_order * (1 + (s.error_form == "arma"))
     if n <= k + 1:  # these fit anything
@@ -213,9 +209,10 @@ def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> None:
         fitting.theta = fitting.by_equations(fitting.shape)
     began = fitting.timed("set point", began)
     degrees = DEGREES if s.degree is None else (s.degree,)
-    best = by_degree(fitting, degrees, replace(fitting.shape, ar=s.error_order), _CRITERION, ticks[1])
+    first = Candidate(shape=replace(fitting.shape, ar=s.error_order), theta=fitting.theta)
+    best = by_degree(fitting, degrees, first, _CRITERION, ticks[1])
     began = fitting.timed("degree", began)
-    best = by_form(fitting, wanted_shapes(best.shape, s.form, s.orders), best, ticks[2])
+    best = by_form(fitting, wanted_shapes(s, best.shape), best, ticks[2])
     if s.degree is None and np.isfinite(best.cost):  # a wrong form or error model may have decided on the degree
         others = [d for d in DEGREES if d != best.shape.degree]
         best = by_degree(fitting, others, best, _CRITERION, ticks[3])
@@ -436,19 +433,13 @@ class Fitting(Attempt):
         )  # fmt: skip
         if last:
             self.theta, self.status = found.theta, "converged" if found.converged else "stalled"
-            self.curves.append(
-                LearningCurve(
-                    method="Levenberg-Marquardt, prediction errors",
-                    seconds=np.array(found.seconds),
-                    training=np.sqrt(np.array(found.costs) / problem.n_errors) / weight,
-                )
-            )
+            self.note_curve(found, "Levenberg-Marquardt, prediction errors", problem.n_errors, 1.0 / weight)
         n, starts_n = problem.n_errors, len(problem.parts) * shape.n_start
         return Candidate(shape=shape, theta=found.theta, cost=found.cost / weight**2, n=n, starts=starts_n)
 
     def better(self, found: Candidate, best: Candidate | None, criterion: str) -> Candidate:
         """Return the better of two, which is held on to."""
-        if best is not None and not found.value(criterion) < best.value(criterion):
+        if best is not None and np.isfinite(best.cost) and not found.value(criterion) < best.value(criterion):
             return best
         if np.isfinite(found.cost):
             self.shape, self.theta = found.shape, found.theta
@@ -456,14 +447,6 @@ class Fitting(Attempt):
 
 
 # --- what is chosen where nothing is said -----------------------------------------------------------------------------
-
-
-def error_orders(form: str, order: int) -> tuple[tuple[int, int], ...]:
-    """Return orders of D and C to try."""
-    if order == 0:
-        return ((0, 0),)
-    found = {"ar": (order, 0), "ma": (0, order), "arma": (order, order)}
-    return tuple(found.values()) if form == "auto" else (found[form],)
 
 
 def time_constants(slowest: float, shortest: int, dt: float) -> list[float]:
@@ -514,28 +497,28 @@ def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | 
 
 
 def by_degree(
-    fitting: Fitting, degrees: Sequence[int], base: Candidate | LpvShape, criterion: str, tick: Tick | None
+    fitting: Fitting, degrees: Sequence[int], best: Candidate, criterion: str, tick: Tick | None
 ) -> Candidate:
-    """Fit a shape with other degrees; return the best of these and of the candidate that it comes from, if any."""
-    best = base if isinstance(base, Candidate) else None
-    shape = base if isinstance(base, LpvShape) else base.shape
+    """Fit a shape with other degrees, with starts from a candidate; return the best of these and of the candidate."""
+    base = best.shape
     for degree, own in zip(degrees, portions(tick, [1.0 + d for d in degrees]), strict=True):
-        trial = replace(shape, degree=degree)
-        starts: list[Array | None] = [None if best is None else carry_over(trial, best.shape, best.theta)]
-        if isinstance(base, LpvShape):
-            white = replace(trial, ar=0, ma=0)
-            starts.insert(0, carry_over(trial, white, fitting.by_equations(white)))
+        trial = replace(base, degree=degree)
+        white = replace(trial, ar=0, ma=0, form="equation")
+        starts = [carry_over(trial, white, fitting.by_equations(white))]
+        if np.isfinite(best.cost):
+            starts.append(carry_over(trial, best.shape, best.theta))
         found = fitting.search(trial, starts, own, f"degree {degree}")
         fitting.tried.append(found)
         best = fitting.better(found, best, criterion)
-    assert best is not None
     return best
 
 
-def wanted_shapes(base: LpvShape, form: str, orders: Sequence[tuple[int, int]]) -> list[LpvShape]:
+def wanted_shapes(s: LpvSettings, base: LpvShape) -> list[LpvShape]:
     """Return a shape with the forms and orders of D and C that are asked for."""
-    forms = ("equation", "output") if form == "auto" else (form,)
-    return [replace(base, form=form, ar=ar, ma=ma) for form in forms for ar, ma in orders]
+    forms = ("equation", "output") if s.form == "auto" else (s.form,)
+    orders = {"ar": (s.error_order, 0), "ma": (0, s.error_order), "arma": (s.error_order, s.error_order)}
+    tried = dict.fromkeys(orders.values() if s.error_form == "auto" else [orders[s.error_form]])
+    return [replace(base, form=form, ar=ar, ma=ma) for form in forms for ar, ma in tried]
 
 
 def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick: Tick | None) -> Candidate:
@@ -587,7 +570,7 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
         for x, (y, u) in zip(records, d.parts, strict=True)
     ]
     model = LpvModel(
-        dt=records[0].dt, n_inputs=records[0].n_inputs, shape=fitting.shape, schedule=of, theta=theta,
+        dt=records[0].dt, shape=fitting.shape, schedule=of, theta=theta,
         u_level=d.u_level, u_scale=d.u_scale, y_level=d.y_level, y_scale=d.y_scale,
         cloud=cloud_of(np.concatenate(near)),
     )  # fmt: skip
@@ -626,24 +609,18 @@ def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[st
     ``poles_rad_s`` has real and imaginary part and their standard deviations, ``dc_gain`` value and standard deviation
     by input; None where there is no number.
     """
-    out = []
+    out = list[dict[str, object]]()
     for p in np.linspace(model.schedule.low, model.schedule.high, _POINTS):
         at = model.at(float(p), covariance)
         poles_sd = np.full(at.poles.size, np.nan + 1j * np.nan) if at.poles_sd is None else at.poles_sd
         gain_sd = np.full(at.dc_gain.size, np.nan) if at.dc_gain_sd is None else at.dc_gain_sd
-        poles = [
-            [_number(x) for x in (z.real, z.imag, sd.real, sd.imag)] for z, sd in zip(at.poles, poles_sd, strict=True)
-        ]
+        poles = [(z.real, z.imag, sd.real, sd.imag) for z, sd in zip(at.poles, poles_sd, strict=True)]
         gains = {
-            inputs[column]: [_number(g), _number(sd)]
-            for column, g, sd in zip(model.shape.columns, at.dc_gain, gain_sd, strict=True)
+            inputs[column]: (g, sd) for column, g, sd in zip(model.shape.columns, at.dc_gain, gain_sd, strict=True)
         }
-        out.append({"p": float(p), "poles_rad_s": poles, "dc_gain": gains})
-    return out
-
-
-def _number(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None
+        out.append({"p": p, "poles_rad_s": poles, "dc_gain": gains})
+    found: list[dict[str, object]] = plain_json(out)
+    return found
 
 
 def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:

@@ -32,8 +32,7 @@ from ambid.blackbox.model import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
 from ambid.estimation.documents import fields_json, read_as
 from ambid.estimation.linear import triangle_of
-from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.records import finite, scaled, with_head
+from ambid.nonlinear.records import ScaledModel, read_numbers, scaled, with_head
 
 Complex = NDArray[np.complex128]
 
@@ -466,34 +465,22 @@ class Frozen:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LpvModel:
+class LpvModel(ScaledModel):
     """A linear model of one output whose coefficients follow a scheduling signal.
 
-    What was before a record the predictor estimates from the first `lag` samples, see `beginning`. Implements
-    `ambid.nonlinear.fit.NonlinearModel`.
+    What was before a record the predictor estimates from the first `lag` samples, see `beginning`. `theta` are each
+    coefficient's weights of the functions of p; the cloud is that of the training regressors and the scheduling signal.
+    Implements `ambid.nonlinear.fit.NonlinearModel`.
     """
 
     dt: float  # s
-    n_inputs: int  # channels, with one that only schedules
     shape: LpvShape
     schedule: Schedule
-    # (n_theta,), SI, for signals in deviations from `*_level`; each coefficient's weights of the functions of p
-    theta: Array
-    u_level: Array  # (n_inputs,), SI
-    u_scale: Array
-    y_level: Array  # (1,), SI
-    y_scale: Array
-    cloud: Cloud  # of the training regressors and the scheduling signal
 
     @property
     def kind(self) -> str:
         """Under which files know it."""
         return "lpv"
-
-    @property
-    def n_outputs(self) -> int:
-        """One."""
-        return 1
 
     @property
     def lag(self) -> int:
@@ -515,15 +502,6 @@ class LpvModel:
                 out[of.place(of.order + i * of.nb + k)] = y / self.u_scale[column]
         out[of.place(of.n_process - 1)] = y
         return out
-
-    @property
-    def scaled_theta(self) -> Array:
-        """Parameters for scaled signals."""
-        return self.theta / self.unit
-
-    def with_theta(self, theta: Array) -> Self:
-        """Return the same model with other parameters."""
-        return replace(self, theta=theta)
 
     def at(self, p: float, covariance: Array | None = None) -> Frozen:
         """Return the linear model at one value of p, with standard deviations by the fit's `covariance`.
@@ -622,38 +600,22 @@ class LpvModel:
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
-        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
-        return {
-            "dt_s": self.dt,
-            "n_inputs": self.n_inputs,
-            "shape": fields_json(self.shape),
-            "schedule": fields_json(self.schedule),
-            **arrays,
-            "cloud": self.cloud.as_json(),
-        }
+        of = {"shape": fields_json(self.shape), "schedule": fields_json(self.schedule)}
+        return {"dt_s": self.dt, "n_inputs": self.n_inputs, **of, **self.numbers_json()}
 
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
-        try:
-            m, shape = int(found["n_inputs"]), read_as(LpvShape, found["shape"], "shape")
-            schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
-            if (
-                shape.form not in ("equation", "output")
-                or shape.offset not in ("scheduled", "constant")
-                or not schedule.high > schedule.low
-            ):
-                raise ValueError("form, offset or range of the schedule make no sense")
-            sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
-            if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
-                raise ValueError("columns or orders make no sense")
-            n = {"theta": shape.n_theta, "u_level": m, "u_scale": m, "y_level": 1, "y_scale": 1}
-            arrays: dict[str, Any] = {k: finite(found[k], size, k) for k, size in n.items()}
-            cloud = Cloud.from_json(found["cloud"], shape.n_process)
-            dt = float(found["dt_s"])
-            return cls(dt=dt, n_inputs=m, shape=shape, schedule=schedule, cloud=cloud, **arrays)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise EstimationError(f"no LPV model ({type(error).__name__}: {error}). Write the file again") from error
+        m, shape = int(found["n_inputs"]), read_as(LpvShape, found["shape"], "shape")
+        schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
+        words = shape.form in ("equation", "output") and shape.offset in ("scheduled", "constant")
+        if not words or not schedule.high > schedule.low:
+            raise ValueError("form, offset or range of the schedule make no sense")
+        sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
+        if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
+            raise ValueError("columns or orders make no sense")
+        numbers = read_numbers(found, shape.n_theta, m, 1, shape.n_process)
+        return cls(dt=float(found["dt_s"]), shape=shape, schedule=schedule, **numbers)
 
 
 def _spread(by: Array, P: Array) -> Array:

@@ -86,7 +86,6 @@ class NarxFunction(LaggedFunction):
     """yhat(t) = L z + c + W2 tanh(W1 z + b1), z = [y(t-1), .., y(t-ny), u(t-nk), .., u(t-nk-nu+1)]."""
 
     kind: ClassVar[str] = "narx"
-    title: ClassVar[str] = "neural NARX"
     p: int  # outputs
     m: int  # inputs
     ny: int

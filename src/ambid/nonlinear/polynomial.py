@@ -131,7 +131,6 @@ class PolynomialFunction(LaggedFunction):
     """
 
     kind: ClassVar[str] = "narmax"
-    title: ClassVar[str] = "NARMAX"
     ellipsoid: ClassVar[bool] = True
     numerators: tuple[tuple[Term, ...], ...]  # by output
     denominators: tuple[tuple[Term, ...], ...]

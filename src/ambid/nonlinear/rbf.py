@@ -114,7 +114,6 @@ class RbfFunction(LaggedFunction):
     """yhat(t) = L z + c + W phi, z = [y(t-1), .., y(t-ny), u(t-nk), .., u(t-nk-nu+1)], phi as in `blocks.Radial`."""
 
     kind: ClassVar[str] = "rbf"
-    title: ClassVar[str] = "radial basis network"
     p: int  # outputs
     m: int  # inputs
     ny: int

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.fit import NonlinearModel
+from ambid.nonlinear.cloud import Cloud
 
 Parts = tuple[tuple[Array, Array], ...]
 """Outputs (n_samples, n_outputs) and inputs (n_samples, n_inputs) of each record, scaled."""
 
 _FEWEST = 20  # rows of a record beyond its lags
+_NUMBERS = ("theta", "u_level", "u_scale", "y_level", "y_scale")
 _FAR = 2.0  # a mean of more than so many standard deviations makes powers of a signal alike
 
 
@@ -92,17 +94,55 @@ def _group(
     return [(x - level) / scale for x in values], level, scale
 
 
-class ScaledModel(NonlinearModel, Protocol):
-    """A nonlinear model that works on scaled deviations of the signals."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScaledModel(ABC):
+    """What all models have that work on scaled deviations of the signals; implements part of `NonlinearModel`."""
+
+    theta: Array  # (n_theta,), parameters for signals in deviations from `*_level`, in `unit` times those of the scaled
+    u_level: Array  # (n_inputs,), SI
+    u_scale: Array
+    y_level: Array  # (n_outputs,), SI
+    y_scale: Array
+    cloud: Cloud  # of the training regressors
 
     @property
-    def u_level(self) -> Array: ...  # noqa: D102
+    @abstractmethod
+    def unit(self) -> Array | float:
+        """What a scaled parameter of 1 is in `theta`."""
+
     @property
-    def u_scale(self) -> Array: ...  # noqa: D102
+    @abstractmethod
+    def lag(self) -> int:
+        """Samples of the past that a prediction needs."""
+
     @property
-    def y_level(self) -> Array: ...  # noqa: D102
+    def n_inputs(self) -> int:
+        """Number of inputs."""
+        return int(self.u_level.size)
+
     @property
-    def y_scale(self) -> Array: ...  # noqa: D102
+    def n_outputs(self) -> int:
+        """Number of outputs."""
+        return int(self.y_level.size)
+
+    @property
+    def scaled_theta(self) -> Array:
+        """Parameters for scaled signals."""
+        return self.theta / self.unit
+
+    def with_theta(self, theta: Array) -> Self:
+        """Return the same model with other parameters."""
+        return replace(self, theta=theta)
+
+    def numbers_json(self) -> dict[str, Any]:
+        """Return the fields that all models share as JSON-able values."""
+        return {**{k: getattr(self, k).tolist() for k in _NUMBERS}, "cloud": self.cloud.as_json()}
+
+
+def read_numbers(found: Mapping[str, Any], n_theta: int, m: int, p: int, n_cloud: int) -> dict[str, Any]:
+    """Read back what `ScaledModel.numbers_json` made, of `m` inputs and `p` outputs."""
+    sizes = zip(_NUMBERS, (n_theta, m, m, p, p), strict=True)
+    return {**{k: finite(found[k], n, k) for k, n in sizes}, "cloud": Cloud.from_json(found["cloud"], n_cloud)}
 
 
 def scaled(model: ScaledModel, u: Array, y: Array) -> tuple[Array, Array]:

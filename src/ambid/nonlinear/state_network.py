@@ -23,8 +23,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.documents import fields_json, read_as
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.search import search
-from ambid.nonlinear.cloud import Cloud
-from ambid.nonlinear.records import Parts, finite, scaled, with_head
+from ambid.nonlinear.records import Parts, ScaledModel, read_numbers, scaled, with_head
 
 Table = NDArray[np.int64]
 
@@ -362,21 +361,16 @@ class StateProblem:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StateNetwork:
+class StateNetwork(ScaledModel):
     """A trained network with its scaling and the cloud of its training (implements `NonlinearModel`).
 
     The state at the beginning is that which fits the first `lag` samples best, without G and K. Behind a sensor without
     sign there is no one-step predictor: what is measured does not correct the state, and a prediction is the free run
-    from the state that fits best, of searches from rest and from both signs.
+    from the state that fits best, of searches from rest and from both signs. In `theta` entries of A and B are in SI,
+    gains and hidden layer for scaled signals; the cloud is that of states and inputs in training.
     """
 
     layout: Layout
-    theta: Array  # (n_theta,), weights; entries of A and B in SI, gains and hidden layer for scaled signals
-    u_level: Array  # (n_inputs,), SI, what deviations are taken from, and their size
-    u_scale: Array
-    y_level: Array  # (n_outputs,), SI
-    y_scale: Array
-    cloud: Cloud  # of states and inputs in training, scaled
     delay: int = 0  # samples by which inputs act late
 
     @property
@@ -388,16 +382,6 @@ class StateNetwork:
     def dt(self) -> float:
         """Sampling interval in s."""
         return self.layout.dt
-
-    @property
-    def n_inputs(self) -> int:
-        """Number of inputs."""
-        return self.layout.n_inputs
-
-    @property
-    def n_outputs(self) -> int:
-        """Number of outputs."""
-        return self.layout.p
 
     @property
     def lag(self) -> int:
@@ -429,16 +413,13 @@ class StateNetwork:
         return found
 
     @property
-    def _scaled(self) -> Array:
-        return self.theta / self.layout.unit
+    def unit(self) -> Array | float:
+        """As `ScaledModel.unit`."""
+        return self.layout.unit
 
     @property
     def _weights(self) -> Array:
-        return self.layout.weights(self._scaled)
-
-    def with_theta(self, theta: Array) -> Self:
-        """Return the same model with other weights."""
-        return replace(self, theta=theta)
+        return self.layout.weights(self.scaled_theta)
 
     def predict(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.predict`; NaN from where the predictor diverges on."""
@@ -455,12 +436,12 @@ class StateNetwork:
         ys, us = self._late(u, y)
         x0, _ = self._first_state(ys, us, derive=False)
         out = np.full((np.asarray(u).shape[0], self.layout.width), np.nan)
-        out[self.delay :] = self.layout.matrices(self._scaled).run(ys, us, x0)[0][:-1]
+        out[self.delay :] = self.layout.matrices(self.scaled_theta).run(ys, us, x0)[0][:-1]
         return out
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.jacobian`, that of the first state included."""
-        layout, m, (ys, us) = self.layout, self.layout.matrices(self._scaled), self._late(u, y)
+        layout, m, (ys, us) = self.layout, self.layout.matrices(self.scaled_theta), self._late(u, y)
         x0, s = self._first_state(ys, us, derive=True)
         X, E = m.run(ys, us, x0)
         out = np.zeros((np.asarray(u).shape[0], self.n_outputs, self.theta.size))
@@ -471,7 +452,7 @@ class StateNetwork:
     def simulate(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.simulate`, from the state that these samples show."""
         whole, head = with_head(self, u, y)
-        m, (ys, us) = self.layout.matrices(self._scaled), self._late(u, whole)
+        m, (ys, us) = self.layout.matrices(self.scaled_theta), self._late(u, whole)
         x0, _ = self._first_state(ys, us, derive=False)
         k = min(self._head, us.shape[0])
         x = m.run(ys[:k], us[:k], x0)[0][-1]
@@ -501,38 +482,28 @@ class StateNetwork:
         """The first state that fits the first samples best, and its slopes by the weights."""
         y, u = y[: self._head], u[: self._head]
         if self.layout.sensor:
-            return _search_first_state(self.layout, self._scaled, y, u)
-        return _solve_first_state(self.layout.matrices(self._scaled), self.layout.n_theta, y, u, derive=derive)
+            return _search_first_state(self.layout, self.scaled_theta, y, u)
+        return _solve_first_state(self.layout.matrices(self.scaled_theta), self.layout.n_theta, y, u, derive=derive)
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
         layout = fields_json(self.layout, without=("dt", "sensor")) | {"anchored": self.layout.anchored}
-        arrays = {k: getattr(self, k).tolist() for k in ("theta", "u_level", "u_scale", "y_level", "y_scale")}
-        return {"dt_s": self.dt, "delay": self.delay, "layout": layout, **arrays, "cloud": self.cloud.as_json()}
+        return {"dt_s": self.dt, "delay": self.delay, "layout": layout, **self.numbers_json()}
 
     @classmethod
     def from_json(cls, found: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
-        try:
-            given = found["layout"]
-            layout = read_as(Layout, {**given, "dt": found["dt_s"], "sensor": not given["anchored"]}, "layout")
-            m, p = layout.n_inputs, layout.p
-            places = [*layout.rows, *(r for r, _ in layout.entries)]
-            columns = [c for _, c in layout.entries]
-            inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
-            inside = inside and max(columns) <= layout.n + m and max(layout.heads) < layout.width
-            if layout.form not in ("one-axis", "free") or not inside:
-                raise EstimationError("no state network: its states are not those of one. Write the file again")
-            arrays: dict[str, Any] = {
-                k: finite(found[k], n, k)
-                for k, n in {"theta": layout.n_theta, "u_level": m, "u_scale": m, "y_level": p, "y_scale": p}.items()
-            }
-            cloud = Cloud.from_json(found["cloud"], layout.width + m)
-            return cls(layout=layout, cloud=cloud, delay=int(found["delay"]), **arrays)
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise EstimationError(
-                f"no state network ({type(error).__name__}: {error}). Write the file again"
-            ) from error
+        given = found["layout"]
+        layout = read_as(Layout, {**given, "dt": found["dt_s"], "sensor": not given["anchored"]}, "layout")
+        places = [*layout.rows, *(r for r, _ in layout.entries)]
+        columns = [c for _, c in layout.entries]
+        inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
+        inside = inside and max(columns) <= layout.n + layout.n_inputs and max(layout.heads) < layout.width
+        if layout.form not in ("one-axis", "free") or not inside:
+            raise EstimationError("no state network: its states are not those of one. Write the file again")
+        n_cloud = layout.width + layout.n_inputs
+        numbers = read_numbers(found, layout.n_theta, layout.n_inputs, layout.p, n_cloud)
+        return cls(layout=layout, delay=int(found["delay"]), **numbers)
 
 
 def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
