@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.blackbox.roots import reflect, roots_of
+from ambid.blackbox.model import reflect, roots_of
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.criteria import information
 from ambid.estimation.documents import plain_json
