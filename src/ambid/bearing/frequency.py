@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.physical_target import physical_response
-from ambid.blackbox.frequency_lines import Lines, check_lines
+from ambid.blackbox.frequency import Lines, check_lines
 from ambid.errors import EstimationError, nearest
 from ambid.estimation import start as weak_form
 from ambid.estimation.estimate import Continuous

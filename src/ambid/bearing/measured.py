@@ -18,7 +18,7 @@ from ambid.arrays import Array
 from ambid.bearing.frequency import Channels, FrequencyEstimate, response
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_to_json
-from ambid.blackbox.frequency_lines import check_lines
+from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
 from ambid.estimation.documents import covariance_together, fields_json, plain_json
 from ambid.physics.discretise import discretise

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ambid.blackbox.convert import to_scipy as to_scipy
     from ambid.blackbox.data import IOData as IOData
     from ambid.blackbox.fit import BlackBoxFit as BlackBoxFit
-    from ambid.blackbox.frequency_rational import frf_ml as frf_ml
+    from ambid.blackbox.frequency import frf_ml as frf_ml
     from ambid.blackbox.frequency_subspace import best_conditioned as best_conditioned
     from ambid.blackbox.frequency_subspace import block_rows_condition as block_rows_condition
     from ambid.blackbox.frequency_subspace import frf_subspace as frf_subspace

@@ -120,7 +120,7 @@ STRUCTURES: Mapping[str, Structure] = {
 RESPONSE_STRUCTURES: Mapping[str, Structure] = {
     **_register(
         "transfer function",
-        "frequency_rational",
+        "frequency",
         ("frf-ml", "nb nf", "consistent", "G = N/D exp(-s delay), in s or z, by maximum likelihood"),
     ),
     **_register(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import Orders, check_order_names, left_open, single_order
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.frequency_lines import Lines, build_response_fit, check_lines, search_lines
+from ambid.blackbox.frequency import Lines, build_response_fit, check_lines, search_lines
 from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread

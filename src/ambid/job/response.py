@@ -163,7 +163,7 @@ def _fit_model(
     delay: Delay,
 ) -> BlackBoxFit:
     """Fit the black-box model; its operating point is that of the record, which a response does not show."""
-    from ambid.blackbox.frequency_rational import frf_ml
+    from ambid.blackbox.frequency import frf_ml
     from ambid.blackbox.frequency_subspace import frf_subspace
 
     if orders is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing.frequency import Channels, greybox_frf, response
-from ambid.blackbox.frequency_lines import Lines
+from ambid.blackbox.frequency import Lines
 from ambid.errors import EstimationError
 from ambid.physics.models import model
 from ambid.physics.presets import preset

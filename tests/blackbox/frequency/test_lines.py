@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.frequency_lines import check_lines
-from ambid.blackbox.frequency_rational import frf_ml
+from ambid.blackbox.frequency import check_lines, frf_ml
 from ambid.errors import EstimationError
 from tests.blackbox.frequency.responses import noisy, plant
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox import frequency_subspace
-from ambid.blackbox.frequency_lines import check_lines
+from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.frequency_subspace import frf_subspace
 from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
