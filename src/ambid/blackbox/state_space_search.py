@@ -35,6 +35,7 @@ from ambid.blackbox.subspace_projection import Realisation, kalman_gain, radius
 from ambid.errors import EstimationError
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.linear import directions, least_squares, one_thread
+from ambid.estimation.search import search
 
 _DOUBLINGS = 24  # samples as a power of two
 _FAINT = 1e-10  # Hankel singular value beside the largest below which a state is not scaled further
@@ -155,21 +156,6 @@ class Point:
         return bool(np.trace(self.noise) < 1.5 * _EXACT**2 * self.noise.shape[0])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Found:
-    """Where the search ended."""
-
-    point: Point
-    tangent: Array  # (n_theta, n_directions)
-    # (n_directions, n_directions), triangular root of the information along the tangent, first states and constants
-    # projected out
-    information: Array
-    n_numbers: int  # directions, first states and constants
-    iterations: int
-    converged: bool
-    promise: float  # fall of N log det that one more step promises
-
-
 def start_point(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Point | None:
     """Give a model the first states and constants that suit it best.
 
@@ -183,65 +169,61 @@ def start_point(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Poi
     return _settle(rough, np.zeros((model.theta.size, 0)), u, y)
 
 
-def search(start: Point, u: Array, y: Array, *, feedthrough: bool, tick: Tick = None) -> Found:
-    """Search from a start.
+class Likelihood:
+    """The problem that is searched: its vector holds first states, constants and coefficients.
 
-    `u`: (n_samples, n_inputs), scaled; `y`: (n_samples, n_outputs); `feedthrough`: whether D is estimated; `tick`:
-    called before each step.
+    The coordinates change at every triangle: the model is balanced there, and steps run along the tangent.
     """
-    point, damping, iterations = start, 1e-3, 0
-    k = start.model.order + start.model.n_outputs
-    while True:
-        if tick is not None:
-            tick()
-        model, x0 = balance(point.model, point.x0, point.noise)
-        point = replace(point, model=model, x0=x0)
-        ways = tangent(model, feedthrough=feedthrough)
-        factor = _triangle(point, ways, u, y)
-        promise = float(np.sum(factor[:-1, -1] ** 2))
-        better = None
-        if promise > _NEAR and not point.exact and iterations < _STEPS:
-            better, damping = _step(point, ways, factor, damping, u, y, feedthrough=feedthrough)
-        if better is None:
-            break
-        point, iterations = better, iterations + 1
-    return Found(
-        point=point,
-        tangent=ways,
-        information=factor[k:-1, k:-1],
-        n_numbers=factor.shape[1] - 1,
-        iterations=iterations,
-        converged=promise < _ROUNDING or point.exact,
-        promise=promise,
-    )
 
+    def __init__(self, start: Point, u: Array, y: Array, *, feedthrough: bool) -> None:
+        self.point = self._trial = start
+        self._seen: Point | None = None  # where the triangle was taken last
+        self.ways, self.factor = np.zeros((0, 0)), np.zeros((0, 0))
+        self._u, self._y, self._feedthrough = u, y, feedthrough
 
-def _step(
-    point: Point, ways: Array, factor: Array, damping: float, u: Array, y: Array, *, feedthrough: bool
-) -> tuple[Point | None, float]:
-    """Find a better point: more damping after failure, a shorter step where the predictor gets unstable."""
-    n, k = point.model.order, point.model.order + point.model.n_outputs
-    rows, right = factor[:-1, :-1], factor[:-1, -1]
-    seen = directions(rows)
-    while damping < 1e10:
-        change, part = seen.solve(right, damping), 1.0
-        model = point.model.with_theta(point.model.theta + ways @ change[k:])
-        while radius(model.A - model.K @ model.C) >= 1.0 and part > _SHORTEST:
+    @property
+    def vector(self) -> Array:
+        """First states, constants and coefficients of the last trial."""
+        return np.concatenate([self._trial.x0, self._trial.constant, self._trial.model.theta])
+
+    def cost(self, _: Array) -> float:
+        """Return N log det of the last trial, which is what is asked for."""
+        return self._trial.cost
+
+    def triangle(self, _: Array) -> Array:
+        """Return the triangle of first states, constants, directions and errors at the last trial."""
+        at = self._trial
+        if at is self._seen:
+            return self.factor
+        self._seen = at
+        model, x0 = balance(at.model, at.x0, at.noise)
+        self.point = replace(at, model=model, x0=x0)
+        self.ways = tangent(model, feedthrough=self._feedthrough)
+        self.factor = _triangle(self.point, self.ways, self._u, self._y)
+        return self.factor
+
+    @property
+    def promise(self) -> float:
+        """By how much one more step would lower the cost."""
+        return float(np.sum(self.factor[:-1, -1] ** 2))
+
+    def move(self, _: Array, step: Array) -> Array | None:
+        """Step from the point of the last triangle, less far where the predictor would get unstable."""
+        at, part = self.point, 1.0
+        n, k = at.model.order, at.model.order + at.model.n_outputs
+        while True:
+            model = at.model.with_theta(at.model.theta + self.ways @ (part * step[k:]))
+            if radius(model.A - model.K @ model.C) < 1.0:
+                break
             part *= 0.5
-            model = point.model.with_theta(point.model.theta + ways @ (part * change[k:]))
-        trial = None
-        if part > _SHORTEST:
-            near = replace(
-                point, model=model, x0=point.x0 + part * change[:n], constant=point.constant + part * change[n:k]
-            )
-            trial = _settle(near, linear(model, feedthrough=feedthrough), u, y)
-        left = right - part * rows @ change
-        promised = float(right @ right - left @ left)
-        if trial is not None and point.cost - trial.cost > 1e-3 * promised > 0:
-            good = point.cost - trial.cost > 0.5 * promised and part == 1.0
-            return trial, max(damping / 20, 1e-14) if good else damping
-        damping = max(damping, 1e-10) * 8
-    return None, damping
+            if part <= _SHORTEST:
+                return None
+        near = replace(at, model=model, x0=at.x0 + part * step[:n], constant=at.constant + part * step[n:k])
+        trial = _settle(near, linear(model, feedthrough=self._feedthrough), self._u, self._y)
+        if trial is None or not trial.cost < at.cost:
+            return None
+        self._trial = trial
+        return self.vector
 
 
 def _settle(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
@@ -343,8 +325,11 @@ def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
                 "Lower n, or take a longer record"
             )
         method, start = _start(data, first, orders, u, y, tick)
-        found = search(start, u, y, feedthrough=first.plan.feedthrough, tick=tick)
-    return _result(data, first, found, method, start)
+        problem = Likelihood(start, u, y, feedthrough=first.plan.feedthrough)
+        say = None if tick is None else lambda *_: tick()
+        done = search(problem, problem.vector, most=_STEPS, tolerance=0.0, settled=_NEAR, move=problem.move, tick=say)
+        problem.triangle(done.theta)
+    return _result(data, first, problem, len(done.costs) - 1, method, start)
 
 
 def _start(data: IOData, first: FirstModel, orders: Orders, u: Array, y: Array, tick: Tick) -> tuple[Method, Point]:
@@ -373,15 +358,18 @@ def _start(data: IOData, first: FirstModel, orders: Orders, u: Array, y: Array, 
     return min(points, key=lambda pair: pair[1].cost)
 
 
-def _result(data: IOData, first: FirstModel, found: Found, method: Method, start: Point) -> BlackBoxFit:
+def _result(
+    data: IOData, first: FirstModel, found: Likelihood, iterations: int, method: Method, start: Point
+) -> BlackBoxFit:
     """Give the numbers their units and say what has to be said of them."""
     m, plan, given = found.point.model, first.plan, first.plan.channels
     n_samples, n_y = given.y.shape
     # each output has its share of the numbers
-    widened = n_samples / (n_samples - found.n_numbers / n_y)
+    widened = n_samples / (n_samples - (found.factor.shape[1] - 1) / n_y)
     noise = found.point.noise * widened
     scaled = Realisation(model=m, innovation=noise, Q=m.K @ noise @ m.K.T, S=m.K @ noise, R=noise)
-    seen = directions(found.information)
+    k = m.order + n_y
+    seen = directions(found.factor[k:-1, k:-1])  # first states and constants projected out
     condition = min(seen.condition, 1e18)
     warnings = []
     if found.point.exact:
@@ -399,15 +387,15 @@ def _result(data: IOData, first: FirstModel, found: Found, method: Method, start
         data,
         plan,
         scaled,
-        found.tangent @ seen.inverse() @ found.tangent.T * widened,
+        found.ways @ seen.inverse() @ found.ways.T * widened,
         criterion=first.criterion,
-        n_estimated=found.tangent.shape[1],
+        n_estimated=found.ways.shape[1],
         offsets=operating_point(scaled, given, found.point.constant),
-        status="converged" if found.converged else "stalled",
+        status="converged" if found.promise < _ROUNDING or found.point.exact else "stalled",
         warnings=warnings,
         details={
             "start": method,
-            "iterations": found.iterations,
+            "iterations": iterations,
             "gain_nats": 0.5 * (start.cost - found.point.cost),
             "left_nats": 0.5 * found.promise,
             "condition_number": condition,
