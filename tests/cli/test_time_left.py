@@ -1,4 +1,4 @@
-"""The time left of a job: right at an even pace, in time right after a change, never jumping; shown on a terminal."""
+"""The time left of a job, shown on a terminal."""
 
 from __future__ import annotations
 
@@ -11,62 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from ambid.cli.terminal import TimeLeft, in_words
-
-
-def course(shares, *, step=0.1, end=None):
-    """Time left at each step of a job whose share over time is given, as (time, time left)."""
-    told, found = TimeLeft(0.0), []
-    for t in np.arange(0.0, end, step):
-        told.take(shares(t), t)
-        left = told.left(t)
-        if left is not None:
-            found.append((t, left))
-    return np.array(found)
-
-
-def test_an_even_pace_is_told_exactly() -> None:
-    t, left = course(lambda t: t / 20.0, end=20.0).T
-    assert t[0] < 1.0
-    np.testing.assert_allclose(left, 20.0 - t, atol=0.2)
-
-
-def test_after_a_change_of_pace_it_is_right_again_and_does_not_jump() -> None:
-    """Half of the work takes 5 s, the other half 20 s."""
-    t, left = course(lambda t: t / 10 if t < 5 else 0.5 + (t - 5) / 40, end=25.0).T
-    late = t > 12.0
-    np.testing.assert_allclose(left[late], 25.0 - t[late], atol=0.2 * 13.0)
-    assert np.max(np.diff(left)) < 1.5  # in a tenth of a second, though expectation rises from 5 s to 20 s
-    assert left[-1] < 1.5
-
-
-def test_uneven_words_give_an_even_countdown() -> None:
-    """A word each second or so, of what was done meanwhile."""
-    told, shown = TimeLeft(0.0), []
-    words = iter(np.cumsum(np.random.default_rng(1).uniform(0.2, 1.8, 40)))
-    due = next(words)
-    for t in np.arange(0.0, 25.0, 0.1):
-        if t >= due:
-            told.take(due / 30.0, t)
-            due = next(words)
-        if t > 5.0:
-            shown.append((t, told.left(t)))
-    t, left = np.array(shown).T
-    np.testing.assert_allclose(left, 30.0 - t, atol=2.5)
-    assert np.max(np.diff(left)) < 0.3
-
-
-def test_without_news_it_runs_down_to_half_and_waits() -> None:
-    told = TimeLeft(0.0)
-    assert told.share is None
-    told.take(0.0, 0.0)
-    assert told.left(5.0) is None
-    told.take(0.5, 5.0)
-    for t in np.arange(5.0, 60.0, 0.1):
-        left = told.left(t)
-    assert left == pytest.approx(2.5, abs=0.2)
-    told.take(0.3, 60.0)  # what is over stays so
-    assert told.share == 0.5
+from ambid.cli.terminal import in_words
 
 
 @pytest.mark.parametrize(
