@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ambid.acquire.device import Column, DeviceEvent, DeviceInfo
 from ambid.errors import DeviceError, UnitError
+from ambid.estimation.documents import fields_json, read_as
 from ambid.units import UNKNOWN, parse_unit
 
 SCHEMA = "ambid.journal/1"
@@ -72,11 +73,7 @@ class JournalHeader:
 
         Returns what `from_json` takes.
         """
-        columns = [asdict(c) for c in self.columns]
-        rest = {k: getattr(self, k) for k in ("rate_hz", "rig", "started", "version")}
-        return {
-            "schema": SCHEMA, "columns": columns, **rest, "device": dict(self.device), "rig_sha256": self.rig_sha256,
-        }  # fmt: skip
+        return {"schema": SCHEMA, **fields_json(self), "rig_sha256": self.rig_sha256}
 
     @classmethod
     def from_json(cls, found: Mapping[str, Any]) -> Self:
@@ -88,14 +85,9 @@ class JournalHeader:
             raise DeviceError(f"the journal's schema is {found.get('schema')!r}; this program reads {SCHEMA!r}."
                               " Recover it with the version that recorded it")  # fmt: skip
         try:
-            columns = tuple(
-                Column(name=c["name"], role=c["role"], unit=c["unit"], span=tuple(c["span"]) if c["span"] else None)
-                for c in found["columns"]
-            )
-            rest = {k: found[k] for k in ("rate_hz", "device", "rig", "started", "version")}
-            return cls(columns=columns, **rest)
-        except (KeyError, TypeError) as failure:
-            raise DeviceError(f"the journal's header lacks {failure}. It was written by another version") from None
+            return read_as(cls, found)
+        except (TypeError, ValueError) as failure:
+            raise DeviceError(f"the journal's header: {failure}. It was written by another version") from None
 
 
 def _check_unit(column: Column) -> None:
@@ -194,8 +186,7 @@ def event_of(text: bytes) -> DeviceEvent:
 
     `text`: payload of `event_frame`.
     """
-    found = json.loads(text)
-    return DeviceEvent(kind=found["kind"], what=found["what"], sample=found["sample"], count=found["count"])
+    return DeviceEvent(**json.loads(text))
 
 
 def preamble() -> bytes:
