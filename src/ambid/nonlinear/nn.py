@@ -27,12 +27,11 @@ from ambid.nonlinear.state_start import (
     NO_START,
     SHORT,
     find_delay,
+    first_network,
     grid_starts,
     guess_delay,
     matrices_json,
     search_start,
-    start_free,
-    start_one_axis,
     train_one_step,
 )  # fmt: skip
 from ambid.nonlinear.state_training import (
@@ -180,7 +179,7 @@ def _start(fitting: Fitting, tick: Tick | None) -> str:
     with fitting.stage("delay"):
         begun: State | str = fitting.state
         if fitting.counts_states:  # more than are needed: fewer would pass for a delay
-            begun = start_free(fitting.data, fitting.dt, fitting.data.n_outputs + _MORE)
+            begun = first_network(fitting.data, fitting.dt, fitting.data.n_outputs + _MORE)
         if isinstance(begun, str):
             return reason
         before = fitting.delay
@@ -204,10 +203,8 @@ def _find_first(fitting: Fitting) -> str:
     """Find a first network; return the reason where there is none."""
     reason, data, s = "", fitting.data, fitting.settings
     for past in (SHORT, *_LONG):
-        if s["form"] == "one-axis":
-            found = start_one_axis(data, fitting.dt, _heads(fitting), past)
-        else:
-            found = start_free(data, fitting.dt, s.get("states") or data.n_outputs, past)
+        heads = _heads(fitting) if s["form"] == "one-axis" else ()
+        found = first_network(data, fitting.dt, 3 if heads else s.get("states") or data.n_outputs, heads, past)
         if isinstance(found, str):
             reason = reason or found
             continue
@@ -232,7 +229,7 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
     assert fitting.state is not None
     if fitting.counts_states:
         p = data.n_outputs
-        starts = {n: [start_free(data, fitting.dt, n)] for n in range(p, p + _LARGEST + 1)}
+        starts = {n: [first_network(data, fitting.dt, n)] for n in range(p, p + _LARGEST + 1)}
         found = _choose_states(fitting, starts, choice, patience=2, stage="choice of states", iterations=6)
         fitting.state = found.state if found is not None else fitting.state
     first = fitting.state

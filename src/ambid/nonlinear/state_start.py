@@ -53,29 +53,51 @@ _PROCESS = (1e-8, 1e-5, 1e-2)  # variance of process noise over that of the stat
 # --- subspace models -------------------------------------------------------------------------------------------------
 
 
-def start_one_axis(data: Scaled, dt: float, heads: tuple[int, ...], past: int = SHORT) -> State | str:
-    """Return a first network of the form ``one-axis``, or the reason why there is none.
+def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), past: int = SHORT) -> State | str:
+    """Return a first network of `n` states, or the reason why there is none.
 
-    `heads` are the states (position, velocity, current) that outputs are; `past` samples the first model looks back.
+    With `heads`, the states (position, velocity, current) that outputs are, in the form ``one-axis``, else ``free``;
+    `past` samples the first model looks back.
     """
-    found = _subspace(data, 3, past)
+    p = data.n_outputs
+    if n < p:
+        raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
+    found = _subspace(data, n, past)
     if isinstance(found, str):
         return found
     A, B, C, K = found
-    continuous = _logarithm(A, B, dt)
-    if continuous is None:
-        return "the sampled model has no continuous one (a pole on the negative real axis): sample faster"
-    Ac, Bc = continuous
-    at = {s: C[o] for o, s in enumerate(heads)}
-    if 0 not in at or 2 not in at:
-        return "position and current are needed as outputs"
-    velocity = at[1] if 1 in at else at[0] @ Ac
-    unit = 1.0 if 1 in at else float(np.linalg.norm(velocity)) or 1.0
-    T = np.stack([at[0], velocity / unit, at[2]])
+    chains, ahead = tuple(n // p + (o < n % p) for o in range(p)), A - np.eye(n)
+    first = np.cumsum((0, *chains))[:-1].tolist()
+    if heads:
+        continuous = _logarithm(A, B, dt)
+        if continuous is None:
+            return "the sampled model has no continuous one (a pole on the negative real axis): sample faster"
+        A, B = continuous
+        chains, first, ahead = tuple(2 if s == 0 and 1 not in heads else 1 for s in heads), list(heads), A
+    T, steps = np.zeros((n, n)), np.zeros(n)
+    for o, length in enumerate(chains):
+        row = C[o]
+        for j in range(first[o], first[o] + length):
+            T[j] = row
+            if j + 1 < first[o] + length:
+                size = 1.0 if heads else max(float(np.linalg.norm(row)), 1e-300)
+                row = row @ ahead
+                steps[j] = float(np.linalg.norm(row)) / size
+                row = row / (steps[j] or 1.0)
     if not np.linalg.cond(T) < 1e10:
-        return "position, velocity and current cannot be told apart in the record: excite more"
-    M = _in_states(T, Ac, Bc)
-    return _begin(one_axis_layout(data, dt, heads, unit, M), M, T @ K, data)
+        return (
+            "position, velocity and current cannot be told apart in the record: excite more"
+            if heads
+            else "the outputs do not show all states: lower states, or excite more"
+        )
+    M = np.hstack([T @ A @ np.linalg.inv(T), T @ B, np.zeros((n, 1))])
+    if heads:
+        layout = one_axis_layout(data, dt, heads, steps[0] or 1.0, M)
+    else:
+        scale = (*np.repeat(data.y_scale, chains).tolist(), *data.u_scale.tolist())
+        layout = Layout.free(dt, chains, steps.tolist(), scale)
+    state = add_gain(State.of(layout, np.array([M[r, c] for r, c in layout.entries]), data), data, T @ K)
+    return NO_START if state is None else state
 
 
 def one_axis_layout(data: Scaled, dt: float, heads: tuple[int, ...], unit: float, M: Array) -> Layout:
@@ -93,44 +115,6 @@ def one_axis_layout(data: Scaled, dt: float, heads: tuple[int, ...], unit: float
         scale=(*scale.tolist(), *data.u_scale.tolist()),
         rates=tuple(float(np.linalg.norm(M[r, :4])) or 1.0 for r in (1, 2)), rows=(1, 2),
     )  # fmt: skip
-
-
-def start_free(data: Scaled, dt: float, n: int, past: int = SHORT) -> State | str:
-    """Return a first network of `n` states of the form ``free``, or the reason why there is none."""
-    p = data.y_level.size
-    if n < p:
-        raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
-    found = _subspace(data, n, past)
-    if isinstance(found, str):
-        return found
-    A, B, C, K = found
-    chains = tuple(n // p + (o < n % p) for o in range(p))
-    rows, steps = [], []
-    for o, length in enumerate(chains):
-        row = C[o]
-        for j in range(length):
-            rows.append(row)
-            ahead = row @ A - row
-            step = float(np.linalg.norm(ahead)) / max(float(np.linalg.norm(row)), 1e-300) if j + 1 < length else 0.0
-            steps.append(step)
-            row = ahead / step if step else row
-    T = np.stack(rows)
-    if not np.linalg.cond(T) < 1e10:
-        return "the outputs do not show all states: lower states, or excite more"
-    layout = Layout.free(dt, chains, steps, (*np.repeat(data.y_scale, chains).tolist(), *data.u_scale.tolist()))
-    return _begin(layout, _in_states(T, A, B), T @ K, data)
-
-
-def _in_states(T: Array, A: Array, B: Array) -> Array:
-    """[A | B | 0] in the states T x."""
-    return np.hstack([T @ A @ np.linalg.inv(T), T @ B, np.zeros((T.shape[0], 1))])
-
-
-def _begin(layout: Layout, M: Array, K: Array, data: Scaled) -> State | str:
-    """The network with weights [A | B | c] = M and its gain, if it runs."""
-    theta = np.array([M[r, c] for r, c in layout.entries])
-    state = add_gain(State.of(layout, theta, data), data, K)
-    return NO_START if state is None else state
 
 
 def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Array] | str:
