@@ -1,6 +1,6 @@
 """Compiled recursions of state-space networks in scaled signals: predictor and free run with exact sensitivities.
 
-e = y - x[heads], x+ = M [x; u; e; f], f = W2 phi(W1 [x; u] + b1); the last column of u is 1 and does not enter the
+e = y - x[heads], x+ = M [x; u; f; e], f = W2 phi(W1 [x; u] + b1); the last column of u is 1 and does not enter the
 hidden layer. Units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no value and no slope at the
 operating point. A sensor without sign adds a last state, z+ = rho z + (1 - rho) m, with m the mean of |x1| over the
 sampling interval, x1 being straight in it; units behind it are plain ones.
@@ -31,7 +31,7 @@ def _fill_step(
     heads: Table, W1: Array, b1: Array, W2: Array, sensor: bool, x: Array, u: Array, e: Array, v: Array, phi: Array,
     by_a: Array, by_b: Array,
 ) -> None:  # fmt: skip
-    """Write v = [x; u; e; f] of one sample, the units' values, and their slopes by a and b."""
+    """Write v = [x; u; f; e] of one sample, the units' values, and their slopes by a and b."""
     m, p, (q, h) = u.size, heads.size, W2.shape
     n = v.size - m - p - q
     for i in range(n):
@@ -39,8 +39,8 @@ def _fill_step(
     for i in range(m):
         v[n + i] = u[i]
     for i in range(p):
-        v[n + m + i] = e[i]
-    v[n + m + p :] = 0.0
+        v[n + m + q + i] = e[i]
+    v[n + m : n + m + q] = 0.0
     for k in range(h):
         a = 0.0
         for i in range(n + m - 1):
@@ -54,7 +54,7 @@ def _fill_step(
             by_a[k] -= db
             by_b[k] += 2.0 * tb * db * a - db
         for j in range(q):
-            v[n + m + p + j] += W2[j, k] * phi[k]
+            v[n + m + j] += W2[j, k] * phi[k]
 
 
 @compiled(error_model="numpy")
@@ -91,13 +91,13 @@ def slope_states(
 ) -> None:  # fmt: skip
     """Write the slopes of the predictions, out (n_samples, p, P); s (n or n + 1, P): of the state, first to last.
 
-    Columns: directions D (n, n + m + p + q, P1) of M, the last of them that of rho where there is a sensor, W1 row by
-    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `used` (n, n + m + p + q) is 0 where no
+    Columns: directions D (n, n + m + q + p, P1) of M, the last of them that of rho where there is a sensor, W1 row by
+    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `used` (n, n + m + q + p) is 0 where no
     direction changes an entry.
     """
     N, m, n, p, (q, h) = u.shape[0], u.shape[1], M.shape[0], heads.size, W2.shape
     P1, P, nz, sensor = D.shape[2], s.shape[1], n + m - 1, X.shape[1] > n
-    c_b, first_f = P1 + h * nz, n + m + p
+    c_b, first_f = P1 + h * nz, n + m
     c_W2 = c_b if sensor else c_b + h
     F, new = np.empty((n, n)), np.zeros((X.shape[1], P))
     phi, by_a, by_b, v = np.empty(h), np.empty(h), np.empty(h), np.empty(M.shape[1])
@@ -111,7 +111,7 @@ def slope_states(
                 F[i, j] = M[i, j]
             if not sensor:
                 for j in range(p):
-                    F[i, heads[j]] -= M[i, n + m + j]
+                    F[i, heads[j]] -= M[i, n + m + q + j]
             new[i] = 0.0
             for k in range(h):
                 g = 0.0

@@ -38,10 +38,10 @@ _SIGNS = (0.0, 1.0, -1.0)  # of the state that a search behind a sensor without 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matrices:
-    """What the recursions want, in scaled signals: M = [A | B | c | K | G] and its slopes D, the hidden layer."""
+    """What the recursions want, in scaled signals: M = [A | B | c | G | K] and its slopes D, the hidden layer."""
 
     heads: Table  # (n_outputs,), state that each output is
-    M: Array  # (n, n + n_inputs + 1 + n_outputs + n_rows)
+    M: Array  # (n, n + n_inputs + 1 + n_rows + n_outputs)
     D: Array  # (*M.shape, n_directions), by the first weights
     W1: Array
     b1: Array
@@ -62,17 +62,12 @@ class Matrices:
     @property
     def K(self) -> Array:
         """Predictor gain."""
-        return self.M[:, self._gain]
-
-    @property
-    def _gain(self) -> slice:
-        first = self.W1.shape[1] + 1
-        return slice(first, first + self.heads.size)
+        return self.M[:, -self.heads.size :]
 
     def without_gain(self, *, hidden: bool = True) -> Matrices:
         """Return the matrices without gain, and without slopes by it; `hidden` false leaves out the units as well."""
-        M, D, gone = self.M.copy(), self.D.copy(), self._gain if hidden else slice(self._gain.start, None)
-        M[:, gone], D[:, gone] = 0.0, 0.0
+        M, D, first = self.M.copy(), self.D.copy(), -self.heads.size if hidden else self.W1.shape[1] + 1
+        M[:, first:], D[:, first:] = 0.0, 0.0
         return replace(self, M=M, D=D)
 
     def run(self, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
@@ -221,12 +216,11 @@ class Layout:
             dF[j, r, c] = 1.0
         if self.form == "one-axis":
             F, dF = _sampled(F, dF, self.dt)
-        M, D = np.insert(F, [F.shape[1] - q] * self.p, 0.0, axis=1), np.zeros((n, F.shape[1] + self.p, P1))
-        own = np.arange(F.shape[1] - q, M.shape[1] - q)
-        D[:, np.delete(np.arange(M.shape[1]), own), :k] = np.moveaxis(dF, 0, 2)
+        M, D = np.hstack([F, np.zeros((n, self.p))]), np.zeros((n, F.shape[1] + self.p, P1))
+        D[:, : F.shape[1], :k] = np.moveaxis(dF, 0, 2)
         if self.gain:
-            M[:, own] = theta[k:P1].reshape(n, self.p)
-            D[np.repeat(np.arange(n), self.p), np.tile(own, n), np.arange(k, P1)] = 1.0
+            M[:, F.shape[1] :] = theta[k:P1].reshape(n, self.p)
+            D[:, F.shape[1] :, k:] = np.eye(n * self.p).reshape(n, self.p, -1)
         W1, b1, W2 = np.split(theta[P1:], np.cumsum(self.hidden_sizes)[:2])
         return Matrices(
             heads=np.array(self.heads, dtype=np.int64), M=M, D=D, W1=W1.reshape(h, n + self.n_inputs).copy(),
