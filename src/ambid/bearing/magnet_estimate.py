@@ -76,7 +76,9 @@ def estimate_bearing(
     few, many = (float(sum(r.u.size for r in x)) for x in (short, records))
     rich = extend and any(not law.rise or (law.pair and not law.asymmetric) for law in laws)
     again = _remembered(tick)
-    ticks = portions(again, [*[few] * len(laws), 2.0 * few * rich, many, many * (delay is None)])
+    longer = tuple(r.first(_LONGER) for r in records)
+    some = float(sum(r.u.size for r in longer)) * (max(r.u.size for r in records) > 2 * _LONGER)
+    ticks = portions(again, [*[few] * len(laws), 2.0 * few * rich, some, many, many * (delay is None)])
     with one_thread():
         linear = linear_start(free[0], known, delay, laws[0])
         fits = [
@@ -89,11 +91,10 @@ def estimate_bearing(
                 law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
                               asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
                 if law != fit.problem.law:
-                    fit = _extended(fit, law, known, short, linear, ticks[-3])
+                    fit = _extended(fit, law, known, short, linear, ticks[-4])
         whole, near = replace(fit.problem, records=tuple(records)), _FAR
-        if max(r.u.size for r in records) > 2 * _LONGER:  # a step or two over all samples will do from there
-            longer = tuple(r.first(_LONGER) for r in records)
-            fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-2])
+        if some:  # a step or two over all samples will do from there
+            fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
             near = _CLOSE if fit.status == "converged" else _FAR
         fit = search(whole, fit.vector, damping=near, tick=ticks[-2])
         fit = rescue(

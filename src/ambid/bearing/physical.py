@@ -64,7 +64,6 @@ def physical_parameters(
     *,
     delay: float | Literal["auto"] = "auto",
     roles: Mapping[str, str] | None = None,
-    band_hz: tuple[float, float] | None = None,
 ) -> PhysicalFit:
     """Return the physical parameters of a black-box model.
 
@@ -80,8 +79,6 @@ def physical_parameters(
         response shows one; the black box's own where it is in continuous time or has no number to spare.
     roles : Mapping[str, str], optional
         Role -> channel; by default by name, else by unit where only one channel has it.
-    band_hz : (float, float), optional
-        Use no frequencies outside; by default all that the black box knows to a third of its response.
 
     Returns
     -------
@@ -100,7 +97,7 @@ def physical_parameters(
     if not free:
         raise EstimationError("every parameter is fixed; nothing is left to find. Free at least one")
     with one_thread():
-        return _find(fit, model, parameters, free, delay, roles or {}, band_hz)
+        return _find(fit, model, parameters, free, delay, roles or {})
 
 
 def _find(
@@ -110,10 +107,9 @@ def _find(
     free: Sequence[Parameter],
     delay: float | Literal["auto"],
     roles: Mapping[str, str],
-    band_hz: tuple[float, float] | None,
 ) -> PhysicalFit:
     """Match, and judge the match."""
-    target = target_of(fit, model, roles, band_hz)
+    target = target_of(fit, model, roles)
     if target.rank < len(free):
         raise EstimationError(
             f"the {fit.structure} model has {target.rank} independent numbers for {len(free)} free parameters. Fix "
@@ -122,34 +118,6 @@ def _find(
     found = match(target, model, parameters, delay)
     own = target.dt is None or target.rank <= len(free)
     return _result(fit, model, parameters, target, found, delay_how="given" if delay != "auto" or own else "estimated")
-
-
-def agreement(found: PhysicalFit, names: Sequence[str], values: Array, covariance: Array) -> Check:
-    """Compare with another estimate of the same parameters, as that of the grey box.
-
-    `values`: (n,), SI; `covariance`: (n, n), SI. Returns wald test of the difference against the sum of both
-    covariances: wide for two estimates from one record, whose errors go together.
-    """
-    from scipy.stats import chi2
-
-    shared = [k for k in found.covariance_names if k in names]
-    if not shared:
-        raise EstimationError("the two estimates share no estimated parameter; nothing can be compared. Free the same")
-    here, there = [found.covariance_names.index(k) for k in shared], [list(names).index(k) for k in shared]
-    difference = np.array([found.values[k] for k in shared]) - np.asarray(values)[there]
-    total = found.covariance[np.ix_(here, here)] + np.asarray(covariance)[np.ix_(there, there)]
-    sd = np.sqrt(np.diag(total))
-    size, ways = np.linalg.eigh(total / np.outer(sd, sd))
-    statistic = float(np.sum((ways.T @ (difference / sd)) ** 2 / np.maximum(size, 1e-12)))
-    p = float(chi2.sf(statistic, len(shared)))
-    worst = max(zip(shared, np.abs(difference) / sd, strict=True), key=lambda pair: pair[1])
-    return Check(
-        passed=p > _MISFIT,
-        p=p,
-        detail=f"black box and other estimate differ by chi-square {statistic:.3g} in {len(shared)} parameters "
-        f"(p = {p:.2g}); most in {worst[0]}, by {worst[1]:.2g} joint standard deviations",
-        values={"statistic": statistic, "parameters": float(len(shared))},
-    )
 
 
 def _result(

@@ -69,9 +69,7 @@ class Target:
         return np.asarray((np.concatenate([points.real, points.imag]).T * self.root).T)
 
 
-def target_of(
-    fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str], band_hz: tuple[float, float] | None
-) -> Target:
+def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) -> Target:
     """Take out of a black box what a physical model has to meet.
 
     `roles`: role -> channel, where names do not tell.
@@ -93,10 +91,6 @@ def target_of(
     samples = fit.record.get("samples")
     low = 4 * np.pi / (fit.dt * (samples if isinstance(samples, int) and samples > 64 else 8192))
     high = 0.9 * nyquist
-    if band_hz is not None:
-        low, high = max(low, 2 * np.pi * band_hz[0]), min(high, 2 * np.pi * band_hz[1])
-    if not 0 < low < high:
-        raise EstimationError(f"no frequencies between {low / 6.2832:.3g} and {high / 6.2832:.3g} Hz. Widen the band")
     omega = np.unique(np.concatenate([np.linspace(low, high, _POINTS // 2), np.geomspace(low, high, _POINTS // 2)]))
     response, known = _known(fit, omega, rows, columns)
     if not np.any(known):

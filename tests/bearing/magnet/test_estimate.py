@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.bearing import magnet_estimate
 from ambid.bearing.magnet_estimate import balance, estimate_bearing
 from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.errors import EstimationError
@@ -51,6 +52,19 @@ def test_linearised_values_are_right_at_every_operating_point(bearing):
     found, _ = PAIR.table(x, i, fit.problem.values(fit.vector))
     exact, _ = PAIR.table(x, i, truth)
     assert found[:, 1:] == pytest.approx(exact[:, 1:], rel=0.01)
+
+
+def test_a_search_over_a_stretch_first_ends_where_one_over_all_samples_does(bearing, monkeypatch):
+    done, _, fit = bearing
+    seen = []
+    monkeypatch.setattr(magnet_estimate, "_LONGER", 2000)
+    monkeypatch.setattr(magnet_estimate, "search", lambda *a, **k: seen.append(search(*a, **k)) or seen[-1])
+    again = estimate_bearing([as_seen(d, str(n)) for n, d in enumerate(done)], KNOWN, laws=[PAIR], extend=False)
+    assert [f.problem.records[0].u.size for f in seen] == [4000, 2000, 6000]
+    assert seen[-1].evaluations <= 3
+    sd = np.sqrt(np.diag(np.linalg.inv(fit.at.J.T @ fit.at.J)))
+    assert again.criterion < fit.criterion + 0.05  # what a search may leave
+    assert np.abs((again.vector - fit.vector) / sd).max() < 0.2
 
 
 def test_nothing_is_left_in_the_innovations(bearing):

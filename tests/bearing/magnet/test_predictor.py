@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.magnet_likelihood import criterion, linearise, prior_rows, run
+from ambid.bearing.magnet_likelihood import criterion, linearise, prior_rows, promise, run
 from ambid.bearing.magnet_problem import BearingRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from tests.bearing.magnet.bearings import as_seen, problem_of, unstable
@@ -65,6 +65,20 @@ def test_sensitivities_of_mean_and_covariance_are_exact(bench, kind):
     problem = problem_of([record], truth, law, estimated, NOISE, 0.6 if kind in ("delay", "stage") else 1.0, **settings)
     vector = problem.start() + 1e-3 * np.random.default_rng(3).standard_normal(problem.size)
     gradient_agrees(problem, vector)
+
+
+def test_the_score_of_a_whole_delay_is_that_of_a_free_one_on_either_side(bench):
+    record, truth = bench
+    record = replace(record.first(600), valid=record.valid[:600])
+    problem = problem_of([record], truth, MagnetLaw(pair=True), PAIR - {"c"}, NOISE, 1.0)
+    free = replace(problem, free_delay=frozenset([record.rate_hz]))
+    at, place = linearise(problem, problem.start()), len(free.estimated)
+    for side, shift in enumerate((0.0, -1e-9)):
+        vector = free.start()
+        vector[place] += shift
+        beside = linearise(free, vector)
+        assert at.J_delay[:, side] @ at.r == pytest.approx(beside.J[:, place] @ beside.r, rel=1e-6)
+        assert promise(at, delay=side) == pytest.approx(promise(beside), rel=1e-6)
 
 
 def test_sensitivities_of_one_magnet_with_an_exponential_gap():
