@@ -63,26 +63,18 @@ ROOM = (_ROW + 2) * PITCH
 # places in `C`: A, F, H and T = P F' in rows of five, E in rows of two, then numbers
 _CA, _CF, _CH, _CT, _CE, _CN = 0, 25, 50, 75, 100, 110
 
-# Numba looks for edits of a kernel's own file alone: after one of the co-energy, run make clean
 _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 
 @compiled
-def drop_of(i: float, th: Array) -> tuple[float, float]:
-    """Return the share of v_drop that transistors and diodes take of the voltage at a current, and its slope."""
-    t = math.tanh(i / th[I_DROP])
-    return t, (1.0 - t * t) / th[I_DROP]
-
-
-@compiled
-def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, dw: Array, g: Array) -> tuple[float, float]:
-    """Write the right-hand side g (n,) at a state under a voltage; return the drop's share and slope, see `drop_of`.
+def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, g: Array) -> tuple[float, float]:
+    """Write the right-hand side g (n,) at a state under a voltage, from the co-energy's derivatives w (12,) there.
 
     Position, velocity and current, then the force behind the eddy pole, then a drifting force, where `flags`
-    (exponential, pair, eddy, drift, held) have them.
+    (exponential, pair, eddy, drift, held) have them. Returns the share of v_drop that transistors and diodes take, and
+    its slope by the current.
     """
-    x, v, i = z[0], z[1], z[2]
-    _energy(x, i, th, flags[0], flags[1], w, dw)
+    v, i = z[1], z[2]
     if not flags[4]:
         net = (z[3] if flags[2] else w[0]) - th[DAMPING] * v
         if flags[3]:
@@ -90,9 +82,9 @@ def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, dw: Array, g
         g[0], g[1] = v, net / th[MASS] + th[GRAVITY]
     if flags[2]:
         g[3] = th[POLE] * (w[0] - z[3])
-    share, steep = drop_of(i, th)
+    share = math.tanh(i / th[I_DROP])
     g[2] = (volt + th[V_OFF] - th[V_DROP] * share - th[RESISTANCE] * i - w[2] * v) / w[3]
-    return share, steep
+    return share, (1.0 - share * share) / th[I_DROP]
 
 
 @compiled
@@ -113,12 +105,6 @@ def jacobian(z: Array, th: Array, flags: Flags, w: Array, g: Array, steep: float
     C[_CA + 10] = (-w[5] * v - g[2] * w[6]) * per
     C[_CA + 11] = -w[2] * per
     C[_CA + 12] = (-th[RESISTANCE] - th[V_DROP] * steep - w[6] * v - g[2] * w[7]) * per
-
-
-@compiled
-def _padded(active: Integers) -> int:
-    """Return the number of lanes, with some that stay empty so that vector instructions leave none over."""
-    return min((active.size + 7) // 8 * 8, PITCH)
 
 
 @compiled
@@ -178,14 +164,15 @@ def _stage_lanes(states: States, p: int, forth: float, weight: float, C: Array, 
 
 @compiled
 def _advance(
-    states: States, z: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
+    states: States, p: int, z: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
     steps: int, w: Array, dw: Array, g: Array, at: Array, to: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
     """Carry state and sensitivities over one sample in place by `steps` classical Runge-Kutta steps.
 
     `volts`: mean and slope of the voltage over the sample, and their derivatives by a longer and by a shorter delay.
+    `_spread` has been where the sample begins: `w`, `dw` and the law's lanes are those.
     """
-    n, p, step = len(states), _padded(active), h / steps
+    n, step = len(states), h / steps
     for k in range(steps):
         for a in range(n):
             to[a], g[a] = z[a], 0.0
@@ -198,12 +185,14 @@ def _advance(
             where = (k + forth / step) / steps - 0.5
             for a in range(n):
                 at[a] = z[a] + forth * g[a]
-            drop = rates(at, volts[0] + volts[1] * where, th, flags, w, dw, g)
+            if stage + k > 0:
+                _energy(at[0], at[2], th, flags[0], flags[1], w, dw)
+                _law_lanes(active, chain, dw, X)
+            drop = rates(at, volts[0] + volts[1] * where, th, flags, w, g)
             for a in range(n):
                 to[a] += weight * g[a]
             if p:
                 jacobian(at, th, flags, w, g, drop[1], C)
-                _law_lanes(active, chain, dw, X)
                 _stage_factors(at, th, flags, w, g, drop, volts, where, C)
                 _stage_lanes(states, p, forth, weight, C, X)
         for a in range(n):
@@ -344,7 +333,7 @@ def _spread_lanes(states: States, p: int, drift: bool, q2: Array, C: Array, X: A
 
 @compiled
 def _spread(
-    states: States, z: Array, P: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
+    states: States, p: int, z: Array, P: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
     volts: Array, h: float, steps: int, w: Array, dw: Array, g: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
     """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the linearised plant.
@@ -353,9 +342,10 @@ def _spread(
     Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B of a
     step, put together over `steps` of them, a power of two.
     """
-    n, p = len(states), _padded(active)
+    n = len(states)
     h /= steps
-    drop = rates(z, volts[0], th, flags, w, dw, g)
+    _energy(z[0], z[2], th, flags[0], flags[1], w, dw)
+    drop = rates(z, volts[0], th, flags, w, g)
     jacobian(z, th, flags, w, g, drop[1], C)
     light, per, half = 0.0 if flags[4] else 1.0 / th[MASS], 1.0 / w[3], 0.5 * h * h
     for a in range(n):
@@ -468,10 +458,11 @@ def predict(
     and their derivatives before sample `first`, and move along. `e`, `s` (n, 2) get innovations and their variances;
     `rows` (4 (end - first), p + 1) the rows of the likelihood.
     """
-    n, p = len(states), active.size
+    n = len(states)
+    p = min((active.size + 7) // 8 * 8, PITCH)  # a few stay empty, so that vector instructions leave none over
     w, dw, C = np.zeros(12), np.zeros((7, MAGNET)), np.zeros(_CN + 14)
     g, at, to, volts, q2 = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(6), np.zeros(3)
-    for j in range(p):
+    for j in range(active.size):
         if active[j] >= MAGNET:
             X[(_KIND + active[j] - MAGNET) * PITCH + j] = chain[j]
     phi = th[LATE]
@@ -480,7 +471,7 @@ def predict(
             if valid[k, o]:
                 e[k, o] = y[k, o] - z[2 * o] - th[X_OFF + o]
                 row = 4 * (k - first) + 2 * o if p else 0
-                s[k, o] = _correct(states, e[k, o], o, noise2[o], _padded(active), z, P, C, X, rows[row : row + 2])
+                s[k, o] = _correct(states, e[k, o], o, noise2[o], p, z, P, C, X, rows[row : row + 2])
         late, now = u[k - whole - 1], u[k - whole]
         volts[0], volts[1] = phi * late + (1.0 - phi) * now, 6.0 * phi * (1.0 - phi) * (now - late)
         volts[2], volts[3] = late - now, 6.0 * (1.0 - 2.0 * phi) * (now - late)
@@ -490,8 +481,8 @@ def predict(
         q2[0] = noise2[2] + knock[k, 0]
         q2[1] = noise2[3] + max(loose[k - whole - 1], loose[k - whole]) + knock[k, 1]
         q2[2] = noise2[4]
-        _spread(states, z, P, th, active, chain, flags, q2, volts, h, steps, w, dw, g, C, X)
-        _advance(states, z, th, active, chain, flags, volts, h, steps, w, dw, g, at, to, C, X)
+        _spread(states, p, z, P, th, active, chain, flags, q2, volts, h, steps, w, dw, g, C, X)
+        _advance(states, p, z, th, active, chain, flags, volts, h, steps, w, dw, g, at, to, C, X)
         low, high = z[0] + th[1], th[1] - z[0]
         if not flags[0] and (low <= 0.0 or (flags[1] and high <= 0.0)):
             return False
