@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ambid.bearing.multistart import Signals, starts
 from ambid.estimation.likelihood import search, weight_of
-from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.predictor import PredictorProblem
 from ambid.job import signals_of
 from ambid.physics.loop import Noise
 from ambid.physics.models import model

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.bearing.linear import Signals
-from ambid.estimation.problem import PredictorProblem, Scales
+from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.models import model

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.predictor import PredictorProblem
 
 STEP = 1e-30
 

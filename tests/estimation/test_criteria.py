@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ambid.estimation.criteria import chi_squared_tail
+from ambid.estimation.uncertainty import chi_squared_tail
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 10, 25, 401, 2000])

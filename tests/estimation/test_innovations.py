@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from ambid.estimation.innovations import gain_derivatives, predictor_gain, solve_lyapunov, stable
+from ambid.estimation.predictor import gain_derivatives, predictor_gain, solve_lyapunov, stable
 from tests.bearing.benches import problem_of, run
 from tests.estimation.reference import STEP, riccati, sampled
 

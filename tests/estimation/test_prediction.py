@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.estimation.likelihood import search
-from ambid.estimation.prediction import expected_prediction_sd, prediction_error, simulation_error
+from ambid.estimation.likelihood import expected_prediction_sd, prediction_error, search, simulation_error
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations
 from ambid.validate.residuals import fit_of

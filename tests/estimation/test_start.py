@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.estimation.start import Regressors, candidates, moments
+from ambid.bearing.multistart import Regressors, candidates, moments
 from tests.bearing.benches import run
 
 

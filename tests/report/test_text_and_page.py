@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ambid.estimation.parts import Check
+from ambid.estimation.estimate import Check
 from ambid.report.estimate_text import estimate_text
 from ambid.report.page import report_html
 from ambid.report.text import check_lines, columns, verdict

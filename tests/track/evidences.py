@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from ambid.estimation.likelihood import weight_of
-from ambid.estimation.problem import PredictorProblem, Scales
+from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.estimation.sensitivity import Workspace, innovations, residual_blocks
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Noise

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing.uncertainty import uncertainty
-from ambid.estimation.likelihood import search
-from ambid.estimation.prediction import sparse_gain
+from ambid.estimation.likelihood import search, sparse_gain
 from ambid.estimation.sensitivity import innovations
 from ambid.physics.models import model
 from ambid.record import Channel, Record

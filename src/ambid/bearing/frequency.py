@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.bearing.multistart import Moments, weak_form_values
 from ambid.bearing.physical_target import physical_response
 from ambid.blackbox.frequency import Lines, check_lines
 from ambid.errors import EstimationError, nearest
-from ambid.estimation import start as weak_form
-from ambid.estimation.estimate import Continuous
+from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, Judged, Parametric
 from ambid.estimation.linear import directions, one_thread
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, Parametric
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -70,8 +69,8 @@ def start_values(
 ) -> Iterator[dict[str, float]]:
     """Yield start values: the equations of motion, linear in the parameters, by regression over bands of lines.
 
-    As `ambid.estimation.start`, with the response in place of the spectra: the input is 1 (times its hold), each output
-    its G. Nothing where the model's equations want an output that was not measured.
+    As `weak_form_values`, with the response in place of the spectra: the input is 1 (times its hold), each output its
+    G. Nothing where the model's equations want an output that was not measured.
 
     `known`: fixed values, SI. Returns all parameters, SI, as they come out (not always a plant).
     """
@@ -87,8 +86,8 @@ def start_values(
         noise[model.outputs[k]] = float(np.sqrt(np.mean(ln.sd[:, j, 0] ** 2)))
     if set(model.outputs) - set(signals):
         return
-    moments = weak_form.Moments(omega=omega, signals=signals)
-    for _, values in weak_form.candidates(model.name, moments, noise, [delay], 1.0 / ln.dt, known):
+    moments = Moments(omega=omega, signals=signals)
+    for _, values in weak_form_values(model.name, moments, noise, [delay], 1.0 / ln.dt, known):
         yield values
 
 

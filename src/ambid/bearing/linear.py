@@ -19,11 +19,9 @@ from ambid.arrays import Array
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
-from ambid.estimation.innovations import stable
 from ambid.estimation.likelihood import Fit, extend, promise_of, score_statistic, search, workspace_near
 from ambid.estimation.linear import one_thread
-from ambid.estimation.predictor import assemble
-from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.predictor import PredictorProblem, assemble, stable
 from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.estimation.problem import noise_floor
+from ambid.estimation.predictor import noise_floor
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.loop import Interval
 

@@ -13,7 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_problem import BODY, LEVELS, UNITS
-from ambid.estimation.documents import (
+from ambid.estimation.estimate import (
+    SCHEMA,
+    Check,
+    Continuous,
+    Delay,
+    EstimatedParameter,
+    Judged,
+    OutputFit,
+    Parametric,
     covariance_apart,
     covariance_together,
     fields_json,
@@ -22,8 +30,6 @@ from ambid.estimation.documents import (
     read_as,
     read_whole,
 )
-from ambid.estimation.estimate import SCHEMA, Continuous
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, OutputFit, Parametric
 from ambid.physics.coenergy_law import MagnetLaw
 
 

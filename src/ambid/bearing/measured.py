@@ -20,7 +20,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_to_json
 from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
-from ambid.estimation.documents import covariance_together, fields_json, plain_json
+from ambid.estimation.estimate import covariance_together, fields_json, plain_json
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import StateSpace
 from ambid.physics.models import model as physical_model

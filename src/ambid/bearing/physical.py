@@ -7,7 +7,7 @@ whether the black box is this physics at all.
 
 Lay the frequency response of a physical model through that of a black box.
 
-Starts come from the weak-form regressions of `ambid.estimation.start`, on the response instead of spectra; the search
+Starts come from the weak-form regressions of `ambid.bearing.multistart`, on the response instead of spectra; the search
 is SciPy's Levenberg-Marquardt with exact derivatives.
 """
 
@@ -20,12 +20,12 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.multistart import weak_form_values
 from ambid.bearing.physical_target import Target, physical_response, target_of
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, Parametric
 from ambid.estimation.linear import one_thread
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, Parametric
-from ambid.estimation.start import candidates
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.parameters import Parameter
@@ -384,7 +384,7 @@ def _possible(
 ) -> Iterator[dict[str, float]]:
     """Start values that make a plant: from the response, and with the values that were given."""
     for m in target.moments:
-        for _, values in candidates(model.name, m, {}, [delay], 1.0 / target.period_s, fixed):
+        for _, values in weak_form_values(model.name, m, {}, [delay], 1.0 / target.period_s, fixed):
             for trial in (values, {**values, **given}) if given != fixed else (values,):
                 finite = all(np.isfinite(v) for v in trial.values())
                 if finite and all(trial[p.name] > 0 for p in model.parameters if p.positive):

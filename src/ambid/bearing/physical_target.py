@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.bearing.multistart import Moments
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, TransferModel, response_covariance
 from ambid.errors import EstimationError
-from ambid.estimation.start import Moments
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import LinearModel
 

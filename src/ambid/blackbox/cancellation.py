@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, StateSpaceModel, TransferModel, roots_at
-from ambid.estimation.parts import Check
+from ambid.estimation.estimate import Check
 
 Complex = NDArray[np.complex128]
 _CHI2_999 = (10.827566170662733, 13.815510557964274)  # of one and two degrees of freedom

@@ -13,7 +13,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, UsedOrders
 from ambid.blackbox.model import BlackBoxModel, Offsets
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.parts import FittedModel
+from ambid.estimation.estimate import FittedModel
 
 Feedback = Literal["consistent", "biased", "with noise model"]
 Kind = Literal["polynomial", "state space", "transfer function"]

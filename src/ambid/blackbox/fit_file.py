@@ -19,7 +19,7 @@ from ambid.blackbox.model import (
     pole_covariance,
 )
 from ambid.errors import ModelError
-from ambid.estimation.documents import (
+from ambid.estimation.estimate import (
     by_output,
     check_schema,
     fields_json,

@@ -34,8 +34,8 @@ from ambid.blackbox.data import (
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import BlackBoxModel, Offsets, TransferModel
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.parts import Check
 from ambid.estimation.search import Rows, search
 from ambid.signals.response import FrequencyResponse
 

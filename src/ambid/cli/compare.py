@@ -37,7 +37,7 @@ def command(
 
     Without --validate, the last part of the record is held back. Best first.
     """
-    from ambid.estimation.documents import json_text, plain_json
+    from ambid.estimation.estimate import json_text, plain_json
     from ambid.job import compare
     from ambid.report.tables import comparison_text
 

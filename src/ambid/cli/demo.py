@@ -13,7 +13,7 @@ from ambid.cli.terminal import painter, progress
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ambid.estimation.parts import EstimatedParameter
+    from ambid.estimation.estimate import EstimatedParameter
     from ambid.report.text import Paint
 
 # Truth of the thesis's simulation rig (table 4.1, corrected) and what its own identification found there (eq. 4.11).

@@ -197,7 +197,7 @@ def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
 def _json_text(found: Any, extras: Sequence[tuple[str, Any, object]]) -> str:
     """Put a fit into ``ambid.fit/1``, with ``physical`` of a rig and ``sensitivity`` where they were asked for."""
     from ambid.blackbox.fit import BlackBoxFit
-    from ambid.estimation.documents import covariance_together, fields_json, json_text
+    from ambid.estimation.estimate import covariance_together, fields_json, json_text
 
     if not isinstance(found, BlackBoxFit):
         from ambid.nonlinear.fit_file import nonlinear_fit_text

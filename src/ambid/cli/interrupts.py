@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
-from ambid.estimation.progress import Tick
+from ambid.estimation.estimate import Tick
 
 INTERRUPTED = 130  # exit code
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import typer
 
-from ambid.estimation.progress import Tick, guessed, silent
+from ambid.estimation.estimate import Tick, guessed, silent
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar

@@ -30,7 +30,7 @@ def command(
 
     Without --rig: the record is read as the one that the estimate came from.
     """
-    from ambid.estimation.documents import json_text, plain_json
+    from ambid.estimation.estimate import json_text, plain_json
     from ambid.job.results import read_estimate, validate
     from ambid.report.estimate_text import validation_lines
     from ambid.report.fit_text import second_lines

@@ -1,27 +1,468 @@
-"""The estimate: parameters with covariance, model, fit, checks, warnings, timings, provenance."""
+"""The estimate: parameters with covariance, model, fit, checks, warnings, timings, provenance; its parts and its JSON.
+
+JSON: one writer and one reader for frozen dataclasses, driven by their annotations.
+
+A field becomes an entry of the same name; what a schema writes in another shape (a check's numbers beside its verdict,
+parameters by name) stands in the two tables below. Numbers that are not finite are null, and null is read as NaN where
+a number has to stand.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import json
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.estimation.documents import (
-    check_schema,
-    covariance_apart,
-    covariance_together,
-    fields_json,
-    json_text,
-    read_as,
-    read_whole,
-)
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, Judged, OutputFit, Parametric
+from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.physics.models import model
+from ambid.physics.parameters import Parameter
+
+
+class Tick(Protocol):
+    """What is called now and then while something is searched or worked through.
+
+    It may raise KeyboardInterrupt: estimators of the nonlinear register then give the best model so far.
+    """
+
+    def __call__(self, stage: str, done: float | None = None, /) -> None:
+        """Take note of the progress.
+
+        `stage`: what is done now, in words for the user.
+        """
+
+
+def silent(stage: str, done: float | None = None, /) -> None:
+    """Report no progress.
+
+    `stage`: not used; `done`: not used.
+    """
+    del stage, done
+
+
+def part_of(tick: Tick | None, begin: float, end: float) -> Tick | None:
+    """Return a tick for a part of a search, which counts its own share from 0 to 1.
+
+    `tick`: of the whole; `begin`, `end`: shares of the whole that are over where the part begins and ends. Returns none
+    where there is none for the whole.
+    """
+    if tick is None:
+        return None
+
+    def of_part(stage: str, done: float | None = None, /) -> None:
+        tick(stage, None if done is None else begin + (end - begin) * min(max(done, 0.0), 1.0))
+
+    return of_part
+
+
+def guessed(steps: int, usual: float) -> float:
+    """Guess which share of a loop is over that ends when nothing is gained any more.
+
+    `steps`: done so far; `usual`: such a loop takes about twice as many. Returns 0 at the begin, one half after the
+    usual number, below 1 however long it takes.
+    """
+    return steps / (steps + usual)
+
+
+def portions(tick: Tick | None, costs: Sequence[float]) -> list[Tick | None]:
+    """Return a tick for each of several parts of a search that come one after the other.
+
+    `tick`: of the whole. Returns as `part_of` makes them.
+    """
+    whole, before, out = sum(costs) or 1.0, 0.0, list[Tick | None]()
+    for cost in costs:
+        out.append(part_of(tick, before / whole, (before + cost) / whole))
+        before += cost
+    return out
+
+
+_NORMAL_95 = 1.959963984540054
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatedParameter:
+    """One parameter as it came out."""
+
+    name: str  # name and SI unit
+    unit: str
+    value: float  # SI; `sd` is 0 for a fixed parameter
+    sd: float
+    ci95: tuple[float, float]  # 95 % interval, value -+ 1.96 sd
+    role: Literal["free", "fixed", "prior"]
+    # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
+    identifiable: bool
+    data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
+
+    @classmethod
+    def of(
+        cls,
+        p: Parameter,
+        theta: Mapping[str, float],
+        sd: Mapping[str, float],
+        seen: Mapping[str, bool],
+        alone: Mapping[str, float] | None = None,
+    ) -> EstimatedParameter:
+        """Return a parameter as it came out.
+
+        `theta`, `sd`, `seen`: by name, value, standard deviation and whether the data show it; `alone`: standard
+        deviations that the data alone would give, for the share of a prior.
+        """
+        value, spread, share = theta[p.name], sd.get(p.name, 0.0), None
+        if alone is not None and p.role == "prior" and p.sd:
+            share = float(1 / (1 + (alone[p.name] / p.sd) ** 2))
+        return cls(
+            name=p.name,
+            unit=p.unit,
+            value=value,
+            sd=spread,
+            ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
+            role=p.role,
+            identifiable=seen.get(p.name, True),
+            data_share=share,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delay:
+    """Delay of an input: `samples` whole periods and a `fraction` of one."""
+
+    samples: int
+    fraction: float  # 0 <= fraction < 1
+    sd: float | None  # standard deviation of samples + fraction, where it was estimated as a real number
+    how: Literal["estimated", "given"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """Outcome of one check."""
+
+    passed: bool
+    detail: str  # one line for people: what was looked at, what was found, what to do
+    p: float | None = None  # probability of a result at least as extreme if the model is right
+    values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # further numbers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputFit:
+    """How well one output is predicted: 1 - |e| / |y - mean|, 1 is perfect."""
+
+    one_step: float  # from all samples before
+    simulation: float | None  # from the input alone; None where the plant is unstable in open loop
+    innovation_sd: float  # SI
+
+
+class Judged:
+    """A result with a status and checks."""
+
+    __slots__ = ()
+    status: str
+    checks: Mapping[str, Check]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the search converged and every check passed."""
+        return self.status == "converged" and all(c.passed for c in self.checks.values())
+
+
+class Parametric:
+    """A result that has named parameters."""
+
+    __slots__ = ()
+    parameters: tuple[EstimatedParameter, ...]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameter values, SI."""
+        return {p.name: p.value for p in self.parameters}
+
+    def parameter(self, name: str) -> EstimatedParameter:
+        """Return one parameter by name; EstimationError where there is none of that name."""
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        names = [p.name for p in self.parameters]
+        raise EstimationError(
+            f"the estimate has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FittedModel(Judged):
+    """What the fits of all structures hold, linear or not; their own classes say what it means there."""
+
+    structure: str
+    covariance: Array | None
+    n_estimated: int
+    noise_covariance: Array
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    dt: float
+    fit: Mapping[str, OutputFit] = field(default_factory=lambda: MappingProxyType({}))
+    criteria: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    checks: Mapping[str, Check] = field(default_factory=lambda: MappingProxyType({}))
+    validation: Mapping[str, object] | None = None
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def sd(self) -> Array | None:
+        """Standard deviation of ``model.theta``, shape (n_theta,), or None."""
+        return None if self.covariance is None else np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+T = TypeVar("T")
+
+COVARIANCE = types.MappingProxyType(
+    {"names": "covariance_names", "matrix": "covariance", "method": "covariance_method"}
+)
+"""Fields that stand together as the entry ``covariance``."""
+
+
+def plain_json(value: Any) -> Any:
+    """Return dicts, lists, strings, booleans, numbers and None for anything that a result holds.
+
+    Dataclasses become objects, complex numbers pairs; a number that is not finite becomes None.
+    """
+    if isinstance(value, (bool, str)) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): plain_json(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        if value and all(isinstance(v, EstimatedParameter) for v in value):
+            return {p.name: plain_json(p) for p in value}
+        return [plain_json(v) for v in value]
+    if isinstance(value, np.ndarray):
+        regular = value.dtype.kind == "f" and bool(np.isfinite(value).all())
+        return value.tolist() if regular else plain_json(value.tolist())
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (complex, np.complexfloating)):
+        return [plain_json(value.real), plain_json(value.imag)]
+    if is_dataclass(value) and not isinstance(value, type):
+        return _WRITERS.get(type(value), fields_json)(value)
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def fields_json(value: Any, *, without: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return the fields of a dataclass as JSON values, by name."""
+    return {f.name: plain_json(getattr(value, f.name)) for f in fields(value) if f.name not in without}
+
+
+def covariance_together(document: dict[str, Any]) -> dict[str, Any]:
+    """Return a document whose fields of the covariance stand together as one entry."""
+    found = {key: document[name] for key, name in COVARIANCE.items() if name in document}
+    rest = {key: value for key, value in document.items() if key not in COVARIANCE.values()}
+    return {**rest, "covariance": found}
+
+
+def covariance_apart(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document whose fields of the covariance stand as the dataclass has them."""
+    return {**document, **{name: document["covariance"][key] for key, name in COVARIANCE.items()}}
+
+
+def by_output(document: dict[str, Any]) -> dict[str, Any]:
+    """Return a document whose ``fit`` and ``validation``, where there is one output, stand at their top as well."""
+    for entry in ("fit", "validation"):
+        found = document[entry]
+        if found is not None and len(found) == 1:
+            first = next(iter(found.values()))
+            document[entry] = {**first, **{o: v for o, v in found.items() if o not in first}}
+    return document
+
+
+def only_outputs(document: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[str, Any]:
+    """Return a document whose ``fit`` and ``validation`` have the outputs alone."""
+    judged = document["validation"]
+    return {
+        **document,
+        "fit": {o: document["fit"][o] for o in outputs if o in document["fit"]},
+        "validation": None if judged is None else {o: judged[o] for o in outputs},
+    }
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """Return the text of a document, with a line feed at its end."""
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def check_schema(document: object, schema: str, where: str, what: str, verb: str) -> None:
+    """Refuse a document of another schema."""
+    found = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
+    if found != schema:
+        raise EstimationError(
+            f"{where} has schema {found!r}; {what} has {schema!r}. Give a file that 'ambid {verb} --json' wrote"
+        )
+
+
+def read_whole(read: Callable[[], T], where: str, what: str, verb: str) -> T:
+    """Return what a reader makes of a document; whatever it stumbles over is one line that names the file."""
+    try:
+        return read()
+    except (AmbidError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise EstimationError(
+            f"{where} is not a whole {what} ({type(error).__name__}: {error}). "
+            f"Write it again with 'ambid {verb} --json'"
+        ) from error
+
+
+def read_as(kind: type[T], value: Any, at: str = "") -> T:
+    """Read JSON as what an annotation says: dataclasses, arrays, mappings, tuples, unions, literals, plain values.
+
+    Raises ValueError with the path of the entry that is missing or of another type. Kinds that no rule is for, such as
+    ``object``, take the value as it is.
+    """
+    return cast("T", _read(kind, value, at))
+
+
+def _read(kind: Any, value: Any, at: str) -> Any:
+    origin, inner = get_origin(kind), get_args(kind)
+    if kind in _READERS:
+        return _READERS[kind](value, at)
+    if is_dataclass(kind):
+        return value if isinstance(value, cast("type", kind)) else _dataclass(kind, value, at)
+    if origin is np.ndarray:
+        return _array(inner[1], value, at)
+    if origin in (Union, types.UnionType):
+        return _first(inner, value, at)
+    if origin is Literal:
+        return value if value in inner else _refuse(value, at, " or ".join(map(repr, inner)))
+    if origin is tuple:
+        return _tuple(inner, value, at)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        entries = value if isinstance(value, Mapping) else _refuse(value, at, "an object")
+        return {str(k): _read(inner[1], v, f"{at}.{k}") for k, v in entries.items()}
+    return value
+
+
+def _dataclass(kind: Any, value: Any, at: str) -> Any:
+    if not isinstance(value, Mapping):
+        _refuse(value, at, "an object")
+    hints, found = _hints(kind), {}
+    for f in fields(kind):
+        place = f"{at}.{f.name}".lstrip(".")
+        if f.name in value:
+            found[f.name] = _read(hints[f.name], value[f.name], place)
+        elif f.default is MISSING and f.default_factory is MISSING:
+            raise ValueError(f"{place!r} is missing")
+    return kind(**found)
+
+
+@lru_cache(maxsize=64)
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _first(kinds: tuple[Any, ...], value: Any, at: str) -> Any:
+    """Read a union: None where it may stand, else as the first kind that takes the value."""
+    if value is None and types.NoneType in kinds:
+        return None
+    others = [kind for kind in kinds if kind is not types.NoneType]
+    for kind in others[:-1]:
+        try:
+            return _read(kind, value, at)
+        except (TypeError, ValueError):
+            continue
+    return _read(others[-1], value, at)
+
+
+def _tuple(kinds: tuple[Any, ...], value: Any, at: str) -> tuple[Any, ...]:
+    if kinds == (EstimatedParameter, ...) and isinstance(value, Mapping):
+        return tuple(_parameter(name, p, f"{at}.{name}") for name, p in value.items())
+    if not isinstance(value, (list, tuple)):
+        _refuse(value, at, "a list")
+    if len(kinds) == 2 and kinds[1] is Ellipsis:
+        return tuple(_read(kinds[0], v, f"{at}[{k}]") for k, v in enumerate(value))
+    if len(value) != len(kinds):
+        _refuse(value, at, f"{len(kinds)} values")
+    return tuple(_read(kind, v, f"{at}[{k}]") for k, (kind, v) in enumerate(zip(kinds, value, strict=True)))
+
+
+def _array(dtype: Any, value: Any, at: str) -> Any:
+    """Read numbers, null as NaN; text and truth values are no numbers."""
+    found = np.array(value)
+    if found.size and found.dtype.kind == "O":
+        found = np.array(value, dtype=np.float64)  # null becomes NaN; anything else raises
+    if found.size and found.dtype.kind not in "iuf":
+        _refuse(value, at, "numbers")
+    if get_args(dtype) == (np.complex128,):
+        pairs = found.astype(np.float64).reshape(-1, 2)
+        return pairs[:, 0] + 1j * pairs[:, 1]
+    return found.astype(np.float64)
+
+
+def _number(value: Any, at: str) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        _refuse(value, at, "a number")
+    return float(value)
+
+
+def _exactly(kind: type, what: str) -> Callable[[Any, str], Any]:
+    def read(value: Any, at: str) -> Any:
+        wrong = not isinstance(value, kind) or (kind is int and isinstance(value, bool))
+        return _refuse(value, at, what) if wrong else value
+
+    return read
+
+
+def _check(value: Any, at: str) -> Check:
+    named = ("passed", "detail", "p")
+    numbers = {name: x for name, x in value.items() if name not in named}
+    return cast("Check", _dataclass(Check, {**value, "values": numbers}, at))
+
+
+def _parameter(name: str, value: Any, at: str) -> EstimatedParameter:
+    if not isinstance(value, Mapping):
+        _refuse(value, at, "an object")
+    return cast("EstimatedParameter", _dataclass(EstimatedParameter, {**value, "name": name}, at))
+
+
+def _refuse(value: Any, at: str, wanted: str) -> Any:
+    text = repr(value)
+    raise ValueError(f"{at or 'it'} is {text if len(text) <= 40 else text[:37] + '...'} instead of {wanted}")
+
+
+def _write_check(check: Check) -> dict[str, Any]:
+    p = {} if check.p is None else {"p": plain_json(check.p)}
+    return {"passed": bool(check.passed), **p, **plain_json(check.values), "detail": check.detail}
+
+
+def _write_delay(delay: Delay) -> dict[str, Any]:
+    return {**fields_json(delay), "total": plain_json(delay.samples + delay.fraction)}
+
+
+def _write_parameter(p: EstimatedParameter) -> dict[str, Any]:
+    return fields_json(p, without=("name",) if p.data_share is not None else ("name", "data_share"))
+
+
+_WRITERS: dict[type, Callable[[Any], dict[str, Any]]] = {
+    Check: _write_check,
+    Delay: _write_delay,
+    EstimatedParameter: _write_parameter,
+}
+_READERS: dict[Any, Callable[[Any, str], Any]] = {
+    Check: _check,
+    float: _number,
+    int: _exactly(int, "a whole number"),
+    bool: _exactly(bool, "true or false"),
+    str: _exactly(str, "text"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,17 +1,323 @@
-"""The innovations-form predictor of a linear model at one vector of estimated numbers, with its exact derivatives."""
+"""The innovations-form predictor of a linear model: what is estimated, its gain, and it, with exact derivatives.
+
+The vector of estimated numbers holds, in this order: free and prior physical parameters (over their magnitudes), the
+delay where it is estimated, the noise description (log levels, or the gain itself), constant disturbances (offsets),
+initial state. States, inputs and outputs are scaled to order one before anything is factorised.
+
+From noise levels to the gain: the filter Riccati equation is solved by Newton steps from a gain nearby, from the stable
+subspace of the symplectic matrix or from SciPy's solution, and differentiated implicitly: with F = A - K C, dP = F dP
+F^T + dA P F^T + F P dA^T + dQ + K dR K^T (a Lyapunov equation, because the gain is stationary in P).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.estimation.innovations import Innovations, gain_derivatives, predictor_gain, predictor_gains, stable, stack
-from ambid.estimation.problem import PredictorProblem
 from ambid.physics.discretise import DiscreteSpace, discretise
-from ambid.physics.linear_model import StateSpace
+from ambid.physics.linear_model import LinearModel, StateSpace
+
+_BLOCK = 8192  # rows that are looked at at once: they stay in the cache
+NoiseForm = Literal["levels", "gain", "given"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scales:
+    """Units in which the predictor works."""
+
+    state: Array  # (n_states,)
+    input: Array  # (n_inputs,)
+    output: Array  # (n_outputs,), about the sensor noise of each output
+    # (n_disturbances,), level at which a disturbance moves an output by about its noise within a few samples
+    disturbance: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictorProblem:
+    """Data, model and what is to be estimated."""
+
+    model: LinearModel
+    rate_hz: float
+    u: Array  # (n_samples, n_inputs), deviations from the operating point, SI
+    y: Array  # (n_samples, n_outputs), deviations from the operating point, SI
+    estimated: tuple[str, ...]  # physical parameters in the vector
+    known: Mapping[str, float]  # the others, SI
+    magnitude: Array  # (n_estimated,), scale of each estimated physical parameter, SI
+    prior_mean: Array  # (n_estimated,), SI, standard deviation infinite where there is no prior
+    prior_sd: Array
+    scales: Scales
+    delay: int = 0  # whole samples of delay on all inputs
+    lag: float = 0.0  # fraction of a sample of delay on top, 0 <= lag < 1, where it is not estimated
+    # whether the delay is estimated as a real number near `delay`: delay - 1 < total < delay + 2
+    fractional: bool = False
+    # samples left out at the start, so that fits with different delays see the same data; at least ``delay + 2``
+    skip: int = 2
+    # the predictor sees every stride-th output (all inputs act); more than 1 only with noise "gain" or "given"
+    stride: int = 1
+    # noise as disturbance and sensor levels through the Riccati equation, as a free predictor gain, or as `gain`
+    noise: NoiseForm = "levels"
+    # (n_noise,), centre of the weak prior on the log noise levels
+    noise_center: Array = field(default_factory=lambda: np.zeros(0))
+    # (n_states, n_outputs), predictor gain in scaled units, for noise "given"
+    gain: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
+
+    def __post_init__(self) -> None:
+        if self.skip < self.delay + 2 or self.y.shape[0] <= self.skip:
+            raise ValueError(f"skip {self.skip} must exceed the delay {self.delay} by two and leave samples")
+        if self.stride > 1 and self.noise == "levels":
+            raise ValueError("a stride above 1 wants the noise as a gain")
+        n, n_y, n_d = len(self.model.states), len(self.model.outputs), len(self.model.disturbances)
+        sizes = {
+            "physical": self.n_physical,
+            "fraction": int(self.fractional),
+            "noise": {"levels": n_d + n_y - 1, "gain": n * n_y, "given": 0}[self.noise],
+            "offset": n_d,
+            "initial": n,
+        }
+        ends = list(accumulate(sizes.values(), initial=0))
+        object.__setattr__(self, "slices", {name: slice(*ends[j : j + 2]) for j, name in enumerate(sizes)})
+
+    @property
+    def n_physical(self) -> int:
+        """Number of estimated physical parameters."""
+        return len(self.estimated)
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return int(self.slices["initial"].stop)
+
+    @property
+    def taps(self) -> tuple[int, ...]:
+        """Lags beyond `delay`, in samples, at which the input acts over one sample."""
+        if self.fractional:
+            return (-1, 0, 1, 2)
+        return (0, 1) if self.lag else (0,)
+
+    @property
+    def lags(self) -> tuple[int, ...]:
+        """Lags beyond `delay` at which the input enters one step of the recursion, which is `stride` samples long."""
+        return tuple(range(self.taps[0] - (self.stride - 1), self.taps[-1] + 1))
+
+    @property
+    def n_used(self) -> int:
+        """Samples of each output that enter the fit."""
+        return int(-(-(self.y.shape[0] - self.skip) // self.stride))
+
+    def parameters(self, vector: Array) -> dict[str, float]:
+        """Return all physical parameters in SI at `vector`.
+
+        `vector`: (size,).
+        """
+        values = vector[self.slices["physical"]] * self.magnitude
+        return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
+
+    def lag_at(self, vector: Array) -> float:
+        """Return the delay in samples beyond `delay` at a vector.
+
+        `vector`: (size,).
+        """
+        return float(vector[self.slices["fraction"]][0]) if self.fractional else self.lag
+
+    def delay_samples(self, vector: Array) -> float:
+        """Return the whole delay in samples at a vector.
+
+        `vector`: (size,).
+        """
+        return self.delay + self.lag_at(vector)
+
+
+def noise_floor(y: Array) -> Array:
+    """Return about the white noise of each output.
+
+    Third differences remove smooth motion and amplify white noise by sqrt(1 + 9 + 9 + 1).
+
+    `y`: (n_samples, n_outputs). Returns (n_outputs,), positive, in the unit of `y`.
+    """
+    squares, rows = np.zeros(y.shape[1]), max(y.shape[0] - 3, 1)
+    for first in range(0, y.shape[0] - 3, _BLOCK):
+        part = y[first : first + _BLOCK + 3]
+        third = part[3:] - part[:-3] - 3.0 * (part[2:-1] - part[1:-2])
+        squares += np.einsum("ij,ij->j", third, third)
+    floor = np.sqrt(squares / rows / 20)
+    return np.asarray(np.maximum(floor, 1e-9 * np.std(y, axis=0)))
+
+
+def scales_for(
+    model: LinearModel, values: Mapping[str, float], inputs: Array, outputs: Array, rate_hz: float
+) -> Scales:
+    """Return the scales of a predictor.
+
+    Sensor noise for outputs and states; for disturbances, what moves the outputs by that within two samples.
+
+    `values`: rough parameters, SI; `inputs`: (n_inputs,), SI, standard deviations of the inputs; `outputs`:
+    (n_outputs,), SI, about the noise of the outputs, see `noise_floor`.
+    """
+    return all_scales(model, [values], inputs, outputs, rate_hz)[0]
+
+
+def all_scales(
+    model: LinearModel, places: Sequence[Mapping[str, float]], inputs: Array, outputs: Array, rate_hz: float
+) -> list[Scales]:
+    """Return the scales of predictors at several places, see `scales_for`."""
+    spaces = [model.matrices(values) for values in places]
+    A, B, E = (np.array(matrices) for matrices in zip(*((s.A, s.B, s.E) for s in spaces), strict=True))
+    discrete, _ = discretise(StateSpace(A=A, B=B, E=E, C=spaces[0].C), 1.0 / rate_hz)
+    reach = np.maximum(np.abs(discrete.C @ discrete.E), np.abs(discrete.C @ discrete.A @ discrete.E))
+    state = np.array([outputs[model.outputs.index(s)] if s in model.outputs else 0.0 for s in model.states])
+    state[state == 0] = outputs[0] * rate_hz / 20  # velocity, the only state that is not measured
+    return [
+        Scales(state=state, input=inputs, output=outputs, disturbance=disturbance)
+        for disturbance in 1 / np.max(reach / outputs[:, None], axis=1)
+    ]
+
+
+_STEP = 1e-7  # of a Newton step, relative: convergence is quadratic, which leaves an error of about 1e-14
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Innovations:
+    """Stationary Kalman predictor."""
+
+    K: Array  # (n_states, n_outputs), predictor gain, x[k+1|k] = A x[k|k-1] + ... + K e[k].
+    P: Array  # (n_states, n_states), covariance of the prediction error of the state
+    S: Array  # (n_outputs, n_outputs), covariance of the innovation
+
+
+def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None = None) -> Innovations:
+    """Solve P = A P A^T - A P C^T (C P C^T + R)^-1 C P A^T + Q and return the predictor gain.
+
+    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `Q`: (n_states, n_states), process noise covariance; `R`:
+    (n_outputs, n_outputs), measurement noise covariance, positive definite; `near`: (n_states, n_outputs). Returns K, P
+    and S; A - K C is stable.
+    """
+    K = near if near is not None and stable(A - near @ C) else None
+    P = None if K is None else _newton(A, C, Q, R, K)
+    if P is None:
+        rough = _stable_subspace(A, C, Q, R)
+        K = None if rough is None else _gain_of(A, C, rough, R)
+        P = None if K is None or not stable(A - K @ C) else _newton(A, C, Q, R, K, rough)
+    if P is None:
+        from scipy.linalg import solve_discrete_are
+
+        with np.errstate(invalid="ignore", over="ignore"):
+            P = solve_discrete_are(A.T, C.T, Q, R)
+        # the general solver's accuracy suffers where poles crowd at one; Newton takes it to rounding
+        P = _newton(A, C, Q, R, _gain_of(A, C, P, R))
+        if P is None:
+            raise np.linalg.LinAlgError("the Riccati equation has no stabilising solution")
+    S = C @ P @ C.T + R
+    return Innovations(K=_gain_of(A, C, P, R), P=P, S=S)
+
+
+def predictor_gains(A: Array, C: Array, Q: Array, R: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the predictor gains of several plants at once, and for which of them the quick way leads to one.
+
+    `A`, `Q`: (n_plants, n_states, n_states); `C`, `R`: as for `predictor_gain`, of all of them. Returns (n_plants,
+    n_states, n_outputs).
+    """
+    P = _stable_subspace(A, C, Q, R)
+    if P is None:
+        return np.zeros((*A.shape[:-1], C.shape[0])), np.zeros(A.shape[0], dtype=bool)
+    K = _gain_of(A, C, P, R)
+    started = np.abs(np.linalg.eigvals(A - K @ C)).max(axis=-1) < 1.0
+    for _ in range(8):
+        before, P = P, solve_lyapunov(A - K @ C, Q + K @ R @ _turned(K))
+        K = _gain_of(A, C, P, R)
+        settled = np.abs(P - before).max(axis=(1, 2)) <= _STEP * np.abs(P).max(axis=(1, 2))
+        if np.all(settled | ~started):
+            break
+    return K, started & settled
+
+
+def _turned(a: NDArray[Any]) -> NDArray[Any]:
+    """Transpose of one or several stacked matrices."""
+    return np.swapaxes(a, -1, -2)
+
+
+def _stable_subspace(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
+    """P from the eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd.
+
+    Of one plant, or of several stacked; None where that is impossible for one of them.
+    """
+    n = A.shape[-1]
+    try:
+        back = _turned(np.linalg.inv(A))
+        left = back @ C.T @ np.linalg.solve(R, C)
+        values, vectors = np.linalg.eig(
+            np.concatenate([np.concatenate([back, left], -1), np.concatenate([Q @ back, A + Q @ left], -1)], -2)
+        )
+        chosen = np.take_along_axis(vectors, np.argsort(np.abs(values))[..., None, n:], -1)
+        P = np.real(_turned(np.linalg.solve(_turned(chosen[..., :n, :]), _turned(chosen[..., n:, :]))))
+    except np.linalg.LinAlgError:
+        return None
+    return 0.5 * (P + _turned(P)) if np.all(np.isfinite(P)) else None
+
+
+def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | None = None) -> Array | None:
+    """Iterate Newton-Kleinman from a stabilising gain; None where it does not settle in a few steps."""
+    for _ in range(8):
+        P = solve_lyapunov(A - K @ C, Q + K @ R @ K.T)
+        if before is not None and np.abs(P - before).max() <= _STEP * np.abs(P).max():
+            return P
+        K, before = _gain_of(A, C, P, R), P
+    return None
+
+
+def _gain_of(A: Array, C: Array, P: Array, R: Array) -> Array:
+    """Predictor gain A P C^T (C P C^T + R)^-1."""
+    seen = C @ P
+    return np.asarray(_turned(np.linalg.solve(seen @ C.T + R, seen @ _turned(A))), dtype=np.float64)
+
+
+def solve_lyapunov(F: Array, Q: Array) -> Array:
+    """Solve P = F P F^T + Q for one or several symmetric right-hand sides, or for several plants with one each.
+
+    `F`: (n, n), stable, or (n_plants, n, n); `Q`: symmetric right-hand sides. Returns symmetric solutions.
+    """
+    n = F.shape[-1]
+    kronecker = (F[..., :, None, :, None] * F[..., None, :, None, :]).reshape(*F.shape[:-2], n * n, n * n)
+    right = Q.reshape(-1, n * n).T if F.ndim == 2 else Q.reshape(-1, n * n, 1)
+    P = _turned(np.linalg.solve(np.eye(n * n) - kronecker, right)).reshape(Q.shape)
+    return np.asarray(0.5 * (P + _turned(P)), dtype=np.float64)
+
+
+def gain_derivatives(A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array) -> Array:
+    """Differentiate the predictor gain exactly along p directions.
+
+    `A`: (n_states, n_states); `C`: (n_outputs, n_states), independent of the parameters; `at`: solution at the point;
+    `dA`, `dQ`: (p, n_states, n_states); `dR`: (p, n_outputs, n_outputs). Returns (p, n_states, n_outputs), dK = (dA P
+    C^T + F dP C^T - K dR) S^-1.
+    """
+    F = A - at.K @ C
+    cross = dA @ at.P @ F.T
+    dP = solve_lyapunov(F, cross + np.swapaxes(cross, 1, 2) + dQ + at.K @ dR @ at.K.T)
+    right = dA @ at.P @ C.T + F @ dP @ C.T - at.K @ dR
+    return np.swapaxes(np.linalg.solve(at.S, np.swapaxes(right, 1, 2)), 1, 2)
+
+
+def stable(F: Array) -> bool:
+    """Return whether all eigenvalues of `F` lie inside the unit circle.
+
+    `F`: (n, n). Returns true where the spectral radius is below one.
+    """
+    return bool(np.abs(np.linalg.eigvals(F)).max() < 1.0)
+
+
+def stack(matrices: Sequence[Array], shape: tuple[int, ...]) -> Array:
+    """Stack matrices along a new first axis, keeping the shape where there is none.
+
+    Returns (p, *shape).
+    """
+    return np.array(matrices) if matrices else np.zeros((0, *shape))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,8 +13,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.linear import column_sizes
-from ambid.estimation.predictor import Predictor, assemble
-from ambid.estimation.problem import PredictorProblem
+from ambid.estimation.predictor import Predictor, PredictorProblem, assemble
 
 _BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
 _QR_ROWS = 256  # rows of one small QR: below the size at which the linear algebra library starts threads

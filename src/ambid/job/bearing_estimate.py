@@ -16,7 +16,7 @@ from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.bearing.rescue import describe_search
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
 from ambid.validate.nonlinear_bearing import WhitenessTest, whiteness

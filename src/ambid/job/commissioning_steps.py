@@ -18,8 +18,7 @@ from ambid.acquire.device import Device
 from ambid.acquire.recording import Acquired
 from ambid.acquire.session import Course
 from ambid.arrays import Array
-from ambid.estimation.documents import fields_json
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.estimate import Estimate, fields_json
 from ambid.job.track_live import LiveTrack
 from ambid.report.numbers import quantity, sized
 

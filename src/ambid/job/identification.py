@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.estimate import Estimate, Tick, silent
 from ambid.estimation.linear import one_thread
-from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, rig_entry, signals_of
 from ambid.physics.models import model
 from ambid.record import Record
@@ -23,8 +22,8 @@ from ambid.rig import Rig
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
+    from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
-    from ambid.estimation.parts import Check
     from ambid.job.bearing_records import BearingWords, TakenRecord
     from ambid.report.figures import BearingEvidence, Evidence
 
@@ -109,9 +108,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
 
     `bench`: the record it came from, channels named by role.
     """
-    from ambid.bearing.result import estimate_of
-    from ambid.bearing.uncertainty import uncertainty
-    from ambid.estimation.prediction import simulation_error
+    from ambid.bearing.uncertainty import estimate_of, uncertainty
+    from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validate import physical
     from ambid.validate.residuals import fit_of

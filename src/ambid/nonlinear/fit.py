@@ -12,7 +12,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.parts import FittedModel
+from ambid.estimation.estimate import FittedModel
 from ambid.estimation.search import Found
 
 Settings = Mapping[str, int | float | str | tuple[int, ...]]

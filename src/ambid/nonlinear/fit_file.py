@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.documents import (
+from ambid.estimation.estimate import (
     by_output,
     check_schema,
     fields_json,

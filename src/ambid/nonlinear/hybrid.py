@@ -26,10 +26,10 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import penalty
+from ambid.estimation.estimate import Tick, guessed, part_of, portions
 from ambid.estimation.linear import information_inverse
-from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import search
+from ambid.estimation.uncertainty import penalty
 from ambid.nonlinear.blocks import Block, Linear, Table, Tanh
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags

@@ -19,12 +19,11 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.model import reflect, roots_of
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.criteria import information
-from ambid.estimation.documents import plain_json
+from ambid.estimation.estimate import Tick, plain_json, portions
 from ambid.estimation.linear import information_inverse, triangle_of
 from ambid.estimation.linear import least_squares as solve
-from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
+from ambid.estimation.uncertainty import information
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged_problem import guarded

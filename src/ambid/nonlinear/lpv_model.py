@@ -30,7 +30,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.model import root_derivative, roots_of, stable
 from ambid.errors import EstimationError
-from ambid.estimation.documents import fields_json, read_as
+from ambid.estimation.estimate import fields_json, read_as
 from ambid.estimation.linear import triangle_of
 from ambid.nonlinear.records import ScaledModel, read_numbers, scaled, with_head
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.criteria import EXACT, information, penalty
+from ambid.estimation.uncertainty import EXACT, information, penalty
 from ambid.nonlinear.polynomial import Factor, Term
 
 _BLOCK = 4096  # rows at a time: a block of some hundred candidates stays in the cache of the second level

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.documents import fields_json, read_as
+from ambid.estimation.estimate import fields_json, read_as
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.search import search
 from ambid.nonlinear.records import Parts, ScaledModel, read_numbers, scaled, with_head

@@ -14,11 +14,10 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.criteria import explained_by_past
+from ambid.estimation.estimate import Tick, part_of, portions
 from ambid.estimation.linear import information_inverse
-from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
-from ambid.estimation.uncertainty import bootstrapped
+from ambid.estimation.uncertainty import bootstrapped, explained_by_past
 from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit, failed_fit
 from ambid.nonlinear.lagged_problem import sandwich_at

@@ -1,7 +1,7 @@
 """The register of nonlinear structures: what each is called, what it is told, what feedback does to it.
 
 An estimator is a function ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit``: `records` a sequence
-of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.progress.Tick`) called now and
+of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.estimate.Tick`) called now and
 then with the name of the stage and the share of the whole search that is over; it may raise KeyboardInterrupt, upon
 which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers that are not finite, end
 in status ``failed`` with the reason, never in an exception; an exception is a request that makes no sense. The

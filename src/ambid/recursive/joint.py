@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.problem import scales_for
+from ambid.estimation.predictor import scales_for
 from ambid.physics.discretise import DiscreteSpace, discretise
 from ambid.physics.linear_model import LinearModel, StateSpace
 from ambid.physics.models import model as model_named

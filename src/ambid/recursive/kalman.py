@@ -236,7 +236,7 @@ class KalmanFilter:
 def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
     """Return the covariance (n_states, n_states) to begin with, the stationary one where none is given."""
     if covariance is None:
-        from ambid.estimation.innovations import predictor_gain
+        from ambid.estimation.predictor import predictor_gain
 
         try:
             P = predictor_gain(model.A, model.C, model.Q, model.R).P

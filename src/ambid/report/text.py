@@ -11,7 +11,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.report.numbers import Quantity, quantity, sized
 
 Style = Literal["good", "bad", "dim", "strong"]

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self, TextIO, TypeVar
 
 from ambid.errors import AmbidError, RecordError
-from ambid.estimation.documents import fields_json, plain_json, read_as
+from ambid.estimation.estimate import fields_json, plain_json, read_as
 from ambid.record.files import file_bytes
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 

@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
-from ambid.estimation.innovations import predictor_gain
-from ambid.estimation.predictor import assemble
-from ambid.estimation.problem import NoiseForm, PredictorProblem, Scales, scales_for
+from ambid.estimation.predictor import NoiseForm, PredictorProblem, Scales, assemble, predictor_gain, scales_for
 from ambid.physics.discretise import discretise
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.models import model

@@ -12,7 +12,7 @@ import numpy as np
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.errors import EstimationError
-from ambid.estimation.documents import fields_json
+from ambid.estimation.estimate import fields_json
 from ambid.validate.fits import judge
 from ambid.validate.orders import HELD_OUT, hold_out, select
 

@@ -21,9 +21,9 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.blackbox.prediction import Errors, Gradient, errors, errors_elsewhere, gradient
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import criteria, skipped
+from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
-from ambid.estimation.parts import Check
+from ambid.estimation.uncertainty import criteria, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.validate.residuals import (

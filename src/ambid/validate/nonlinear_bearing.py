@@ -12,7 +12,7 @@ from ambid.bearing.magnet_likelihood import BearingFit, run, sweep
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
-from ambid.estimation.parts import Check
+from ambid.estimation.estimate import Check
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validate.second_record import conclude, consistency_check
 

@@ -21,7 +21,7 @@ from ambid.blackbox.data import IOData, UsedOrders, compact_order
 from ambid.blackbox.fit import BlackBoxFit, Structure, structure
 from ambid.blackbox.prediction import errors, errors_elsewhere
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.criteria import criteria, skipped
+from ambid.estimation.uncertainty import criteria, skipped
 from ambid.signals.delay import lagged_triangle
 from ambid.validate.residuals import autoregression
 

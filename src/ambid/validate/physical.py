@@ -22,12 +22,11 @@ from ambid.arrays import Array
 from ambid.bearing.linear import carry, free_delay
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import STRETCHES, Uncertainty, experiment_hint
-from ambid.estimation.criteria import chi_squared_tail
-from ambid.estimation.likelihood import Fit, extend, free_one, search, weight_of, workspace_near
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit, extend, free_one, search, sparse_gain, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
-from ambid.estimation.parts import Check
-from ambid.estimation.prediction import sparse_gain
 from ambid.estimation.sensitivity import Products, products
+from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation

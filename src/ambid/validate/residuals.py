@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import chi_squared_tail
+from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.linear import column_sizes, directions, triangle_of
-from ambid.estimation.parts import Check, OutputFit
+from ambid.estimation.uncertainty import chi_squared_tail
 
 P_LEAST = 1e-3  # 99.9 % bounds
 _SEEN = 1e-3  # part of a regressor that J must leave for it to be tested

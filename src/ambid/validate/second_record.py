@@ -10,12 +10,17 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
-from ambid.estimation.likelihood import Fit, search, weight_of
+from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.likelihood import (
+    Fit,
+    expected_prediction_sd,
+    prediction_error,
+    search,
+    simulation_error,
+    weight_of,
+)
 from ambid.estimation.linear import one_thread
-from ambid.estimation.parts import Check
-from ambid.estimation.prediction import expected_prediction_sd, prediction_error, simulation_error
-from ambid.estimation.problem import PredictorProblem, noise_floor, scales_for
+from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.models import model
 from ambid.validate.physical import innovation_products, innovation_tests

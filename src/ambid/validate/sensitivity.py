@@ -19,7 +19,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import skipped
+from ambid.estimation.uncertainty import skipped
 
 _PAIR = 0.9  # correlation from which two numbers are named as a pair
 _DEPENDENT = 1e-10  # eigenvalue of the correlation matrix under which a direction is not independent

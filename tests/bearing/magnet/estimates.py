@@ -6,7 +6,7 @@ import numpy as np
 
 from ambid.bearing.magnet_problem import UNITS, BearingRecord
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
-from ambid.estimation.parts import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.simulate import Simulation, simulate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import CRITERIA, information, penalty
+from ambid.estimation.uncertainty import CRITERIA, information, penalty
 from ambid.nonlinear.polynomial import lagged, products, term_name
 from ambid.nonlinear.selection import MatrixCandidates, candidates, select_terms
 from tests.nonlinear.narmax.systems import polynomial

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import criteria, skipped
+from ambid.estimation.uncertainty import criteria, skipped
 from ambid.validate.fits import judge
 from tests.validate.blackbox.fits import arx, io, polynomial, run
 

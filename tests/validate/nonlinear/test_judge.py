@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.estimation.criteria import criteria
+from ambid.estimation.uncertainty import criteria
 from ambid.nonlinear.narmax import narmax
 from ambid.validate.fits import beyond, judge, validation
 from tests.validate.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit

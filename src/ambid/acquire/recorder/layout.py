@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ambid.acquire.device import Column, DeviceEvent, DeviceInfo
 from ambid.errors import DeviceError, UnitError
-from ambid.estimation.documents import fields_json, read_as
+from ambid.estimation.estimate import fields_json, read_as
 from ambid.units import UNKNOWN, parse_unit
 
 SCHEMA = "ambid.journal/1"
