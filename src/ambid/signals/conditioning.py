@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,17 +223,8 @@ def remove_offset(record: Record, names: str | Sequence[str] | None = None) -> R
     return mapped(record, which, Step(name="remove_offset", settings=means), lambda x: x - np.mean(x))
 
 
-def remove_trend(
-    record: Record,
-    names: str | Sequence[str] | None = None,
-    *,
-    degree: int | None = None,
-    highpass_hz: float | None = None,
-) -> Record:
-    """Remove a low-frequency trend: a polynomial in time, or everything under a high-pass corner.
-
-    The same removal belongs on the input and the output of an identification: a high-pass on one of them only is read
-    as dynamics of the plant. A high-pass also removes the low frequencies that tell the displacement stiffness k_x.
+def remove_trend(record: Record, names: str | Sequence[str] | None = None, *, degree: int = 1) -> Record:
+    """Remove a low-frequency trend: a polynomial in time, from input and output of an identification alike.
 
     Parameters
     ----------
@@ -242,10 +232,8 @@ def remove_trend(
         The record to condition.
     names : str or sequence of str, optional
         Channels; all of them by default.
-    degree : int, optional
-        Degree of the least-squares polynomial; 1 (a straight line, with the offset) unless `highpass_hz` is given.
-    highpass_hz : float, optional
-        Corner in Hz of a zero-phase high-pass (second-order Butterworth, forwards and backwards, -6 dB at the corner).
+    degree : int
+        Degree of the least-squares polynomial; 1: a straight line, with the offset.
 
     Returns
     -------
@@ -255,23 +243,13 @@ def remove_trend(
     Raises
     ------
     RecordError
-        If both ways are asked for, the degree or corner is out of range, or a channel cannot be used.
+        If the degree is out of range, or a channel cannot be used.
     """
     which = chosen(record, names)
-    if highpass_hz is not None:
-        if degree is not None:
-            raise RecordError(
-                "remove_trend got degree and highpass_hz; it does one of the two. Give one, or call twice"
-            )
-        corner = float(highpass_hz)
-        step = Step(name="remove_trend", settings={"channels": list(which), "highpass_hz": corner})
-        return mapped(record, which, step, lambda x: zero_phase(x, record.rate_hz, corner, kind="highpass", order=2))
-    degree = 1 if degree is None else degree
     if not 0 <= degree < min(20, record.n_samples):
         raise RecordError(
             f"remove_trend got degree {degree} for {record.n_samples} samples; it must be 0 to 19 and under the "
-            f"number of samples. "
-            "Give a lower degree, or highpass_hz"
+            f"number of samples. Give a lower degree"
         )
     step = Step(name="remove_trend", settings={"channels": list(which), "degree": degree})
     return mapped(record, which, step, lambda x: x - polynomial_trend(x, degree))
@@ -321,46 +299,40 @@ def lowpass(record: Record, cutoff_hz: float, names: str | Sequence[str] | None 
     """
     which = chosen(record, names)
     step = Step(name="lowpass", settings={"channels": list(which), "cutoff_hz": float(cutoff_hz), "order": order})
-    return mapped(
-        record, which, step, lambda x: zero_phase(x, record.rate_hz, float(cutoff_hz), kind="lowpass", order=order)
-    )
+    return mapped(record, which, step, lambda x: zero_phase(x, record.rate_hz, float(cutoff_hz), order=order))
 
 
-def zero_phase(
-    x: Array, rate_hz: float, corner_hz: float, *, kind: Literal["lowpass", "highpass"], order: int
-) -> Array:
-    """Filter forwards and backwards with a Butterworth filter in second-order sections.
+def zero_phase(x: Array, rate_hz: float, corner_hz: float, *, order: int) -> Array:
+    """Filter forwards and backwards with a Butterworth low-pass in second-order sections.
 
     `x`: (n_samples,), any unit, samples; `rate_hz`: sampling rate in Hz; `corner_hz`: frequency in Hz where the two
-    passes together give -6 dB; `kind`: what passes; `order`: order of one pass, 1 to 12. Returns (n_samples,), unit of
-    `x`, filtered samples, not delayed.
+    passes together give -6 dB; `order`: order of one pass, 1 to 12. Returns (n_samples,), unit of `x`, filtered
+    samples, not delayed.
     """
     from scipy.signal import butter, sosfiltfilt
 
     if not 0.0 < corner_hz < rate_hz / 2:
         raise RecordError(
-            f"{kind} corner {corner_hz:g} Hz at a rate of {rate_hz:g} Hz; it must lie between 0 and half the rate "
+            f"lowpass corner {corner_hz:g} Hz at a rate of {rate_hz:g} Hz; it must lie between 0 and half the rate "
             f"({rate_hz / 2:g} Hz). Give another corner"
         )
     if not 1 <= order <= 12:
-        raise RecordError(f"{kind} order {order}; it must be 1 to 12. Give a lower order")
+        raise RecordError(f"lowpass order {order}; it must be 1 to 12. Give a lower order")
     # The padding covers the filter's memory (about one period of the corner), or the ends would ring.
     padding = max(6 * order, round(2 * rate_hz / corner_hz))
-    if kind == "highpass":
-        padding = min(padding, x.size - 1)
     if x.size <= padding:
         raise RecordError(
-            f"{x.size} samples are too few for a {kind} at {corner_hz:g} Hz and {rate_hz:g} Hz rate; it needs more "
+            f"{x.size} samples are too few for a lowpass at {corner_hz:g} Hz and {rate_hz:g} Hz rate; it needs more "
             f"than {padding}. "
             "Use a longer record, or a higher corner"
         )
-    sections = butter(order, corner_hz, btype=kind, fs=rate_hz, output="sos")
+    sections = butter(order, corner_hz, fs=rate_hz, output="sos")
     filtered: Array = np.ascontiguousarray(sosfiltfilt(sections, x, padlen=padding))
     return filtered
 
 
-def resample(record: Record, rate_hz: float, *, allow_upsampling: bool = False) -> Record:
-    """Change the sampling rate of the whole record by a rational factor, with an anti-alias filter.
+def resample(record: Record, rate_hz: float) -> Record:
+    """Lower the sampling rate of the whole record by a rational factor, with an anti-alias filter.
 
     Polyphase linear-phase FIR (Kaiser window), compensated for its delay. A held input (steps, PRBS) is smeared over
     the edges by the filter: identify at the measured rate where that matters.
@@ -371,8 +343,6 @@ def resample(record: Record, rate_hz: float, *, allow_upsampling: bool = False) 
         The record to condition.
     rate_hz : float
         New rate in Hz; its ratio to the present one must be a fraction with terms up to 1000.
-    allow_upsampling : bool
-        A higher rate adds samples but no information and makes residuals coloured, so it has to be allowed explicitly.
 
     Returns
     -------
@@ -382,14 +352,13 @@ def resample(record: Record, rate_hz: float, *, allow_upsampling: bool = False) 
     Raises
     ------
     RecordError
-        If the rate is not positive, higher without leave, or not a rational multiple.
+        If the rate is not positive, higher (that adds samples but no information), or not a rational multiple.
     """
     if not (np.isfinite(rate_hz) and rate_hz > 0):
         raise RecordError(f"resample to {rate_hz} Hz; the rate must be a positive number of Hz. Give another rate")
-    if rate_hz > record.rate_hz and not allow_upsampling:
+    if rate_hz > record.rate_hz:
         raise RecordError(
-            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz adds samples but no information. "
-            "Give a lower rate, or allow_upsampling=True"
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz adds samples but no information. Give a lower rate"
         )
     ratio = Fraction(rate_hz / record.rate_hz).limit_denominator(1000)
     if ratio == 0 or ratio.numerator > 1000 or abs(float(ratio) * record.rate_hz / rate_hz - 1.0) > 1e-9:

@@ -13,6 +13,7 @@ from ambid.record.record import Record
 from ambid.signals.conditioning import equal_runs, finite, runs
 from ambid.signals.delay import lagged_triangle
 
+_FALSE_ALARM = 1e-4  # probability of a drop-out in a whole record without one
 _ZERO_JUMP = 8.0  # robust sd of the sample-to-sample change that a fall to zero has to exceed, going and coming
 
 
@@ -72,10 +73,11 @@ class Dropouts:
         )
 
 
-def find_dropouts(
-    record: Record, name: str, *, false_alarm: float = 1e-4, saturation: Saturation | None = None
-) -> Dropouts:
+def find_dropouts(record: Record, name: str, *, saturation: Saturation | None = None) -> Dropouts:
     """Find stretches in which a channel stands still or falls to zero; nothing is replaced (see `replace_samples`).
+
+    One record in 10000 without drop-outs gives one, if repeated samples come by chance as often as in this record.
+    Steps and PRBS, which hold their levels all the time, therefore pass.
 
     Parameters
     ----------
@@ -83,9 +85,6 @@ def find_dropouts(
         The record to look at.
     name : str
         Channel.
-    false_alarm : float
-        Probability that a whole record without drop-outs gives one, if repeated samples came by chance at the
-        rate at which they come in this record. Steps and PRBS, which hold their levels all the time, therefore pass.
     saturation : Saturation, optional
         What `find_saturation` found in this channel, where that is known already: it sorts the whole channel.
 
@@ -98,12 +97,10 @@ def find_dropouts(
     Raises
     ------
     RecordError
-        If the channel cannot be used or `false_alarm` is not between 0 and 1.
+        If the channel cannot be used.
     """
     x = finite(record, name)
-    if not 0.0 < false_alarm < 1.0:
-        raise RecordError(f"find_dropouts got false_alarm {false_alarm}; it must lie between 0 and 1. Give e.g. 1e-4")
-    shortest = longest_chance_run(x, false_alarm) + 1
+    shortest = longest_chance_run(x) + 1
     starts, lengths = equal_runs(x)
     saturation = find_saturation(record, name) if saturation is None else saturation
     limits = [limit.value for limit in (saturation.lower, saturation.upper) if limit]
@@ -114,19 +111,19 @@ def find_dropouts(
     return Dropouts(channel=name, spans=spans, n_samples=x.size, first_s=first, shortest=shortest)
 
 
-def longest_chance_run(x: Array, false_alarm: float = 1e-4) -> int:
+def longest_chance_run(x: Array) -> int:
     """Return the longest run of equal samples that chance explains.
 
     With p the probability that a sample repeats the one before it, a run of r samples begins at a given place with
-    probability p^(r-1); over n places it stays under `false_alarm` for r > 1 + log(false_alarm/n)/log(p).
+    probability p^(r-1); over n places it stays under 1e-4 for r > 1 + log(1e-4/n)/log(p).
 
-    `x`: (n_samples,), any unit, samples; `false_alarm`: probability over the whole record. Returns samples, at least 3;
+    `x`: (n_samples,), any unit, samples. Returns samples, at least 3;
     n_samples - 1 at most, so that a channel that never changes is always one run too long.
     """
     p = 1.0 - equal_runs(x)[0].size / x.size
     if p == 0.0 or x.size < 5:
         return 3
-    return int(np.clip(np.ceil(1.0 + np.log(false_alarm / x.size) / np.log(p)), 3, x.size - 1))
+    return int(np.clip(np.ceil(1.0 + np.log(_FALSE_ALARM / x.size) / np.log(p)), 3, x.size - 1))
 
 
 def _stands_still(x: Array, starts: np.ndarray, lengths: np.ndarray, shortest: int) -> np.ndarray:
@@ -213,7 +210,7 @@ class Outliers:
         )
 
 
-def find_outliers(record: Record, name: str, *, threshold: float = 6.0, width: int = 1) -> Outliers:
+def find_outliers(record: Record, name: str, *, threshold: float = 6.0) -> Outliers:
     """Find outliers of a channel; nothing is replaced (see `replace_samples`).
 
     Parameters
@@ -225,9 +222,6 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0, width: i
     threshold : float
         Prediction error that makes an outlier, in local robust standard deviations of the innovations (Hampel
         identifier: median absolute value times 1.4826). At 6, Gaussian noise gives less than one in 1e8 samples.
-    width : int
-        Longest group of neighbouring outliers that is looked for, 1 to 5 samples. Over 1, pulses of a real input
-        of that length are found too.
 
     Returns
     -------
@@ -237,28 +231,24 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0, width: i
     Raises
     ------
     RecordError
-        If the channel cannot be used, threshold or width is out of range, or the record has under 50 samples.
+        If the channel cannot be used, the threshold is out of range, or the record has under 50 samples.
     """
     x = finite(record, name)
-    if not (threshold >= 3.0 and 1 <= width <= 5):
-        raise RecordError(
-            f"find_outliers got threshold {threshold:g} and width {width}; threshold is at least 3 and width 1 to "
-            f"5. Give others"
-        )
+    if not threshold >= 3.0:
+        raise RecordError(f"find_outliers got threshold {threshold:g}; it is at least 3. Give another")
     if x.size < 50:
         raise RecordError(f"channel {name!r} has {x.size} samples; outliers need at least 50. Use a longer record")
-    sizes = outlier_sizes(x, threshold, width)
+    sizes = outlier_sizes(x, threshold)
     indices = np.flatnonzero(sizes)
     first = record.start_s + int(indices[0]) / record.rate_hz if indices.size else None
     return Outliers(channel=name, indices=indices, first_s=first, largest_sd=float(sizes.max()))
 
 
-def outlier_sizes(x: Array, threshold: float = 6.0, width: int = 1) -> Array:
+def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
     """Return the prediction error of each outlier in robust standard deviations, 0 for samples that are none.
 
     `x`: (n_samples,), any unit, samples, finite; `threshold`: error that makes an outlier, in local robust standard
-    deviations; `width`: longest group of outliers in samples. Returns (n_samples,), dimensionless, sizes; 0 where there
-    is no outlier.
+    deviations. Returns (n_samples,), dimensionless, sizes; 0 where there is no outlier.
     """
     spread = float(np.std(x))
     if spread == 0.0:
@@ -269,9 +259,9 @@ def outlier_sizes(x: Array, threshold: float = 6.0, width: int = 1) -> Array:
     # An outlier spoils the predictor and the prediction of its neighbours: repeat with the found ones bridged.
     for _ in range(5):
         ahead, behind = _predictors(clean)
-        forward = _errors(x, clean, ahead, width, spread)
-        backward = [e[::-1] for e in _errors(x[::-1], clean[::-1], behind, width, spread)]
-        found = _groups(x, forward, backward, threshold, width)
+        forward = _errors(x, clean, ahead, spread)
+        backward = _errors(x[::-1], clean[::-1], behind, spread)[::-1]
+        found = _stand_out(x, forward, backward, threshold)
         found[common] = 0.0
         if np.array_equal(found > 0, sizes > 0):
             return found
@@ -308,18 +298,11 @@ def _predictors(clean: Array) -> tuple[Array, Array]:
     return found[0], found[1]
 
 
-def _errors(x: Array, clean: Array, weights: Array, width: int, spread: float) -> list[Array]:
-    """Errors of the 1 to `width` step predictions of x from the clean past, in local robust sd."""
-    padded = np.concatenate((np.full(_ORDER + width - 1, clean[0]), clean[:-1]))
-    errors = []
-    past = list(np.eye(_ORDER + 1)[:_ORDER])  # newest first: samples, then predictions, by the weights of the samples
-    for horizon in range(1, width + 1):
-        past = [weights[:_ORDER] @ np.array(past) + weights[-1] * np.eye(_ORDER + 1)[-1], *past[:-1]]
-        first = width - horizon
-        usual = np.convolve(padded[first : first + x.size + _ORDER - 1], past[0][:_ORDER], mode="valid")
-        error = x - (usual + past[0][-1])
-        errors.append(error / _local_scale(error, spread))
-    return errors
+def _errors(x: Array, clean: Array, weights: Array, spread: float) -> Array:
+    """Errors of the one-step predictions of x from the clean past, in local robust sd."""
+    padded = np.concatenate((np.full(_ORDER, clean[0]), clean[:-1]))
+    error = x - (np.convolve(padded, weights[:_ORDER], mode="valid") + weights[-1])
+    return np.asarray(error / _local_scale(error, spread))
 
 
 def _local_scale(error: Array, spread: float) -> Array:
@@ -342,23 +325,14 @@ def _local_scale(error: Array, spread: float) -> Array:
     return scale
 
 
-def _groups(x: Array, forward: list[Array], backward: list[Array], threshold: float, width: int) -> Array:
-    """Mark groups of up to `width` samples, all of which stand out from both sides and in the same direction."""
-    sizes = np.zeros(x.size)
-    reach = _ORDER + width
-    for length in range(1, width + 1):
-        starts = np.arange(reach, x.size - reach - length + 1)
-        for sign in (1.0, -1.0):
-            marked = np.ones(starts.size, dtype=bool)
-            least = np.full(starts.size, np.inf)
-            edge = np.maximum(sign * x[starts - 1], sign * x[starts + length])
-            for j in range(length):
-                error = np.minimum(sign * forward[j][starts + j], sign * backward[length - 1 - j][starts + j])
-                marked &= (error > threshold) & (sign * x[starts + j] > edge)
-                least = np.minimum(least, error)
-            for j in range(length):
-                at = starts[marked] + j
-                sizes[at] = np.maximum(sizes[at], least[marked])
+def _stand_out(x: Array, forward: Array, backward: Array, threshold: float) -> Array:
+    """Sizes of the samples that stand out from both sides in the same direction, 0 for the others."""
+    sizes, inner = np.zeros(x.size), slice(_ORDER + 1, x.size - _ORDER - 1)
+    before, after = x[_ORDER : x.size - _ORDER - 2], x[_ORDER + 2 : x.size - _ORDER]
+    for sign in (1.0, -1.0):
+        error = np.minimum(sign * forward[inner], sign * backward[inner])
+        marked = (error > threshold) & (sign * x[inner] > np.maximum(sign * before, sign * after))
+        sizes[inner] = np.where(marked, error, sizes[inner])
     return sizes
 
 
@@ -376,15 +350,14 @@ class Limit:
     ----------
     value : float
         The limit in the channel's unit.
-    count, n_runs, longest : int
-        Samples at it, runs that they form, and samples of the longest run.
+    count, longest : int
+        Samples at it, and those of the longest run.
     first_index : int
         First sample at it.
     """
 
     value: float
     count: int
-    n_runs: int
     longest: int
     first_index: int
 
@@ -437,10 +410,10 @@ class Saturation:
         )
 
 
-def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | None = None) -> Saturation:
+def find_saturation(record: Record, name: str) -> Saturation:
     """Find samples held at a limit of the channel's range.
 
-    Without `limits`, an extreme value is a limit where it holds at least 5 samples and over 3 times as many as any of
+    An extreme value is a limit where it holds at least 5 samples and over 3 times as many as any of
     the 10 levels next to it. A quantised sine holds at most 2.4 times as many (its peaks dwell); steps and PRBS hold
     all their levels. Not reported, because the samples alone do not tell it from design or rest: an input of two
     levels, and an extreme value held only from the very start of the record (see `find_dropouts`). A sensor whose curve
@@ -452,9 +425,6 @@ def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | 
         The record to look at.
     name : str
         Channel.
-    limits : (float, float), optional
-        Known lower and upper limit in the channel's unit; samples at or beyond them are then counted, whatever the
-        signal.
 
     Returns
     -------
@@ -464,16 +434,11 @@ def find_saturation(record: Record, name: str, *, limits: tuple[float, float] | 
     Raises
     ------
     RecordError
-        If the channel cannot be used, or the lower limit is not under the upper one.
+        If the channel cannot be used.
     """
     x = finite(record, name)
-    if limits is not None:
-        if not limits[0] < limits[1]:
-            raise RecordError(f"limits {limits} of channel {name!r}; the lower must be under the upper one. Swap them")
-        lower, upper = (_limit(limits[0], x <= limits[0]), _limit(limits[1], x >= limits[1]))
-    elif not _may_pile(x):
-        lower = upper = None
-    else:
+    lower = upper = None
+    if _may_pile(x):
         values, counts = np.unique(x, return_counts=True)
         lower, upper = _pile(x, values, counts), _pile(-x, -values[::-1], counts[::-1])
         upper = replace(upper, value=-upper.value) if upper else None
@@ -497,19 +462,6 @@ def _may_pile(x: Array) -> bool:
     return any(bool(np.all(np.diff(end) <= _ROUND_OFF * (ends[1][-1] - ends[0][0]))) for end in ends)
 
 
-def _limit(value: float, at: np.ndarray) -> Limit | None:
-    if not at.any():
-        return None
-    starts, lengths = runs(at)
-    return Limit(
-        value=value,
-        count=int(lengths.sum()),
-        n_runs=int(starts.size),
-        longest=int(lengths.max()),
-        first_index=int(starts[0]),
-    )
-
-
 def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
     """Return the lower extreme of `x` as a limit if samples pile up at it; `values`: its levels, in order."""
     # Levels that only round-off keeps apart are one, as in a computed sine with a whole number of samples per period.
@@ -526,7 +478,9 @@ def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
         return None
     if _held(x, float(np.mean(lengths))):
         return None
-    return _limit(float(values[0]), at)
+    return Limit(
+        value=float(values[0]), count=int(lengths.sum()), longest=int(lengths.max()), first_index=int(starts[0])
+    )
 
 
 def _held(x: Array, dwell: float) -> bool:
