@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.bearing.multistart import Regressors, candidates, moments
+from ambid.bearing.multistart import Regressors, take_moments, weak_form_values
 from tests.bearing.benches import run
 
 
@@ -15,7 +15,7 @@ def test_moments_are_derivatives_without_differentiating():
     a, w = -0.4, 2 * np.pi * 7.3
     d = np.exp(a * t) * (a * np.sin(w * t) + w * np.cos(w * t)) + 0.2
     dd = np.exp(a * t) * ((a * a - w * w) * np.sin(w * t) + 2 * a * w * np.cos(w * t))
-    of_x, of_d, of_dd = (moments({"x": v}, (), rate) for v in (x, d, dd))
+    of_x, of_d, of_dd = (take_moments({"x": v}, (), rate) for v in (x, d, dd))
     lines = slice(3, 400)
     for order, direct in ((1, of_d), (2, of_dd)):
         got, wanted = of_x.signals["x"][order][lines], direct.signals["x"][0][lines]
@@ -23,7 +23,7 @@ def test_moments_are_derivatives_without_differentiating():
 
 
 def test_moments_of_a_constant_vanish_beyond_the_window():
-    m = moments({"x": np.full(1000, 5.0)}, (), 100.0)
+    m = take_moments({"x": np.full(1000, 5.0)}, (), 100.0)
     for values in m.signals["x"]:
         assert np.abs(values[3:]).max() < 1e-9 * 1000
 
@@ -32,8 +32,8 @@ def test_a_held_input_is_taken_as_held():
     # the spectrum of the staircase itself, summed on a fine grid
     rng, n, rate, fine = np.random.default_rng(0), 256, 100.0, 64
     u = rng.standard_normal(n)
-    held = moments({"u": u}, ("u",), rate)
-    stairs = moments({"u": np.repeat(u, fine)}, (), rate * fine)
+    held = take_moments({"u": u}, ("u",), rate)
+    stairs = take_moments({"u": np.repeat(u, fine)}, (), rate * fine)
     lines = slice(3, 60)
     got, wanted = held.signals["u"][0][lines], stairs.signals["u"][0][lines] / fine
     np.testing.assert_allclose(held.omega[lines], stairs.omega[lines])
@@ -76,10 +76,10 @@ def test_some_band_is_near_the_truth(name, known):
         zip((*bench.model.inputs, *bench.model.outputs), np.c_[bench.signals.u, bench.signals.y].T, strict=True)
     )
     columns = {k: v - v.mean() for k, v in columns.items()}
-    m = moments(columns, bench.model.inputs, bench.signals.rate_hz)
+    m = take_moments(columns, bench.model.inputs, bench.signals.rate_hz)
     noise = dict(zip(bench.model.outputs, bench.sensor, strict=True))
     given = {k: bench.truth[k] for k in known}
-    found = [v for _, v in candidates(bench.model.name, m, noise, [bench.delay], bench.signals.rate_hz, given)]
+    found = [v for _, v in weak_form_values(bench.model.name, m, noise, [bench.delay], bench.signals.rate_hz, given)]
     assert len(found) == 8
     assert all(set(f) == set(bench.truth) for f in found)
     assert all(f[k] == given[k] for f in found for k in known)
@@ -92,8 +92,8 @@ def test_some_band_is_near_the_truth(name, known):
 def test_start_values_take_the_delay_into_account():
     bench = run("coil", 8000, 6, delay=3.0)
     columns = {"voltage": bench.signals.u[:, 0], "current": bench.signals.y[:, 0] - bench.signals.y.mean()}
-    m = moments(columns, ("voltage",), bench.signals.rate_hz)
-    (_, right), (_, wrong) = list(candidates("coil", m, {}, (3.0, 0.0), bench.signals.rate_hz, {}))[12:14]
+    m = take_moments(columns, ("voltage",), bench.signals.rate_hz)
+    (_, right), (_, wrong) = list(weak_form_values("coil", m, {}, (3.0, 0.0), bench.signals.rate_hz, {}))[12:14]
     assert right["L"] == pytest.approx(bench.truth["L"], rel=0.05)
     # up to 125 Hz a delay d looks like an inductance R d
     assert wrong["L"] == pytest.approx(bench.truth["L"] + bench.truth["R"] * 3e-4, rel=0.05)
