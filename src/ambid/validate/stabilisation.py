@@ -28,34 +28,35 @@ _SHARE = 0.4  # part of the orders, from a cluster's first one on, that must sho
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModePole:
-    """One pole of one model; of a complex pair the one above the real axis."""
-
-    order: int  # of the model
-    pole: complex  # in continuous time, log(z)/dt
-    frequency_hz: float  # |pole|/(2 pi)
-    damping: float  # -Re(pole)/|pole|; negative for an unstable pole
-    shape: tuple[complex, ...]  # mode shape: the outputs that go with the pole, largest 1
-    stable_frequency: bool = False  # whether the next lower order has a pole that agrees in that
-    stable_damping: bool = False
-    stable_shape: bool = False
-
-    @property
-    def stable(self) -> bool:
-        """Whether it agrees in everything."""
-        return self.stable_frequency and self.stable_damping and self.stable_shape
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Mode:
     """A cluster of stable poles: a mode of the plant."""
 
-    pole: complex  # median
-    frequency_hz: float  # of that
-    damping: float
-    frequency_spread: float  # standard deviation over the orders; not the uncertainty from noise
-    damping_spread: float
+    pole: complex  # in continuous time, log(z)/dt; of a complex pair the one above the real axis; median of a cluster
     orders: tuple[int, ...]  # models that show it
+
+    @property
+    def frequency_hz(self) -> float:
+        """Natural frequency, |pole|/(2 pi)."""
+        return abs(self.pole) / (2 * np.pi)
+
+    @property
+    def damping(self) -> float:
+        """-Re(pole)/|pole|; negative for an unstable pole."""
+        return -self.pole.real / abs(self.pole) if self.pole else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModePole(Mode):
+    """One pole of one model."""
+
+    shape: tuple[complex, ...]  # mode shape: the outputs that go with the pole, largest 1
+    stable_frequency: bool = False  # whether the next lower order has a pole that agrees in that
+    stable: bool = False  # whether it agrees in frequency, damping and shape
+
+    @property
+    def order(self) -> int:
+        """Order of the model."""
+        return self.orders[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,18 +113,9 @@ def _poles(order: int, A: Array, C: Array, data: IOData) -> list[ModePole]:
     for z, v in sorted(zip(values, shapes.T, strict=True), key=lambda x: abs(np.angle(x[0]))):
         if z.imag < 0 or abs(z) < 1e-8:
             continue
-        s = complex(np.log(complex(z)) / data.dt)
         largest = v[np.argmax(np.abs(v))]
-        size = abs(s)
-        out.append(
-            ModePole(
-                order=order,
-                pole=s,
-                frequency_hz=size / (2 * np.pi),
-                damping=-s.real / size if size else 0.0,
-                shape=tuple(complex(x) for x in (v / largest if abs(largest) > 0 else v)),
-            )
-        )
+        shape = tuple(complex(x) for x in (v / largest if abs(largest) > 0 else v))
+        out.append(ModePole(orders=(order,), pole=complex(np.log(complex(z)) / data.dt), shape=shape))
     return out
 
 
@@ -134,12 +126,10 @@ def _mark(p: ModePole, before: Sequence[ModePole]) -> ModePole:
         return p
     near = min(same, key=lambda q: abs(q.pole - p.pole))
     f, g, c, d = p.frequency_hz, near.frequency_hz, p.damping, near.damping
-    return replace(
-        p,
-        stable_frequency=abs(f - g) <= _FREQUENCY * max(f, g, 1e-300),
-        stable_damping=abs(c - d) <= _DAMPING * max(abs(c), abs(d), 0.1),
-        stable_shape=assurance(p.shape, near.shape) >= _SHAPE,
-    )
+    same_frequency = abs(f - g) <= _FREQUENCY * max(f, g, 1e-300)
+    same_damping = abs(c - d) <= _DAMPING * max(abs(c), abs(d), 0.1)
+    stable = same_frequency and same_damping and assurance(p.shape, near.shape) >= _SHAPE
+    return replace(p, stable_frequency=same_frequency, stable=stable)
 
 
 def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
@@ -166,17 +156,7 @@ def _modes(poles: Sequence[ModePole], largest: int) -> tuple[Mode, ...]:
         orders = sorted({p.order for p in c})
         if len(orders) < max(3, _SHARE * (largest - orders[0] + 1)):
             continue
-        centre = _centre(c)
-        out.append(
-            Mode(
-                pole=centre,
-                frequency_hz=abs(centre) / (2 * np.pi),
-                damping=-centre.real / abs(centre) if centre else 0.0,
-                frequency_spread=float(np.std([p.frequency_hz for p in c])),
-                damping_spread=float(np.std([p.damping for p in c])),
-                orders=tuple(orders),
-            )
-        )
+        out.append(Mode(pole=_centre(c), orders=tuple(orders)))
     return tuple(sorted(out, key=lambda m: m.frequency_hz))
 
 
