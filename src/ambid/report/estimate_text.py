@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
 from ambid.estimation.estimate import Estimate
+from ambid.estimation.parts import Judged
 from ambid.physics.models import model
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import (
@@ -189,28 +190,23 @@ def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def physics_text(found: PhysicalFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write the physical parameters that follow from a black-box fit, and whether it can be this physics."""
+def physics_text(found: PhysicalFit | FrequencyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write the physical parameters that follow from a black-box fit or a measured response, and their checks."""
     d = found.delay
-    total = d.samples + d.fraction
-    low, high = found.band_hz
+    spread = "" if d.sd is None else f" ± {d.sd:.2g}"
+    delay = f"delay {d.samples + d.fraction:.4g}{spread} samples, {d.how}"
+    if not isinstance(found, Judged):
+        low, high = found.band_hz
+        about, checks = f", from {found.structure}", {"misfit": found.misfit}
+        delay += f"; from {sized(low, 'Hz')} to {sized(high, 'Hz')}"
+        warnings = other_warnings(checks, found.warnings)
+    else:  # its warnings stand with those of the response
+        about, checks, warnings = status_words(found.status, paint), dict(found.checks), []
     lines = [
-        paint(f"physical parameters of model {found.model}, from {found.structure}", "strong"),
+        paint(f"physical parameters of model {found.model}", "strong") + about,
         *parameter_lines(found.parameters, width=width, paint=paint),
-        f"delay {total:.3g} sample{'' if total == 1 else 's'}, {d.how}; from {sized(low, 'Hz')} to {sized(high, 'Hz')}",
-        *check_lines({"misfit": found.misfit}, width=width, paint=paint),
-        *warning_lines([w for w in found.warnings if w != found.misfit.detail], width=width, paint=paint),
+        delay,
+        *check_lines(checks, width=width, paint=paint),
+        *warning_lines(warnings, width=width, paint=paint),
     ]
     return "\n".join(lines)
-
-
-def frequency_lines(estimate: FrequencyEstimate, width: int, paint: Paint) -> list[str]:
-    """Write the physical parameters of a measured response."""
-    d = estimate.delay
-    spread = "" if d.sd is None else f" ± {d.sd:.2g}"
-    return [
-        f"{paint('physical parameters', 'strong')} of model {estimate.model}{status_words(estimate.status, paint)}",
-        *parameter_lines(estimate.parameters, width=width, paint=paint),
-        f"delay {d.samples + d.fraction:.4g}{spread} samples ({d.how})",
-        *check_lines(estimate.checks, width=width, paint=paint),
-    ]

@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel, pole_covariance
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.report.estimate_text import frequency_lines, names_words
+from ambid.report.estimate_text import names_words, physics_text
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.text import (
     WIDTH,
@@ -323,7 +323,7 @@ def frf_text(measured: Measured, *, width: int = WIDTH, paint: Paint = plain) ->
             pair_lines(measured, width=width),
             _distortion_lines(measured, width),
             [] if fit is None else _response_fit_lines(fit, width, paint),
-            [] if estimate is None else frequency_lines(estimate, width, paint),
+            [] if estimate is None else [physics_text(estimate, width=width, paint=paint)],
             warning_lines(warnings_of(measured), width=width, paint=paint),
             timing_lines(measured.timing_s, paint=paint),
         ]
