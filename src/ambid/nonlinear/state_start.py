@@ -25,7 +25,7 @@ from ambid.estimation.predictor import noise_floor
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Parts, Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout
-from ambid.nonlinear.state_training import State, add_gain, shift_inputs, train
+from ambid.nonlinear.state_training import State, add_gain, best_of, shift_inputs, train
 from ambid.signals.delay import find_delay as delay
 
 NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
@@ -428,12 +428,7 @@ def search_start(
     found = global_search(
         cost, -np.ones(n), np.ones(n), seed=[seed, 5], evaluations=evaluations, tick=tick, stage=STAGE
     )
-    best: State | None = None
-    for z in (found.vector, *found.best[1:_TRIED]):
-        state = _add_kalman_gain(cost, z, data)
-        if state is not None and (best is None or state.score < best.score):
-            best = state
-    return best, found
+    return best_of(_add_kalman_gain(cost, z, data) for z in (found.vector, *found.best[1:_TRIED])), found
 
 
 def _add_kalman_gain(cost: ShotCost, z: Array, data: Scaled) -> State | None:
@@ -451,14 +446,12 @@ def _add_kalman_gain(cost: ShotCost, z: Array, data: Scaled) -> State | None:
     m: Any = layout.matrices(theta)
     C = np.eye(3)[list(layout.heads)]
     step = np.maximum(np.abs(m.A - np.eye(3)).sum(axis=1), 1e-9) ** 2
-    best: State | None = None
-    for q in _PROCESS:
+
+    def kalman(q: float) -> State | None:
         try:
             P = solve_discrete_are(m.A.T, C.T, q * np.diag(step), noise + 1e-12 * np.eye(layout.p))
-            K = np.linalg.solve(C @ P @ C.T + noise, C @ P @ m.A.T).T
+            return add_gain(bare, data, np.linalg.solve(C @ P @ C.T + noise, C @ P @ m.A.T).T)
         except (np.linalg.LinAlgError, ValueError):
-            continue
-        state = add_gain(bare, data, K)
-        if state is not None and (best is None or state.score < best.score):
-            best = state
-    return best
+            return None
+
+    return best_of(map(kalman, _PROCESS))

@@ -6,7 +6,7 @@ anchored, without value and slope at the operating point, so that A and B are th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -255,14 +255,18 @@ def add_gain(state: State, data: Scaled, K: Array) -> State | None:
     k = len(layout.entries)
     heads = np.zeros((layout.n, layout.p))
     heads[layout.heads, range(layout.p)] = 0.5
-    best: State | None = None
-    for gain in (K, 0.5 * K, heads, 0.0 * K):
+
+    def with_gain(gain: Array) -> State | None:
         v = wide.vector
         v[k : layout.n_directions] = gain.ravel()
-        tried = wide.at(problem, v)
-        if tried is not None and (best is None or tried.score < best.score):
-            best = tried
-    return best
+        return wide.at(problem, v)
+
+    return best_of(with_gain(gain) for gain in (K, 0.5 * K, heads, 0.0 * K))
+
+
+def best_of(states: Iterable[State | None]) -> State | None:
+    """Return the network with the least errors of those that there are."""
+    return min((x for x in states if x is not None), key=lambda x: x.score, default=None)
 
 
 def add_units(state: State, neurons: int, seed: list[int]) -> State:
