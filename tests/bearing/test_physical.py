@@ -338,8 +338,8 @@ def test_intervals_from_identified_black_boxes_hold():
 
 @pytest.mark.parametrize(
     ("name", "n", "fixed", "structure", "orders", "seeds"),
-    [("falling rotor", 5000, ("m", "c"), "sspem", {"n": 3}, 24),
-     ("falling rotor", 5000, ("m", "c"), "pbsid", {"n": 3}, 24),
+    [("falling rotor", 5000, ("m", "c"), "sspem", {"n": 3}, 16),
+     ("falling rotor", 5000, ("m", "c"), "pbsid", {"n": 3}, 16),
      ("bearing", 8000, ("c",), "sspem", {"n": 4}, 8)],
 )  # fmt: skip
 def test_errors_are_of_the_size_that_is_said(name, n, fixed, structure, orders, seeds):
